@@ -16,6 +16,7 @@ pub(crate) fn reading(k: u32, cell: usize) -> CellStep {
     CellStep {
         measured_s: 0.1,
         charge_as: 0.1 * current_a,
+        offset_s: 0.1,
         unmeasured_s: 0.0,
         current_a: Some(current_a),
         temperature_c: Some(25.0 + (cell / 8) as f64),

@@ -6,7 +6,7 @@
 //!
 //! # One curve per capacity
 //! Which losses have taken a capacity is not measured. Assumed: per part of capacity lost, each electrode has lost
-//! [`MATERIAL_SHARE`] of its active material and the rest is lithium. [`AgedOcv::error_v`] is what another mix within
+//! [`MATERIAL_SHARE`] of its active material and the rest is lithium. [`OffsetLine::mixes_v`] is what another mix within
 //! [`MATERIAL_SHARE_STD`] would change.
 
 use super::electrodes::{Electrodes, LostMaterial};
@@ -18,6 +18,9 @@ pub const MATERIAL_SHARE: f64 = 0.3;
 
 /// Standard deviation of [`MATERIAL_SHARE`], of each electrode.
 pub const MATERIAL_SHARE_STD: f64 = 0.3;
+
+/// Standard deviation of a shift.
+pub const SHIFT_STD: f64 = 0.3;
 
 /// Capacities of aged cells in the table, parts of the new cell's, rising. Further above the new one's capacity a cell is
 /// a larger one, whose curve no longer changes.
@@ -36,29 +39,34 @@ pub struct AgedOcv {
     capacity_ah: Vec<f64>,
     /// `offset_v[c][s]`, V: row per capacity, column per SOC breakpoint.
     offset_v: Vec<Vec<f64>>,
-    /// Standard deviation of the offsets, V, likewise; empty = unknown.
-    error_v: Vec<Vec<f64>>,
+    /// Change of the offsets by one standard deviation of each mix, V, likewise; empty = unknown.
+    mixes_v: [Vec<Vec<f64>>; MIXES],
+    is_shift: bool,
 }
 
-/// Offset between two capacities over one interval of SOC: a0 + a1 soc + C (b0 + b1 soc), V.
+/// Number of mixes of losses that may be other than assumed: more material of the negative, of the positive electrode.
+pub const MIXES: usize = 2;
+
+/// A quantity over one interval of SOC: its value at SOC 0 and its slope per unit of SOC.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SocLine(pub [f64; 2]);
+
+impl SocLine {
+    /// Value at a SOC.
+    pub fn at(&self, soc: f64) -> f64 {
+        self.0[0] + self.0[1] * soc
+    }
+}
+
+/// How the curve differs from the new cell's near one capacity, over one interval of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OffsetLine {
-    /// [a0, a1].
-    pub fixed: [f64; 2],
-    /// [b0, b1], per Ah.
-    pub per_ah: [f64; 2],
-}
-
-impl OffsetLine {
     /// Offset, V.
-    pub fn at(&self, soc: f64, capacity_ah: f64) -> f64 {
-        self.fixed[0] + self.fixed[1] * soc + capacity_ah * (self.per_ah[0] + self.per_ah[1] * soc)
-    }
-
-    /// Slope over SOC, V per unit of SOC.
-    pub fn slope_v(&self, capacity_ah: f64) -> f64 {
-        self.fixed[1] + capacity_ah * self.per_ah[1]
-    }
+    pub offset_v: SocLine,
+    /// Its change with the capacity, V per Ah.
+    pub per_ah_v: SocLine,
+    /// Its change by one standard deviation of each mix, V.
+    pub mixes_v: [SocLine; MIXES],
 }
 
 impl AgedOcv {
@@ -81,8 +89,7 @@ impl AgedOcv {
             let offset_v = curve(MATERIAL_SHARE, MATERIAL_SHARE, part)?;
             let negative = half_width(curve(low, MATERIAL_SHARE, part)?, curve(high, MATERIAL_SHARE, part)?);
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
-            let error_v = negative.iter().zip(positive).map(|(a, b)| libm::hypot(*a, b));
-            Some((offset_v, error_v.collect::<Vec<f64>>()))
+            Some((offset_v, [negative, positive]))
         };
         // From the new cell down, as far as there are such cells.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
@@ -90,11 +97,11 @@ impl AgedOcv {
             return None;
         }
         let mut table = Self::default();
-        for (part, (offset_v, error_v)) in aged.into_iter().rev() {
+        for (part, (offset_v, mixes_v)) in aged.into_iter().rev() {
             table.push(part * new_capacity_ah, offset_v, rows);
-            table.error_v.push(error_v);
+            table.mixes_v.iter_mut().zip(mixes_v).for_each(|(table, row)| table.push(row));
         }
-        table.error_v.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]);
+        table.mixes_v.iter_mut().for_each(|table| table.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]));
         table.finish(new_capacity_ah, rows);
         Some(table)
     }
@@ -103,15 +110,17 @@ impl AgedOcv {
     /// temperature. 1 = the top keeps its ampere-hours, 0 = the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self::default();
-        if shift == 0.0 {
-            return table;
-        }
         let ocv_v = |at: f64| interpolate(soc, &rows[rows.len() / 2], at);
         for part in LOST_CAPACITIES {
-            let lost = shift * (1.0 - part);
-            let offset_v = soc.iter().map(|&z| ocv_v(z + lost * z * (1.0 - z)) - ocv_v(z)).collect();
+            let shifted = |shift: f64, z: f64| ocv_v(z + shift * (1.0 - part) * z * (1.0 - z));
+            let offset_v = soc.iter().map(|&z| shifted(shift, z) - ocv_v(z)).collect();
+            let more = |z: f64| 0.5 * (shifted(shift + SHIFT_STD, z) - shifted(shift - SHIFT_STD, z));
             table.push(part * new_capacity_ah, offset_v, rows);
+            table.mixes_v[0].push(soc.iter().map(|&z| more(z)).collect());
+            table.mixes_v[1].push(vec![0.0; soc.len()]);
         }
+        table.mixes_v.iter_mut().for_each(|table| table.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]));
+        table.is_shift = true;
         table.finish(new_capacity_ah, rows);
         table
     }
@@ -139,45 +148,41 @@ impl AgedOcv {
         self.offset_v.push(offset_v);
     }
 
-    /// Borders between the segments of capacity, Ah, rising: one segment more than borders.
-    pub fn borders_ah(&self) -> &[f64] {
-        &self.capacity_ah
-    }
-
-    /// Segment of a capacity: how many borders are at or below it.
-    pub fn segment(&self, capacity_ah: f64) -> usize {
-        self.capacity_ah.iter().take_while(|&&border| capacity_ah >= border).count()
-    }
-
-    /// Offset in a segment of capacity over the interval from SOC breakpoint `s`.
-    pub fn line(&self, soc: &[f64], segment: usize, s: usize) -> OffsetLine {
-        if self.capacity_ah.is_empty() {
-            return OffsetLine::default();
+    /// Sets the standard deviation of the shift, [`SHIFT_STD`] until then; electrodes have none.
+    pub fn set_shift_std(&mut self, std: f64) {
+        if self.is_shift {
+            self.mixes_v[0].iter_mut().flatten().for_each(|mix_v| *mix_v *= std / SHIFT_STD);
         }
-        let line = |value: &dyn Fn(usize) -> f64| {
-            let slope = (value(s + 1) - value(s)) / (soc[s + 1] - soc[s]);
-            [value(s) - slope * soc[s], slope]
+    }
+
+    /// Offset at a capacity over the interval from SOC breakpoint `s`.
+    pub fn line(&self, soc: &[f64], s: usize, capacity_ah: f64) -> OffsetLine {
+        let line = |rows: &[Vec<f64>], change: bool| {
+            let Some(ends) = self.between(rows, [s, s + 1], capacity_ah) else { return SocLine::default() };
+            let [low, high] = ends.map(|(value, per_ah)| if change { per_ah } else { value });
+            let slope = (high - low) / (soc[s + 1] - soc[s]);
+            SocLine([low - slope * soc[s], slope])
         };
-        let last = self.capacity_ah.len();
-        if segment == 0 || segment == last {
-            return OffsetLine { fixed: line(&|s| self.offset_v[segment.min(last - 1)][s]), per_ah: [0.0; 2] };
+        OffsetLine {
+            offset_v: line(&self.offset_v, false),
+            per_ah_v: line(&self.offset_v, true),
+            mixes_v: [0, 1].map(|mix| line(&self.mixes_v[mix], false)),
         }
-        let (low_ah, high_ah) = (self.capacity_ah[segment - 1], self.capacity_ah[segment]);
-        let (low, high) = (&self.offset_v[segment - 1], &self.offset_v[segment]);
-        let per_ah = |s: usize| (high[s] - low[s]) / (high_ah - low_ah);
-        OffsetLine { fixed: line(&|s| low[s] - low_ah * per_ah(s)), per_ah: line(&per_ah) }
     }
 
-    /// Standard deviation of the offset at a SOC breakpoint for a capacity, V; `None` = unknown.
-    pub fn error_v(&self, s: usize, capacity_ah: f64) -> Option<f64> {
-        let last = self.error_v.len().checked_sub(1)?;
-        let segment = self.segment(capacity_ah);
-        if segment == 0 || segment > last {
-            return Some(self.error_v[segment.min(last)][s]);
+    /// Values of `rows`, one per capacity, at SOC breakpoints, and their change per Ah: linear between the capacities,
+    /// constant outside.
+    fn between<const K: usize>(&self, rows: &[Vec<f64>], at: [usize; K], capacity_ah: f64) -> Option<[(f64, f64); K]> {
+        let last = rows.len().checked_sub(1)?;
+        let above = self.capacity_ah.iter().take_while(|&&border| capacity_ah >= border).count();
+        if above == 0 || above > last {
+            return Some(at.map(|s| (rows[above.min(last)][s], 0.0)));
         }
-        let (low_ah, high_ah) = (self.capacity_ah[segment - 1], self.capacity_ah[segment]);
-        let along = (capacity_ah - low_ah) / (high_ah - low_ah);
-        Some(self.error_v[segment - 1][s] * (1.0 - along) + self.error_v[segment][s] * along)
+        let (low_ah, high_ah) = (self.capacity_ah[above - 1], self.capacity_ah[above]);
+        Some(at.map(|s| {
+            let per_ah = (rows[above][s] - rows[above - 1][s]) / (high_ah - low_ah);
+            (rows[above - 1][s] + (capacity_ah - low_ah) * per_ah, per_ah)
+        }))
     }
 }
 

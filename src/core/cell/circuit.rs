@@ -53,19 +53,17 @@ pub fn terminal_v(
 }
 
 /// Terminal voltage under `current_a` of an aged cell at `state` = (SOC, resistance ratio, capacity in Ah) with the branches'
-/// voltages summed in `branches_v`. The open-circuit curve changes linearly with the capacity round `segment`
-/// ([`CellModel::aged_ocv_v`]).
+/// voltages summed in `branches_v`.
 pub fn aged_terminal_v(
     model: &CellModel,
     state: (f64, f64, f64),
-    segment: usize,
     temperature: &TemperaturePosition,
     branches_v: f64,
     current_a: f64,
 ) -> f64 {
     let (soc, resistance_ratio, capacity_ah) = state;
     let position = model.grid_position_at(temperature, soc);
-    let ocv_v = model.aged_ocv_v(&position, segment, capacity_ah);
+    let ocv_v = model.aged_ocv_v(&position, capacity_ah);
     ocv_v - branches_v - model.r0_ohm(&position) * resistance_ratio * current_a
 }
 

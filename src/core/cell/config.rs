@@ -1,5 +1,7 @@
 //! Settings of the per-cell estimator. `config` checks their ranges; the estimator uses them as they are.
 
+use crate::filter::{CONSIDERED, ScalarGaussian};
+
 /// How the circuit's equations are stepped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Discretisation {
@@ -35,6 +37,8 @@ pub struct EstimatorConfig {
     pub gap: GapSettings,
     /// Error of a voltage reading against the cell model.
     pub voltage: VoltageError,
+    /// Constant errors of the sensors.
+    pub sensor: SensorErrors,
     /// Rejection of outliers.
     pub gate: GateSettings,
     /// Check of the innovations against their covariance.
@@ -65,6 +69,8 @@ pub struct InitialState {
     pub capacity_ah: f64,
     /// Its standard deviation, Ah.
     pub capacity_std_ah: f64,
+    /// Capacity of the open-circuit curve before the first half-cycle, Ah.
+    pub curve: ScalarGaussian,
     /// Standard deviation of ln(resistance relative to new) at the start.
     pub log_resistance_std: f64,
 }
@@ -111,6 +117,31 @@ pub struct VoltageError {
     pub load_memory_s: f64,
     /// Longest time that one voltage reading stands for, s: readings further apart count no more than this.
     pub max_information_s: f64,
+}
+
+/// Constant errors of the sensors: standard deviations. The filter considers them, so that they never average out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorErrors {
+    /// Offset of a cell's voltage, V, with that of its open-circuit curve against the model.
+    pub voltage_offset_v: f64,
+    /// Offset of the current, per cell, A, as far as it has not been learned.
+    pub current_offset_a: f64,
+    /// Gain error of the current, fraction.
+    pub current_gain: f64,
+    /// Error of the model's branch resistances against its series resistance, which ageing and temperature change apart,
+    /// fraction.
+    pub branch_resistance: f64,
+}
+
+impl SensorErrors {
+    /// Sensors without constant errors, as in the paper.
+    pub const NONE: Self =
+        Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, branch_resistance: 0.0 };
+
+    /// The deviations in the order of the filter's constant errors.
+    pub fn deviations(&self) -> [f64; CONSIDERED] {
+        [self.voltage_offset_v, self.current_offset_a, self.current_gain, self.branch_resistance]
+    }
 }
 
 /// Rejection of outliers among the voltage readings.

@@ -17,10 +17,13 @@
 //! Effect: the sample rate does not change the result.
 //!
 //! Noise of a step and of a reading (deviation 4): [`noise`].
-//! Deviation 5: the OCV curve changes with lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), where the model says how.
+//! Deviation 5: the OCV curve changes with the capacity lost by the last half-cycle ([`AgedOcv`](crate::cell::AgedOcv)).
 //! Effect: the top and the bottom of an aged cell's curve give the same capacity.
 //!
 //! Use of the cell while the program does not run (deviation 6): [`downtime`].
+//!
+//! Deviation 7: constant errors of sensors and model are followed, those of [`SensorErrors`](crate::cell::SensorErrors) also
+//! considered ([`crate::filter::unscented`]); deviation 8: the current's offset is learned ([`crate::health::offset`]).
 //!
 //! A reading beyond the gate leaves the state unchanged. After every reading has been beyond it for `lost_after_s`, the
 //! filter restarts: SOC and branches from the voltage, resistance and capacity are kept.

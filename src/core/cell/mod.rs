@@ -14,7 +14,7 @@ pub mod model;
 pub use aged_ocv::AgedOcv;
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
-    ProcessNoise, SigmaPointSettings, VoltageError,
+    ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};

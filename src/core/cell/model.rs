@@ -11,7 +11,7 @@
 //! between nodes whose resistances differ the product of two interpolated values is up to twice that of either node.
 //! Effect: none where both are constant.
 
-use super::aged_ocv::{AgedOcv, OffsetLine};
+use super::aged_ocv::{AgedOcv, MIXES, OffsetLine};
 use crate::filter::bisect;
 
 /// Most RC branches a model may have.
@@ -176,12 +176,20 @@ impl CellModel {
         self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// Open-circuit voltage of a cell that has aged to a capacity, V. `segment` is that of the capacity round which the
-    /// change of the curve is linear ([`AgedOcv::segment`]).
-    pub fn aged_ocv_v(&self, position: &GridPosition, segment: usize, capacity_ah: f64) -> f64 {
+    /// Open-circuit voltage of a cell that has aged to a capacity, V.
+    pub fn aged_ocv_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
+        self.ocv_v(position) + self.offset(position, capacity_ah).offset_v.at(self.soc_at(position))
+    }
+
+    /// Change of that voltage per Ah of capacity, V, and by one standard deviation of each mix of losses, V.
+    pub fn aged_ocv_changes_v(&self, position: &GridPosition, capacity_ah: f64) -> (f64, [f64; MIXES]) {
+        let (line, soc) = (self.offset(position, capacity_ah), self.soc_at(position));
+        (line.per_ah_v.at(soc), line.mixes_v.map(|mix_v| mix_v.at(soc)))
+    }
+
+    fn soc_at(&self, position: &GridPosition) -> f64 {
         let [from, to] = [self.soc[position.s], self.soc[position.s + 1]];
-        let soc = from + position.beyond_s * (to - from);
-        self.ocv_v(position) + self.offset(position, segment).at(soc, capacity_ah)
+        from + position.beyond_s * (to - from)
     }
 
     /// Slope of the open-circuit voltage of an aged cell over SOC, V per unit of SOC.
@@ -189,18 +197,11 @@ impl CellModel {
         let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
         position.temperature.between(position.temperature.along_t, rise)
             / (self.soc[position.s + 1] - self.soc[position.s])
-            + self.offset(position, self.aged_ocv.segment(capacity_ah)).slope_v(capacity_ah)
+            + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    fn offset(&self, position: &GridPosition, segment: usize) -> OffsetLine {
-        self.aged_ocv.line(&self.soc, segment, position.s)
-    }
-
-    /// Standard deviation of an aged cell's open-circuit voltage by the unknown mix of its losses, V; `None` = unknown.
-    pub fn aged_ocv_error_v(&self, position: &GridPosition, capacity_ah: f64) -> Option<f64> {
-        let [low, high] = [position.s, position.s + 1].map(|s| self.aged_ocv.error_v(s, capacity_ah));
-        let (low, high) = low.zip(high)?;
-        Some(low + position.along_s * (high - low))
+    fn offset(&self, position: &GridPosition, capacity_ah: f64) -> OffsetLine {
+        self.aged_ocv.line(&self.soc, position.s, capacity_ah)
     }
 
     /// Series resistance of a new cell, ohm.
@@ -241,9 +242,7 @@ impl CellModel {
 
     /// SOC at which a cell that has aged to a capacity has an open-circuit voltage, see [`Self::soc_of_ocv`].
     pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
-        let segment = self.aged_ocv.segment(capacity_ah);
-        let is_below =
-            |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), segment, capacity_ah);
+        let is_below = |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), capacity_ah);
         let (low, high) = bisect((-0.5, 1.5), 40, is_below);
         0.5 * (low + high)
     }

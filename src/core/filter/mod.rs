@@ -10,4 +10,4 @@ pub mod unscented;
 
 pub use bisection::bisect;
 pub use linear::{Measurement, ScalarGaussian, update_states};
-pub use unscented::{FilterError, Gaussian, MeasurementNoise, SigmaPointWeights, Update};
+pub use unscented::{CONSIDERED, CONSTANT_ERRORS, FilterError, Gaussian, MeasurementNoise, SigmaPointWeights, Update};

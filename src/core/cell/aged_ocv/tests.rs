@@ -6,7 +6,7 @@ use crate::cell::electrodes::tests::{LFP, M50};
 const SOC: [f64; 6] = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0];
 
 fn offset_v(table: &AgedOcv, s: usize, capacity_ah: f64) -> f64 {
-    table.line(&SOC, table.segment(capacity_ah), s).at(SOC[s], capacity_ah)
+    table.line(&SOC, s, capacity_ah).offset_v.at(SOC[s])
 }
 
 fn rows(ocv_v: impl Fn(f64) -> f64) -> Vec<Vec<f64>> {
@@ -20,11 +20,10 @@ fn m50() -> AgedOcv {
 #[test]
 fn nothing_changes_without_capacities_and_for_a_new_cell() {
     let none = AgedOcv::default();
-    assert_eq!((none.line(&SOC, 0, 2), none.error_v(2, 1.0)), (OffsetLine::default(), None));
-    assert_eq!(AgedOcv::of_shift(0.0, &SOC, 2.0, &rows(|z| z)), none);
+    assert_eq!(none.line(&SOC, 2, 1.0), OffsetLine::default());
     for s in 0..5 {
         assert!(offset_v(&m50(), s, 5.0).abs() < 1e-12, "{s}");
-        assert_eq!(m50().error_v(s, 5.0), Some(0.0));
+        assert_eq!(m50().line(&SOC, s, 5.0).mixes_v, [SocLine::default(); MIXES]);
         // Smooth through the new capacity, constant above 105 %.
         assert!((offset_v(&m50(), s, 5.25) + offset_v(&m50(), s, 4.75)).abs() < 1e-12, "{s}");
         assert_eq!(offset_v(&m50(), s, 5.3), offset_v(&m50(), s, 9.0));
@@ -39,15 +38,23 @@ fn offsets_are_the_aged_curve_less_the_new_one_and_continuous_over_capacity() {
     for (s, z) in SOC.into_iter().enumerate().take(5) {
         let expected_v = aged.voltage_v(z) - M50.voltage_v(z);
         assert!((offset_v(&table, s, 4.0) - expected_v).abs() < 1e-9, "{z}");
-        for border in table.borders_ah() {
+        for border in &table.capacity_ah {
             let (below, above) = (offset_v(&table, s, border - 1e-9), offset_v(&table, s, border + 1e-9));
             assert!((below - above).abs() < 1e-6, "{z} {border}");
         }
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    let error_v = |capacity_ah| table.error_v(2, capacity_ah).expect("known");
-    assert!(error_v(4.0) > 0.002 && error_v(4.5) < error_v(4.0), "{}", error_v(4.0));
+    // Half the difference of mixes on both sides.
+    let with =
+        |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
+    let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));
+    let mix_v = |capacity_ah: f64| table.line(&SOC, 2, capacity_ah).mixes_v[0].at(SOC[2]);
+    assert!((mix_v(4.0) - expected_v).abs() < 1e-9, "{} {expected_v}", mix_v(4.0));
+    assert!(mix_v(4.0).abs() > 0.001 && mix_v(4.5).abs() < mix_v(4.0).abs());
+    // The change with the capacity is the difference over it.
+    let per_ah_v = (offset_v(&table, 2, 4.2) - offset_v(&table, 2, 4.1)) / 0.1;
+    assert!((table.line(&SOC, 2, 4.15).per_ah_v.at(SOC[2]) - per_ah_v).abs() < 1e-9);
 }
 
 #[test]
@@ -56,7 +63,15 @@ fn a_shift_moves_the_inside_of_the_curve_only() {
     // A quarter lost: a = 0.8 x 0.25 = 0.2.
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
     assert_eq!(offset_v(&table, 0, 1.5), 0.0);
-    assert!(table.line(&SOC, table.segment(1.5), 4).at(1.0, 1.5).abs() < 1e-12);
+    assert!(table.line(&SOC, 4, 1.5).offset_v.at(1.0).abs() < 1e-12);
+    // Its deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s); another deviation scales it, electrodes have none.
+    let mix_v = |table: &AgedOcv| table.line(&SOC, 2, 1.5).mixes_v[0].at(SOC[2]);
+    assert!((mix_v(&table) - 0.075 * 0.4 * 0.6).abs() < 1e-12);
+    let (mut other, mut electrodes) = (table.clone(), m50());
+    other.set_shift_std(0.6);
+    electrodes.set_shift_std(0.6);
+    assert!((mix_v(&other) - 2.0 * mix_v(&table)).abs() < 1e-12);
+    assert_eq!(electrodes, m50());
 }
 
 #[test]
@@ -68,10 +83,9 @@ fn an_aged_curve_rises_even_where_the_new_one_hardly_does() {
         [AgedOcv::of_electrodes(&LFP, &SOC, 2.0, &both).expect("a table"), AgedOcv::of_shift(1.0, &SOC, 2.0, &both)];
     for (table, row) in tables.iter().flat_map(|table| both.iter().map(move |row| (table, row))) {
         for capacity_ah in [0.1, 0.9, 1.3, 1.55, 1.6, 1.87, 2.0, 3.0] {
-            let segment = table.segment(capacity_ah);
             let rises = (0..SOC.len() - 1).all(|s| {
-                let line = table.line(&SOC, segment, s);
-                row[s + 1] + line.at(SOC[s + 1], capacity_ah) > row[s] + line.at(SOC[s], capacity_ah)
+                let line = table.line(&SOC, s, capacity_ah).offset_v;
+                row[s + 1] + line.at(SOC[s + 1]) > row[s] + line.at(SOC[s])
             });
             assert!(rises, "{capacity_ah} Ah");
         }

@@ -17,7 +17,7 @@ mod tables;
 
 use filter_array::{BatchStep, FilterArray};
 use input::{BlockInput, CellSlot, WIDTH};
-use kernel::{INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, REST_S, at};
+use kernel::{INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, OFFSET_INFORMATION, OFFSET_SCORE, REST_S, at};
 
 use super::cell_estimator::{CellEstimator, thermal_c};
 use super::filter::Filter;
@@ -47,9 +47,9 @@ pub struct EstimatorBank {
 /// The filters of a pack, by number of branches.
 #[derive(Debug, Clone)]
 enum FilterArrays {
-    One(FilterArray<4, 10, 12>),
-    Two(FilterArray<5, 15, 16>),
-    Three(FilterArray<6, 21, 20>),
+    One(FilterArray<4, 10, 16>),
+    Two(FilterArray<5, 15, 20>),
+    Three(FilterArray<6, 21, 24>),
 }
 
 /// Runs an expression for the pack's number of branches.
@@ -96,7 +96,11 @@ impl EstimatorBank {
             return;
         }
         let mut new = Self::new(model, config, self.cells.len());
-        (0..self.cells.len()).for_each(|cell| new.put(cell, &self.cell(cell)));
+        for cell in 0..self.cells.len() {
+            let mut estimator = self.cell(cell);
+            estimator.restate_constant_errors(&self.config.sensor, &config.sensor);
+            new.put(cell, &estimator);
+        }
         new.results = std::mem::take(&mut self.results);
         *self = new;
     }
@@ -131,6 +135,7 @@ impl EstimatorBank {
         input.temperature_c.0[lane] = temperature_c;
         input.measured_s.0[lane] = step.measured_s;
         input.charge_as.0[lane] = step.charge_as;
+        input.offset_s.0[lane] = step.offset_s;
         input.current_a.0[lane] = current_a;
         input.voltage_v.0[lane] = step.voltage_v;
     }
@@ -264,6 +269,8 @@ impl EstimatorBank {
             mean_nis: hot[MEAN_NIS],
             information_s: hot[INFORMATION_S],
             rest_s: hot[REST_S],
+            offset_information: hot[OFFSET_INFORMATION],
+            offset_score: hot[OFFSET_SCORE],
             ..memory
         };
         CellEstimator { filter: has_filter.then_some(filter), memory }
@@ -291,6 +298,33 @@ impl EstimatorBank {
         result
     }
 
+    /// What the voltages since the last correction say about the current sensor's offset: sums of d^2 / R and of
+    /// d x innovation / R, with d the effect of its standard deviation on an innovation of variance R. Means over the cells,
+    /// whose models err alike.
+    pub fn offset_evidence(&self) -> (f64, f64) {
+        let cells = self.cells.len();
+        let mean = |i: usize| {
+            let sum: f64 =
+                each_array!(&self.filters, x => x.blocks.iter().flat_map(|block| block.memory[i].0).take(cells).sum());
+            sum / cells.max(1) as f64
+        };
+        (mean(OFFSET_INFORMATION), mean(OFFSET_SCORE))
+    }
+
+    /// Corrects all cells by `deviations` of the current's offset, whose deviation becomes `offset_std_a`.
+    pub fn absorb_current_offset(&mut self, deviations: f64, offset_std_a: f64) {
+        let before_a = self.config.sensor.current_offset_a;
+        let remains = if before_a > 0.0 { offset_std_a / before_a } else { 1.0 };
+        self.change_all(|cell| cell.absorb_current_offset(deviations, remains));
+        self.set_current_offset_std(offset_std_a);
+    }
+
+    /// Sets the standard deviation of the current's offset, per cell, A.
+    pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
+        self.config.sensor.current_offset_a = offset_std_a;
+        self.constants.sensor.current_offset_a = offset_std_a;
+    }
+
     /// Changes every cell's estimator.
     pub fn change_all(&mut self, mut change: impl FnMut(&mut CellEstimator)) {
         (0..self.cells.len()).for_each(|cell| self.change(cell, &mut change));
@@ -301,7 +335,9 @@ impl EstimatorBank {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_array!(&self.filters, x => {
             let state = &x.blocks[block];
-            ScalarGaussian { mean: state.mean[i].0[lane], variance: state.covariance[at(i, i)].0[lane] }
+            let by_constant = state.by_constant.iter().map(|column| column[i].0[lane] * column[i].0[lane]);
+            let variance = by_constant.fold(state.covariance[at(i, i)].0[lane], |sum, part| sum + part);
+            ScalarGaussian { mean: state.mean[i].0[lane], variance }
         })
     }
 }

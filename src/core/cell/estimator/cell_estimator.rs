@@ -3,17 +3,20 @@
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
 
+use nalgebra::SMatrix;
+
 use super::downtime::update_after_downtime;
 use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
 use super::memory::Memory;
 use super::noise::VoltageReading;
 use super::state_vector::{
-    BRANCHES, CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, UNKNOWN_SOC_VARIANCE, marginal, square, widened,
+    BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, UNKNOWN_SOC_VARIANCE, square,
+    widened,
 };
 use super::step::{CellStep, StepResult};
 use crate::cell::circuit;
-use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
-use crate::filter::{FilterError, ScalarGaussian, Update};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
+use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
 
 /// The estimator of one cell.
 #[derive(Debug, Clone)]
@@ -64,12 +67,17 @@ impl CellEstimator {
         let information_s = self.memory.information_s.clamp(1e-3, config.voltage.max_information_s);
         let load_a = self.memory.load_a;
         let temperature = model.temperature_position(temperature_c);
-        let reading = VoltageReading { voltage_v: step.voltage_v, current_a, load_a, temperature, information_s };
-        let update = match downtime_std {
+        let curve = self.memory.curve();
+        let reading =
+            VoltageReading { voltage_v: step.voltage_v, current_a, load_a, temperature, information_s, curve };
+        let (update, offset_v) = match downtime_std {
             None => each!(filter, x => update(x, model, config, &reading))?,
-            Some(std) => each!(filter, x => update_after_downtime(x, model, config, &reading, std))?,
+            Some(std) => (each!(filter, x => update_after_downtime(x, model, config, &reading, std))?, 0.0),
         };
         (self.memory.downtime_std, self.memory.is_unseen) = (0.0, false);
+        if update.accepted {
+            self.memory.note_offset(offset_v, &update);
+        }
         self.memory.record_update(config, step, &update);
         Ok(Some(update))
     }
@@ -86,7 +94,7 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            model.soc_of_aged_ocv(&temperature, self.memory.capacity.mean, step.voltage_v + load_v)
+            model.soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = square(config.initial.branch_std_v).max(KNOWN_VARIANCE);
@@ -94,6 +102,7 @@ impl CellEstimator {
             log_resistance: self.memory.log_resistance,
             capacity: self.memory.capacity,
             covariance: self.capacity_resistance_covariance(),
+            by_constant: self.learned_by_constant(),
         };
         self.filter = Some(match model.branches.len() {
             1 => Filter::One(initial_state(soc, branch_variance, &kept)),
@@ -111,6 +120,7 @@ impl CellEstimator {
             each!(filter, x => {
                 let (r, c) = (LOG_RESISTANCE, CAPACITY);
                 (x.covariance[(r, c)], x.covariance[(c, r)]) = (0.0, 0.0);
+                x.by_constant.fill(0.0);
             });
         }
     }
@@ -163,10 +173,45 @@ impl CellEstimator {
     }
 
     fn marginal(&self, state: usize) -> Option<ScalarGaussian> {
-        self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, state)))
+        self.filter.as_ref().map(|filter| each!(filter, x => x.marginal(state)))
     }
 
-    /// Covariance of capacity (Ah) and ln(resistance).
+    /// Errors of ln rho and of the capacity by the constant errors.
+    fn learned_by_constant(&self) -> SMatrix<f64, 2, CONSTANT_ERRORS> {
+        let rows = |x: &dyn Fn(usize, usize) -> f64| SMatrix::from_fn(|i, k| x([LOG_RESISTANCE, CAPACITY][i], k));
+        self.filter
+            .as_ref()
+            .map_or_else(SMatrix::zeros, |filter| each!(filter, x => rows(&|i, k| x.by_constant[(i, k)])))
+    }
+
+    /// Corrects the state by `deviations` of the current's offset, whose remaining deviation becomes `remains` times the
+    /// one before.
+    pub fn absorb_current_offset(&mut self, deviations: f64, remains: f64) {
+        (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
+        let Some(filter) = &mut self.filter else { return };
+        each!(filter, x => {
+            let column = x.by_constant.column(CURRENT_OFFSET).into_owned();
+            x.mean += column * deviations;
+            if remains <= 1.0 {
+                x.by_constant.set_column(CURRENT_OFFSET, &(column * remains));
+            } else {
+                // A part of the larger offset is new and has not moved any state.
+                x.by_constant.set_column(CURRENT_OFFSET, &(column / remains));
+                x.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
+            }
+        });
+    }
+
+    /// Restates the errors by constant errors for other deviations of them.
+    pub(super) fn restate_constant_errors(&mut self, old: &SensorErrors, new: &SensorErrors) {
+        let Some(filter) = &mut self.filter else { return };
+        for (k, (old, new)) in old.deviations().into_iter().zip(new.deviations()).enumerate() {
+            let factor = if old > 0.0 { new / old } else { 1.0 };
+            each!(filter, x => x.by_constant.column_mut(k).scale_mut(factor));
+        }
+    }
+
+    /// Covariance of capacity (Ah) and ln(resistance), without the constant errors.
     pub fn capacity_resistance_covariance(&self) -> f64 {
         self.filter.as_ref().map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
     }
@@ -178,17 +223,41 @@ impl CellEstimator {
         model.settled_ohm(&position) * libm::exp(self.log_resistance().mean) * self.memory.load_a
     }
 
-    /// Replaces the capacity estimate (at transitions only).
+    /// Capacity of the open-circuit curve, Ah.
+    pub fn curve(&self) -> ScalarGaussian {
+        self.memory.curve()
+    }
+
+    /// Change of the capacity estimate with the capacity of the open-circuit curve since the last restatement.
+    pub fn capacity_by_curve(&self) -> f64 {
+        let std_ah = self.memory.curve().std();
+        let by_curve = |x: f64| if std_ah > 0.0 { -x / std_ah } else { 0.0 };
+        self.filter
+            .as_ref()
+            .map_or(0.0, |filter| each!(filter, x => by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)])))
+    }
+
+    /// Replaces the capacity estimate, and the open-circuit curve by that of this capacity (at transitions only). The state
+    /// moves as if the curve had been that one since the last call.
     ///
     /// The filter's variance never falls by that: the evidence since the last call may have counted for too much.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
         self.memory.capacity = capacity;
+        let before = self.memory.curve();
+        self.memory.set_curve(capacity);
         if let Some(filter) = &mut self.filter {
             each!(filter, x => {
+                let column = x.by_constant.column(CURVE_CAPACITY).into_owned();
+                if before.variance > 0.0 {
+                    x.mean += column * ((before.mean - capacity.mean) / before.std());
+                }
+                // What is left of the curve's error is the capacity's, and no longer apart from it.
+                x.covariance += column * column.transpose();
+                x.by_constant.column_mut(CURVE_CAPACITY).fill(0.0);
                 x.mean[CAPACITY] = capacity.mean;
                 // A smaller variance would not fit the covariances with the other states.
-                let variance = &mut x.covariance[(CAPACITY, CAPACITY)];
-                *variance = variance.max(capacity.variance);
+                let missing = capacity.variance - x.marginal(CAPACITY).variance;
+                x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
             });
         }
     }
@@ -196,6 +265,7 @@ impl CellEstimator {
     /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
+        self.memory.set_curve(ScalarGaussian { mean: capacity_ah, variance: 0.0 });
         if let Some(filter) = &mut self.filter {
             each!(filter, x => x.mean[CAPACITY] = capacity_ah);
         }

@@ -21,7 +21,7 @@ use nalgebra::SMatrix;
 
 use super::filter::update;
 use super::noise::VoltageReading;
-use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square, widened};
+use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::filter::{FilterError, Gaussian, Update};
 
@@ -39,16 +39,16 @@ pub(super) fn update_after_downtime<const N: usize>(
     let before_soc = x.mean[0];
     let mut used = used_prior(x, config, downtime_std);
     // Predicted variance of the voltage for a prior that wide; the copy is discarded.
-    let predicted = update(&mut used.clone(), model, config, reading)?.innovation_variance;
+    let predicted = update(&mut used.clone(), model, config, reading)?.0.innovation_variance;
     let drop_v = reading.current_a
         * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc))
         * libm::exp(x.mean[LOG_RESISTANCE]);
     let reach = 3.0_f64.sqrt() * downtime_std;
-    let soc = model.soc_of_aged_ocv(&reading.temperature, x.mean[CAPACITY], reading.voltage_v + drop_v);
+    let soc = model.soc_of_aged_ocv(&reading.temperature, reading.curve.mean, reading.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.
     used.mean[0] = soc.clamp(before_soc - reach, before_soc + reach);
-    let by_used = update(&mut used, model, config, reading)?;
-    let by_left_alone = update(x, model, config, reading)?;
+    let (by_used, _) = update(&mut used, model, config, reading)?;
+    let (by_left_alone, _) = update(x, model, config, reading)?;
     let log_likelihood = |variance: f64| -0.5 * (libm::log(variance) + square(by_left_alone.innovation) / variance);
     let odds = libm::exp(log_likelihood(by_left_alone.innovation_variance) - log_likelihood(predicted));
     let weight = USED_PRIOR / (USED_PRIOR + (1.0 - USED_PRIOR) * odds);
@@ -59,7 +59,7 @@ pub(super) fn update_after_downtime<const N: usize>(
 /// Prior of a cell that was used: SOC anywhere within reach and uncorrelated, branches as at a start.
 fn used_prior<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, downtime_std: f64) -> Gaussian<N> {
     let mut used = *x;
-    let soc_variance = widened(x.covariance[(0, 0)], square(downtime_std));
+    let soc_variance = widened(x.marginal(0).variance, square(downtime_std));
     for i in std::iter::once(0).chain(BRANCHES..N) {
         for j in 0..N {
             if i != j {
@@ -68,16 +68,20 @@ fn used_prior<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, downtim
         }
     }
     used.covariance[(0, 0)] = soc_variance;
+    used.by_constant.row_mut(0).fill(0.0);
     for i in BRANCHES..N {
+        used.by_constant.row_mut(i).fill(0.0);
         used.covariance[(i, i)] += square(config.initial.branch_std_v);
     }
     used
 }
 
-/// Mean and covariance of the mixture of two Gaussians, the second with `weight`.
+/// Mean and covariance of the mixture of two Gaussians, the second with `weight`. The difference of their constant errors is
+/// left out: it is small against that of their means.
 fn merge<const N: usize>(x: &mut Gaussian<N>, other: &Gaussian<N>, weight: f64) {
     let apart = other.mean - x.mean;
     let between: SMatrix<f64, N, N> = apart * apart.transpose();
     x.covariance = x.covariance * (1.0 - weight) + other.covariance * weight + between * (weight * (1.0 - weight));
+    x.by_constant = x.by_constant * (1.0 - weight) + other.by_constant * weight;
     x.mean += apart * weight;
 }

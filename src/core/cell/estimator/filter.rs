@@ -5,11 +5,13 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::noise::{self, VoltageReading};
-use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square, widened};
+use super::state_vector::{
+    BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, KNOWN_VARIANCE, LOG_RESISTANCE, square, widened,
+};
 use super::step::CellStep;
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::{CellModel, EstimatorConfig};
-use crate::filter::{FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
+use crate::filter::{CONSTANT_ERRORS, FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
 
 /// Largest standard deviation that a load through a gap adds to the SOC, fraction.
 const MAX_GAP_LOAD_STD: f64 = 0.3;
@@ -38,7 +40,10 @@ pub(super) use each;
 pub(super) struct LearnedState {
     pub(super) log_resistance: ScalarGaussian,
     pub(super) capacity: ScalarGaussian,
+    /// Covariance of both without the constant errors.
     pub(super) covariance: f64,
+    /// Errors of ln rho and of the capacity by the constant errors.
+    pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
 }
 
 /// The state at a start: SOC and branches new, the rest as learned.
@@ -50,12 +55,17 @@ pub(super) fn initial_state<const N: usize>(
     let mut mean = SVector::zeros();
     let mut variance = SVector::<f64, N>::repeat(branch_variance);
     (mean[0], variance[0]) = (soc.mean, soc.variance);
-    (mean[LOG_RESISTANCE], variance[LOG_RESISTANCE]) = (kept.log_resistance.mean, kept.log_resistance.variance);
-    (mean[CAPACITY], variance[CAPACITY]) = (kept.capacity.mean, kept.capacity.variance);
+    let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
+    for (k, (i, learned)) in [(LOG_RESISTANCE, kept.log_resistance), (CAPACITY, kept.capacity)].into_iter().enumerate()
+    {
+        let row = kept.by_constant.row(k);
+        (mean[i], variance[i]) = (learned.mean, (learned.variance - row.norm_squared()).max(KNOWN_VARIANCE));
+        by_constant.set_row(i, &row);
+    }
     let mut covariance = SMatrix::from_diagonal(&variance);
     (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) =
         (kept.covariance, kept.covariance);
-    Gaussian { mean, covariance }
+    Gaussian { mean, covariance, by_constant }
 }
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
@@ -76,12 +86,12 @@ pub(super) fn predict<const N: usize>(
         let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[CAPACITY]);
         let variance = square(config.process.soc_per_sqrt_s) * step.measured_s
             + square(config.process.charge_per_sqrt_soc) * moved_soc;
-        propagate(x, model, config, temperature_c, step.measured_s, step.charge_as)?;
+        propagate(x, model, config, temperature_c, (step.measured_s, step.charge_as, step.offset_s))?;
         x.covariance[(0, 0)] += variance;
     }
     if step.unmeasured_s > 0.0 {
         // The current of that time is unknown: 0 is assumed, but a load next to the gap may have continued through it.
-        propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
+        propagate(x, model, config, temperature_c, (step.unmeasured_s, 0.0, 0.0))?;
         let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[CAPACITY]);
         let load_std = if gap_load_a > config.gap.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
         let variance = square(config.gap.noise_per_sqrt_s) * step.unmeasured_s
@@ -92,14 +102,14 @@ pub(super) fn predict<const N: usize>(
     Ok(())
 }
 
-/// The circuit's equations over `dt_s`, with the noise of branches and resistance; the caller adds the SOC's.
+/// The circuit's equations over a time (s), the charge (A s) and the time with the current sensor's offset (s) in it, with
+/// the noise of branches and resistance; the caller adds the SOC's.
 fn propagate<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
     config: &EstimatorConfig,
     temperature_c: f64,
-    dt_s: f64,
-    charge_as: f64,
+    (dt_s, charge_as, offset_s): (f64, f64, f64),
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let temperature = model.temperature_position(temperature_c);
@@ -118,23 +128,49 @@ fn propagate<const N: usize>(
         }
         next
     };
-    let q = noise::process::<N>(model, config, &position(x.mean[0]), dt_s);
-    x.predict(&spread::<N>(config), f, &q)
+    let here = position(x.mean[0]);
+    let q = noise::process::<N>(model, config, &here, dt_s);
+
+    // The constant errors: the circuit's derivatives at the mean, and the charge that the sensor counts too much.
+    let mut by_constant = x.by_constant;
+    let (per_as, ratio) = (1.0 / (3600.0 * x.mean[CAPACITY]), libm::exp(x.mean[LOG_RESISTANCE]));
+    let mut excess_as = [0.0; CONSTANT_ERRORS];
+    excess_as[CURRENT_OFFSET] = config.sensor.current_offset_a * offset_s;
+    excess_as[CURRENT_GAIN] = config.sensor.current_gain * charge_as;
+    for k in 0..CONSTANT_ERRORS {
+        let moved_per_ah = charge_as * per_as / x.mean[CAPACITY];
+        by_constant[(0, k)] += excess_as[k] * per_as + moved_per_ah * x.by_constant[(CAPACITY, k)];
+    }
+    for i in BRANCHES..N {
+        let branch = BranchAt::new(model, i - BRANCHES, &here, ratio);
+        let kept = branch.voltage_after(config.discretisation, 1.0, 0.0, dt_s);
+        let gained_ohm = branch.voltage_after(config.discretisation, 0.0, 1.0, dt_s);
+        for k in 0..CONSTANT_ERRORS {
+            let excess_a = if dt_s > 0.0 { excess_as[k] / dt_s } else { 0.0 };
+            let driven_a = mean_current_a * x.by_constant[(LOG_RESISTANCE, k)] - excess_a;
+            by_constant[(i, k)] = kept * x.by_constant[(i, k)] + gained_ohm * driven_a;
+        }
+    }
+    x.predict(&spread::<N>(config), f, &q)?;
+    x.by_constant = by_constant;
+    Ok(())
 }
 
-/// Updates with a voltage reading.
+/// Updates with a voltage reading; also returns the effect of the current's offset on the innovation, V per standard
+/// deviation.
 #[inline]
 pub(super) fn update<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
     config: &EstimatorConfig,
     reading: &VoltageReading,
-) -> Result<Update, FilterError> {
-    let segment = model.aged_ocv.segment(x.mean[CAPACITY]);
+) -> Result<(Update, f64), FilterError> {
     let h = |x: &SVector<f64, N>| {
         let branches_v: f64 = (BRANCHES..N).fold(0.0, |sum, i| sum + x[i]);
-        let state = (x[0], libm::exp(x[LOG_RESISTANCE]), x[CAPACITY]);
-        circuit::aged_terminal_v(model, state, segment, &reading.temperature, branches_v, reading.current_a)
+        let state = (x[0], libm::exp(x[LOG_RESISTANCE]), reading.curve.mean);
+        circuit::aged_terminal_v(model, state, &reading.temperature, branches_v, reading.current_a)
     };
-    x.update(&spread::<N>(config), reading.voltage_v, h, &reading.noise(x, model, config))
+    let noise = reading.noise(x, model, config);
+    let update = x.update(&spread::<N>(config), reading.voltage_v, h, &noise)?;
+    Ok((update, noise.by_constant[CURRENT_OFFSET]))
 }

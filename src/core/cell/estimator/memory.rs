@@ -32,6 +32,9 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
+    /// Capacity of the open-circuit curve, Ah; `None` in a state stored before it was kept: then that of the cell.
+    #[serde(default)]
+    pub(super) curve: Option<ScalarGaussian>,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
@@ -45,6 +48,13 @@ pub(super) struct Memory {
     /// How long the cell has rested, s.
     #[serde(default)]
     pub(super) rest_s: f64,
+    /// Information about the current sensor's offset in the voltages since it was last corrected, in units of its standard
+    /// deviation: sum of d^2 / R with d its effect on an innovation of variance R without it.
+    #[serde(default)]
+    pub(super) offset_information: f64,
+    /// What these voltages say: sum of d x innovation / R.
+    #[serde(default)]
+    pub(super) offset_score: f64,
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
     #[serde(default, rename = "away_std")]
     pub(super) downtime_std: f64,
@@ -65,6 +75,7 @@ impl Memory {
         let (capacity, log_resistance) = configured(config);
         Self {
             capacity,
+            curve: Some(config.initial.curve),
             log_resistance,
             temperature_c: None,
             last_current_a: 0.0,
@@ -72,12 +83,25 @@ impl Memory {
             mean_nis: 0.0,
             information_s: config.voltage.max_information_s,
             rest_s: 0.0,
+            offset_information: 0.0,
+            offset_score: 0.0,
             downtime_std: 0.0,
             is_unseen: false,
             rejected: 0,
             rejected_s: 0.0,
             rejected_after_gap: false,
         }
+    }
+
+    /// Capacity of the open-circuit curve, Ah.
+    #[inline]
+    pub(super) fn curve(&self) -> ScalarGaussian {
+        self.curve.unwrap_or(self.capacity)
+    }
+
+    /// Sets the capacity of the open-circuit curve, Ah.
+    pub(super) fn set_curve(&mut self, curve: ScalarGaussian) {
+        self.curve = Some(curve);
     }
 
     /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
@@ -120,6 +144,14 @@ impl Memory {
     #[inline]
     pub(super) fn is_carried_over(&self) -> bool {
         self.is_unseen || self.downtime_std_if_any().is_some()
+    }
+
+    /// Adds what a reading says about the current's offset, whose standard deviation moves the innovation by `offset_v`.
+    #[inline]
+    pub(super) fn note_offset(&mut self, offset_v: f64, update: &Update) {
+        let per_variance = offset_v / (update.innovation_variance - square(offset_v));
+        self.offset_information += per_variance * offset_v;
+        self.offset_score += per_variance * update.innovation;
     }
 
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
@@ -165,11 +197,14 @@ impl Memory {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
         check_log_resistance(self.log_resistance.mean)?;
+        InvalidState::unless_capacity("the capacity of a cell's open-circuit curve", self.curve().mean)?;
+        InvalidState::unless_natural("its variance", self.curve().variance)?;
         for variance in [self.capacity.variance, self.log_resistance.variance] {
             InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
         }
-        let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a];
-        InvalidState::unless_numbers("a cell's last temperature or current", signed)?;
+        let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a, self.offset_score];
+        InvalidState::unless_numbers("a cell's last temperature or current, or its offset", signed)?;
+        InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;
         let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
         InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }

@@ -9,11 +9,15 @@
 //! that begins under load, the constant-voltage part of a charge, and cold cells no longer count as exact.
 //! At rest the error repeats instead of averaging out: a rest of t counts as t_r ln(1 + t/t_r) under load.
 
-use nalgebra::SMatrix;
+use nalgebra::{SMatrix, SVector};
 
-use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square};
-use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, TemperaturePosition};
-use crate::filter::{Gaussian, MeasurementNoise};
+use super::state_vector::{
+    BRANCH_RESISTANCE, BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
+    VOLTAGE_OFFSET, square,
+};
+use crate::cell::aged_ocv::MIXES;
+use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
+use crate::filter::{CONSTANT_ERRORS, Gaussian, MeasurementNoise, ScalarGaussian};
 
 /// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
 pub(super) const MAX_WALK_S: f64 = 600.0;
@@ -43,6 +47,9 @@ pub(super) struct VoltageReading {
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
+    /// Capacity of the open-circuit curve, Ah: that by the last half-cycle. A voltage says nothing about the capacity through
+    /// the shape of the curve: the model's errors would be mistaken for lost capacity.
+    pub(super) curve: ScalarGaussian,
 }
 
 impl VoltageReading {
@@ -54,9 +61,10 @@ impl VoltageReading {
         config: &EstimatorConfig,
     ) -> MeasurementNoise {
         let position = model.grid_position_at(&self.temperature, x.mean[0]);
-        let slope_v = model.ocv_slope_v(&position, x.mean[CAPACITY]);
+        let slope_v = model.ocv_slope_v(&position, self.curve.mean);
         let ratio = libm::exp(x.mean[LOG_RESISTANCE]);
-        let drop_v = (BRANCHES..N).fold(model.r0_ohm(&position) * ratio * self.current_a, |sum, i| sum + x.mean[i]);
+        let r0_ohm = model.r0_ohm(&position) * ratio;
+        let drop_v = (BRANCHES..N).fold(r0_ohm * self.current_a, |sum, i| sum + x.mean[i]);
         let load_v = model.settled_ohm(&position) * ratio * self.load_a;
         let base_v_sqrt_s = model
             .voltage_error_v(&position)
@@ -71,7 +79,33 @@ impl VoltageReading {
                 + square(config.gate.model_error_v)
                 + square(config.gate.soc_error * slope_v),
             gate_sigma: config.gate.sigma,
+            by_constant: self.by_constant(x, (model, config), &position, slope_v, r0_ohm),
         }
+    }
+
+    /// Effect of the constant errors on the voltage less its prediction, V.
+    fn by_constant<const N: usize>(
+        &self,
+        x: &Gaussian<N>,
+        (model, config): (&CellModel, &EstimatorConfig),
+        position: &GridPosition,
+        slope_v: f64,
+        r0_ohm: f64,
+    ) -> SVector<f64, CONSTANT_ERRORS> {
+        let SensorErrors { voltage_offset_v, current_offset_a, current_gain, branch_resistance } = config.sensor;
+        let branches_v = (BRANCHES..N).fold(0.0, |sum, i| sum + x.mean[i]);
+        let offset_a = if self.current_a == 0.0 { 0.0 } else { current_offset_a };
+        let mut direct_v = SVector::<f64, CONSTANT_ERRORS>::zeros();
+        direct_v[VOLTAGE_OFFSET] = voltage_offset_v;
+        direct_v[CURRENT_OFFSET] = r0_ohm * offset_a;
+        direct_v[CURRENT_GAIN] = r0_ohm * current_gain * self.current_a;
+        direct_v[BRANCH_RESISTANCE] = -branch_resistance * branches_v;
+        let (per_ah_v, mixes_v) = model.aged_ocv_changes_v(position, self.curve.mean);
+        direct_v[CURVE_CAPACITY] = -per_ah_v * self.curve.std();
+        direct_v.fixed_rows_mut::<MIXES>(CURVE_MIXES).copy_from_slice(&mixes_v);
+        let mut slopes = SVector::<f64, N>::repeat(-1.0);
+        (slopes[0], slopes[LOG_RESISTANCE], slopes[CAPACITY]) = (slope_v, -r0_ohm * self.current_a, 0.0);
+        direct_v + x.by_constant.tr_mul(&slopes)
     }
 }
 

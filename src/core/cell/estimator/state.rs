@@ -10,7 +10,7 @@ use super::cell_estimator::CellEstimator;
 use super::filter::{Filter, each};
 use super::memory::{Memory, check_log_resistance};
 use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
-use crate::filter::Gaussian;
+use crate::filter::{CONSTANT_ERRORS, Gaussian};
 use crate::quantity::InvalidState;
 
 /// The estimator's state as a document.
@@ -21,6 +21,9 @@ pub struct CellState {
     mean: Vec<f64>,
     /// Its covariance in that order, row by row.
     covariance: Vec<f64>,
+    /// Errors of that state by the constant errors, state by state.
+    #[serde(default)]
+    by_constant: Vec<f64>,
     memory: Memory,
 }
 
@@ -37,9 +40,9 @@ const fn place_of(i: usize, n: usize) -> usize {
 impl CellEstimator {
     /// Returns the state for storing.
     pub fn snapshot(&self) -> CellState {
-        let (mean, covariance) =
+        let (mean, covariance, by_constant) =
             self.filter.as_ref().map_or_else(Default::default, |filter| each!(filter, x => document(x)));
-        CellState { mean, covariance, memory: self.memory }
+        CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
     /// Restores a stored state; `None` when it is for another number of branches.
@@ -66,6 +69,7 @@ impl CellState {
         self.memory.check()?;
         InvalidState::unless_numbers("a mean of a cell's filter", self.mean.iter().copied())?;
         InvalidState::unless_numbers("a covariance of a cell's filter", self.covariance.iter().copied())?;
+        InvalidState::unless_numbers("a constant error of a cell's filter", self.by_constant.iter().copied())?;
         let size = self.mean.len();
         let variances = self.covariance.iter().step_by(size + 1);
         variances.copied().try_for_each(|x| InvalidState::unless_positive("a variance of a cell's filter", x))?;
@@ -75,11 +79,13 @@ impl CellState {
     }
 }
 
-fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>) {
+fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let place = |i| place_of(i, N);
     let mean = (0..N).map(|i| x.mean[place(i)]).collect();
     let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))]).collect();
-    (mean, covariance)
+    let by_constant =
+        (0..N * CONSTANT_ERRORS).map(|i| x.by_constant[(place(i / CONSTANT_ERRORS), i % CONSTANT_ERRORS)]);
+    (mean, covariance, by_constant.collect())
 }
 
 fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
@@ -88,6 +94,11 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
     }
     let mut mean = SVector::<f64, N>::zeros();
     let mut covariance = SMatrix::<f64, N, N>::zeros();
+    let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
+    // A state stored before constant errors were considered has none.
+    for (i, stored) in state.by_constant.chunks_exact(CONSTANT_ERRORS).take(N).enumerate() {
+        stored.iter().enumerate().for_each(|(k, &error)| by_constant[(place_of(i, N), k)] = error);
+    }
     for i in 0..N {
         mean[place_of(i, N)] = state.mean[i];
         for j in 0..N {
@@ -97,7 +108,7 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
     let is_symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
     let is_consistent = is_symmetric && covariance.cholesky().is_some();
     let covariance = if is_consistent { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
-    Some(Gaussian { mean, covariance })
+    Some(Gaussian { mean, covariance, by_constant })
 }
 
 #[cfg(test)]
@@ -112,6 +123,7 @@ mod tests {
         let step = CellStep {
             measured_s: 1.0,
             charge_as: 0.0,
+            offset_s: 0.0,
             unmeasured_s: 0.0,
             current_a: Some(0.0),
             temperature_c: Some(25.0),

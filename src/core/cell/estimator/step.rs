@@ -9,6 +9,8 @@ pub struct CellStep {
     pub measured_s: f64,
     /// Charge taken out in that time, A s.
     pub charge_as: f64,
+    /// Part of that time in which the current sensor's offset is in the charge, s: a reading of exactly zero has none.
+    pub offset_s: f64,
     /// Time without a current measurement, s (asleep, sensor lost).
     pub unmeasured_s: f64,
     /// Cell current at the reading, A; `None` = unknown, then the voltage is not used.

@@ -8,7 +8,7 @@ use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
 use crate::cell::{
     CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
-    InitialState, ProcessNoise, SigmaPointSettings, VoltageError,
+    InitialState, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 use crate::filter::ScalarGaussian;
 
@@ -23,6 +23,7 @@ pub(crate) fn config() -> EstimatorConfig {
             branch_std_v: 0.05,
             capacity_ah: 2.0,
             capacity_std_ah: 0.2,
+            curve: ScalarGaussian::from_std(2.0, 0.06),
             log_resistance_std: 0.2,
         },
         process: ProcessNoise {
@@ -45,6 +46,7 @@ pub(crate) fn config() -> EstimatorConfig {
             load_memory_s: 1200.0,
             max_information_s: 100.0,
         },
+        sensor: SensorErrors::NONE,
         gate: GateSettings { sigma: 5.0, model_error_v: 0.06, soc_error: 0.02, lost_after_s: 30.0 },
         consistency: ConsistencySettings { window_s: 600.0, limit: 4.0 },
     }
@@ -65,15 +67,16 @@ impl Truth {
         self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, dt_s);
         self.soc = circuit::soc_after(self.soc, current_a * dt_s, self.capacity_ah);
         let state = (self.soc, self.ratio, self.capacity_ah);
-        let (segment, temperature) = (model.aged_ocv.segment(self.capacity_ah), model.temperature_position(25.0));
+        let temperature = model.temperature_position(25.0);
         CellStep {
             measured_s: dt_s,
             charge_as: current_a * dt_s,
+            offset_s: dt_s,
             unmeasured_s: 0.0,
             current_a: Some(current_a),
             temperature_c: Some(25.0),
             ambient_c: 25.0,
-            voltage_v: circuit::aged_terminal_v(model, state, segment, &temperature, self.branch_v, current_a),
+            voltage_v: circuit::aged_terminal_v(model, state, &temperature, self.branch_v, current_a),
         }
     }
 }
@@ -270,6 +273,7 @@ fn an_aged_cell_starts_on_its_aged_curve() {
     model.aged_ocv = crate::cell::AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &model.ocv_v.values);
     let mut config = config();
     config.initial.capacity_ah = 1.5;
+    config.initial.curve = ScalarGaussian::from_std(1.5, 0.0);
     // So sure of its start that the first voltage does not move it.
     config.initial.soc_std = 1e-3;
     let mut truth = Truth { soc: 0.4, branch_v: 0.0, capacity_ah: 1.5, ratio: 1.0 };

@@ -73,8 +73,8 @@ fn soc_of_ocv_inverts_the_curve() {
 fn an_aged_cells_voltage_and_slope_agree_and_invert() {
     let mut model = small_model();
     model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &[vec![3.0, 3.5, 4.0]]);
-    let (segment, temperature) = (model.aged_ocv.segment(1.5), model.temperature_position(17.0));
-    let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), segment, 1.5);
+    let temperature = model.temperature_position(17.0);
+    let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), 1.5);
     // A quarter lost moves the middle by 0.8 x 0.25 x 0.25 of SOC.
     let new_v = model.ocv_v(&model.grid_position(0.5, 17.0));
     assert!((at(0.5) - new_v - 0.05).abs() < 1e-12);

@@ -7,15 +7,18 @@ use std::array::from_fn;
 use nalgebra::{SMatrix, SVector};
 
 use super::input::{BlockInput, CellSlot, WIDTH};
-use super::kernel::{self, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, REST_S, at};
+use super::kernel::{
+    self, CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS,
+    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, at,
+};
 use super::tables::{LineCache, Tables};
 use crate::cell::estimator::filter::Filter;
 use crate::cell::estimator::memory::Memory;
 use crate::cell::estimator::state_vector::CAPACITY;
 use crate::cell::estimator::step::{CellStep, StepResult};
 use crate::cell::model::CellModel;
-use crate::filter::Gaussian;
 use crate::filter::simd::Lanes;
+use crate::filter::{CONSTANT_ERRORS, Gaussian};
 
 /// Filters of N states, with T numbers of the covariance and tables of W columns.
 #[derive(Debug, Clone)]
@@ -91,7 +94,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (0..N).for_each(|i| covariance[at(i, i)] = Lanes::splat(1.0));
         let mut mean = [zero; N];
         mean[CAPACITY] = Lanes::splat(1e3);
-        let state = FilterState { mean, covariance, memory: [zero; kernel::MEMORY] };
+        let by_constant = [[zero; N]; CONSTANT_ERRORS];
+        let state = FilterState { mean, covariance, by_constant, memory: [zero; kernel::MEMORY] };
         let tables = Tables::new(model);
         Self {
             cache: vec![(LineCache::new(&tables), from_fn(|_| LineCache::new(&tables))); blocks],
@@ -163,7 +167,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         let state = FilterState::of_lane(&self.blocks[block], lane);
         let mean = SVector::from_fn(|i, _| state.mean[i].0[0]);
         let covariance = SMatrix::from_fn(|i, j| state.covariance[at(i.max(j), i.min(j))].0[0]);
-        (make(Gaussian { mean, covariance }), state.memory.map(|number| number.0[0]))
+        let by_constant = SMatrix::from_fn(|i, k| state.by_constant[k][i].0[0]);
+        (make(Gaussian { mean, covariance, by_constant }), state.memory.map(|number| number.0[0]))
     }
 
     /// Puts a filter into a lane; returns true, the cell's new `has_filter`.
@@ -174,6 +179,9 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
             state.mean[i].0[lane] = filter.mean[i];
             for j in 0..=i {
                 state.covariance[at(i, j)].0[lane] = filter.covariance[(i, j)];
+            }
+            for k in 0..CONSTANT_ERRORS {
+                state.by_constant[k][i].0[lane] = filter.by_constant[(i, k)];
             }
         }
         true
@@ -186,6 +194,9 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         hot[MEAN_NIS].0[lane] = memory.mean_nis;
         hot[INFORMATION_S].0[lane] = memory.information_s;
         hot[REST_S].0[lane] = memory.rest_s;
+        hot[OFFSET_INFORMATION].0[lane] = memory.offset_information;
+        hot[OFFSET_SCORE].0[lane] = memory.offset_score;
+        (hot[CURVE_AH].0[lane], hot[CURVE_STD_AH].0[lane]) = (memory.curve().mean, memory.curve().std());
         false
     }
 }

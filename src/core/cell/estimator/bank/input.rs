@@ -41,6 +41,7 @@ impl BlockInput {
         input: StepInput {
             measured_s: Lanes([1.0; WIDTH]),
             charge_as: Lanes([0.0; WIDTH]),
+            offset_s: Lanes([0.0; WIDTH]),
             current_a: Lanes([0.0; WIDTH]),
             voltage_v: Lanes([0.0; WIDTH]),
             temperature_c: Lanes([25.0; WIDTH]),
@@ -65,6 +66,7 @@ impl BlockInput {
         CellStep {
             measured_s: input.measured_s.0[lane],
             charge_as: input.charge_as.0[lane],
+            offset_s: input.offset_s.0[lane],
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
             temperature_c: Some(input.temperature_c.0[lane]),
@@ -82,6 +84,7 @@ impl StepInput<WIDTH> {
         StepInput {
             measured_s: take(&self.measured_s),
             charge_as: take(&self.charge_as),
+            offset_s: take(&self.offset_s),
             current_a: take(&self.current_a),
             voltage_v: take(&self.voltage_v),
             temperature_c: take(&self.temperature_c),

@@ -23,14 +23,14 @@ mod update;
 
 use predict::predict;
 pub(super) use types::{
-    DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY, REST_S, StepInput,
-    StepOutcome, at,
+    CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY,
+    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, StepInput, StepOutcome, at,
 };
 use update::update;
 
 use super::tables::{LineCache, Tables};
 use crate::cell::estimator::memory::REST_REPEATS_S;
-use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
+use crate::cell::estimator::state_vector::LOG_RESISTANCE;
 use crate::filter::simd::Lanes;
 
 /// One ordinary step.
@@ -44,9 +44,8 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
 ) -> (FilterState<L, N, T>, StepOutcome<L>) {
     tables.refresh_temperatures(cache, &input.temperature_c);
     let ratio = before.mean[LOG_RESISTANCE].exp();
-    let (mean, covariance, has_factor) = predict(tables, cache, c, before, input, ratio);
-    let mut x = FilterState { mean, covariance, memory: before.memory };
-    tables.refresh_capacities(cache, &x.mean[CAPACITY]);
+    tables.refresh_capacities(cache, &before.memory[CURVE_AH]);
+    let (mut x, has_factor) = predict(tables, cache, c, before, input, ratio);
     let information_s = update_memory(c, &mut x, input);
     let mut outcome = update(tables, cache, c, &mut x, input, ratio, information_s);
     x.memory[INFORMATION_S] = Lanes::splat(0.0);
@@ -60,6 +59,7 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     for i in 0..T {
         sum = sum + x.covariance[i];
     }
+    sum = sum + x.memory[OFFSET_INFORMATION] + x.memory[OFFSET_SCORE];
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
     (x, outcome)

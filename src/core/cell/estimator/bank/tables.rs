@@ -8,20 +8,20 @@
 //!
 //! In: states of charge, degrees C. Out: V, ohm, s. A NaN gives NaN in its own lane alone: such a step is not usable.
 
-use crate::cell::aged_ocv::OffsetLine;
+use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
 /// Index of the open-circuit voltage, V, in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
-/// Index of its change per capacity, V per Ah; 0 where the curve does not age.
+/// Index of its change with the capacity, V per Ah; 0 where the curve does not age. Those by the mixes of losses follow.
 pub(super) const OCV_PER_AH: usize = 2;
 /// Index of the series resistance, ohm.
-pub(super) const R0_OHM: usize = 4;
+pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
 /// Index of the voltage error, V; 0 where the model has none.
-pub(super) const ERROR_V: usize = 6;
+pub(super) const ERROR_V: usize = R0_OHM + 2;
 /// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
-const BRANCHES: usize = 8;
+const BRANCHES: usize = ERROR_V + 2;
 
 /// Temperatures with cached rows: more than packs have sensors. Beyond that, rows are computed again with equal results.
 const MAX_ISOTHERMS: usize = 64;
@@ -31,7 +31,7 @@ pub(super) const fn branch(i: usize) -> usize {
     BRANCHES + 4 * i
 }
 
-/// The tables, `W` = 8 + 4 per branch.
+/// The tables, `W` = 12 + 4 per branch.
 #[derive(Debug, Clone)]
 pub(super) struct Tables<const W: usize> {
     model: CellModel,
@@ -42,10 +42,6 @@ pub(super) struct Tables<const W: usize> {
     nodes: Vec<[f64; W]>,
     /// Rows at `temperatures_c`.
     rows: Vec<[f64; W]>,
-    /// Borders between segments of capacity, Ah; the outer segments are unbounded.
-    borders_ah: Vec<f64>,
-    /// Change of the open-circuit voltage by ageing, segment by segment, interval by interval.
-    offsets: Vec<OffsetLine>,
     temperatures_c: [f64; MAX_ISOTHERMS],
     /// Slot of the next new temperature.
     next: usize,
@@ -58,10 +54,8 @@ pub(super) struct LineCache<const L: usize, const W: usize> {
     temperature_c: [f64; L],
     /// Last slots of the temperatures' rows.
     isotherms: [usize; L],
-    /// Segments of capacity, and their lower and upper ends, Ah.
-    segments: [usize; L],
-    from_ah: Lanes<L>,
-    to_ah: Lanes<L>,
+    /// Capacities of the open-circuit curves, Ah.
+    capacity_ah: [f64; L],
     places: [CachedLines<L, W>; 3],
 }
 
@@ -93,14 +87,7 @@ impl<const W: usize> Tables<W> {
             (0..=temperatures).flat_map(|t| (0..intervals).map(move |s| row(model, t.min(temperatures - 1), s)));
         let mut borders = model.soc.clone();
         (borders[0], borders[intervals]) = (f64::NEG_INFINITY, f64::INFINITY);
-        let ends = [f64::NEG_INFINITY, f64::INFINITY];
-        let borders_ah: Vec<f64> =
-            ends[..1].iter().chain(model.aged_ocv.borders_ah()).chain(&ends[1..]).copied().collect();
-        let segments = 0..borders_ah.len() - 1;
-        let offsets = segments.flat_map(|k| (0..intervals).map(move |s| model.aged_ocv.line(&model.soc, k, s)));
         Self {
-            offsets: offsets.collect(),
-            borders_ah,
             borders,
             nodes: nodes.collect(),
             rows: vec![[0.0; W]; MAX_ISOTHERMS * intervals],
@@ -178,18 +165,17 @@ impl<const W: usize> Tables<W> {
                 cache.temperature_c[lane] = temperature_c.0[lane];
                 let isotherm = self.isotherm(temperature_c.0[lane], cache.isotherms[lane]);
                 cache.isotherms[lane] = isotherm;
-                let segment = cache.segments[lane];
-                cache.places.iter_mut().for_each(|lines| self.copy((isotherm, segment), lines, lane));
+                let capacity_ah = cache.capacity_ah[lane];
+                cache.places.iter_mut().for_each(|lines| self.copy((isotherm, capacity_ah), lines, lane));
             }
         }
     }
 
-    /// Brings the lines of `cache` to the segments of these capacities, Ah.
+    /// Brings the lines of `cache` to the open-circuit curves of these capacities, Ah. They change at half-cycles.
     #[inline(always)]
     pub(super) fn refresh_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
-        let holds =
-            |lane: usize| (capacity_ah.0[lane] >= cache.from_ah.0[lane]) & (capacity_ah.0[lane] < cache.to_ah.0[lane]);
-        if !(0..L).fold(true, |same, lane| same & holds(lane)) {
+        let same = (0..L).fold(true, |same, lane| same & (cache.capacity_ah[lane] == capacity_ah.0[lane]));
+        if !same {
             self.reload_capacities(cache, capacity_ah);
         }
     }
@@ -198,13 +184,10 @@ impl<const W: usize> Tables<W> {
     #[inline(never)]
     fn reload_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
         for lane in 0..L {
-            let inner = &self.borders_ah[1..self.borders_ah.len() - 1];
-            let segment = inner.iter().filter(|&&border| capacity_ah.0[lane] >= border).count();
-            cache.segments[lane] = segment;
-            (cache.from_ah.0[lane], cache.to_ah.0[lane]) = (self.borders_ah[segment], self.borders_ah[segment + 1]);
+            cache.capacity_ah[lane] = capacity_ah.0[lane];
             let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
             cache.isotherms[lane] = isotherm;
-            cache.places.iter_mut().for_each(|lines| self.copy((isotherm, segment), lines, lane));
+            cache.places.iter_mut().for_each(|lines| self.copy((isotherm, capacity_ah.0[lane]), lines, lane));
         }
     }
 
@@ -240,21 +223,24 @@ impl<const W: usize> Tables<W> {
                     (lines.from.0[lane], lines.to.0[lane]) = (self.borders[interval], self.borders[interval + 1]);
                     let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
                     cache.isotherms[lane] = isotherm;
-                    self.copy((isotherm, cache.segments[lane]), lines, lane);
+                    self.copy((isotherm, cache.capacity_ah[lane]), lines, lane);
                 }
             }
         }
     }
 
-    /// Copies the lines of a lane's interval into the cache, at an isotherm and in a segment of capacity.
-    fn copy<const L: usize>(&self, (isotherm, segment): (usize, usize), lines: &mut CachedLines<L, W>, lane: usize) {
+    /// Copies the lines of a lane's interval into the cache, at an isotherm and for a capacity, Ah.
+    fn copy<const L: usize>(&self, (isotherm, capacity_ah): (usize, f64), lines: &mut CachedLines<L, W>, lane: usize) {
         let interval = lines.interval[lane];
         let row = &self.rows[isotherm * self.intervals() + interval];
         lines.row.iter_mut().zip(row).for_each(|(lanes, value)| lanes.0[lane] = *value);
-        let OffsetLine { fixed, per_ah } = self.offsets[segment * self.intervals() + interval];
+        let OffsetLine { offset_v, per_ah_v, mixes_v } =
+            self.model.aged_ocv.line(&self.model.soc, interval, capacity_ah);
         for k in 0..2 {
-            lines.row[OCV_V + k].0[lane] += fixed[k];
-            lines.row[OCV_PER_AH + k].0[lane] = per_ah[k];
+            lines.row[OCV_V + k].0[lane] += offset_v.0[k];
+            for (i, change_v) in std::iter::once(&per_ah_v).chain(&mixes_v).enumerate() {
+                lines.row[OCV_PER_AH + 2 * i + k].0[lane] = change_v.0[k];
+            }
         }
     }
 }
@@ -272,9 +258,7 @@ impl<const L: usize, const W: usize> LineCache<L, W> {
         Self {
             temperature_c: [f64::NAN; L],
             isotherms: [0; L],
-            segments: [0; L],
-            from_ah: Lanes::splat(tables.borders_ah[0]),
-            to_ah: Lanes::splat(tables.borders_ah[1]),
+            capacity_ah: [f64::NAN; L],
             places: [lines.clone(), lines.clone(), lines],
         }
     }
@@ -294,18 +278,17 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         Self { row: &lines.row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
-    /// Open-circuit voltage of cells of a capacity, V, its slope, V per unit of SOC, and series resistance, ohm.
+    /// Open-circuit voltage, V, its slope, V per unit of SOC, and series resistance, ohm.
     #[inline(always)]
-    pub(super) fn ocv_and_r0(&self, capacity_ah: Lanes<L>) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
-        let slope_v = self.row[OCV_V + 1] + self.row[OCV_PER_AH + 1] * capacity_ah;
-        let at_zero_v = self.row[OCV_V] + self.row[OCV_PER_AH] * capacity_ah;
-        (at_zero_v + slope_v * self.soc, slope_v, self.one(R0_OHM))
+    pub(super) fn ocv_and_r0(&self) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
+        let slope_v = self.row[OCV_V + 1];
+        (self.row[OCV_V] + slope_v * self.soc, slope_v, self.one(R0_OHM))
     }
 
-    /// Change of the open-circuit voltage with the capacity, V per Ah.
+    /// Change of the open-circuit voltage with the capacity, V per Ah, and by each mix of losses, V.
     #[inline(always)]
-    pub(super) fn ocv_per_ah(&self) -> Lanes<L> {
-        self.row[OCV_PER_AH] + self.row[OCV_PER_AH + 1] * self.soc
+    pub(super) fn ocv_changes(&self) -> [Lanes<L>; 1 + MIXES] {
+        std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)
     }
 
     /// Resistance, ohm, and time constant, s, of a branch.

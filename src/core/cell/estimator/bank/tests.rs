@@ -3,9 +3,16 @@
 use super::*;
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::config::{CapacityState, Discretisation, SigmaPointSettings};
-use crate::cell::estimator::tests::config;
+use crate::cell::estimator::tests::config as without_errors;
 use crate::cell::model::tests::small_model;
-use crate::cell::{AgedOcv, Table};
+use crate::cell::{AgedOcv, SensorErrors, Table};
+
+/// Settings with every constant error.
+fn config() -> EstimatorConfig {
+    let sensor =
+        SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, branch_resistance: 0.1 };
+    EstimatorConfig { sensor, ..without_errors() }
+}
 
 /// A generator of numbers in [0, 1) with a fixed seed.
 struct Dice(u64);
@@ -86,13 +93,13 @@ impl Pack {
         let state = (cell.soc, cell.ratio, cell.capacity_ah);
         let branches_v = cell.branch_v.iter().sum();
         let temperature = self.model.temperature_position(temperature_c);
-        let segment = self.model.aged_ocv.segment(state.2);
-        let truth_v = circuit::aged_terminal_v(&self.model, state, segment, &temperature, branches_v, current_a);
+        let truth_v = circuit::aged_terminal_v(&self.model, state, &temperature, branches_v, current_a);
         let outlier_v = if dice.roll() < 1e-3 { 0.8 } else { 0.0 };
         let lost = time % 4000 > 3900 && index == 1;
         let step = CellStep {
             measured_s: dt_s,
             charge_as: current_a * dt_s,
+            offset_s: if current_a == 0.0 { 0.0 } else { dt_s },
             unmeasured_s: gap_s,
             current_a: (dice.roll() > 1e-3).then_some(current_a),
             temperature_c: (index != 2).then_some(temperature_c),
@@ -198,6 +205,7 @@ fn every_setting_that_changes_the_filter_changes_the_kernel() {
         (&plain, held),
         (&plain, euler),
         (&plain, spread),
+        (&plain, without_errors()),
     ];
     for (case, (model, config)) in cases.into_iter().enumerate() {
         let (soc, learned) = differences(model, &config, 6000);

@@ -8,6 +8,7 @@ fn step(current_a: f64, measured_s: f64, unmeasured_s: f64) -> CellStep {
     CellStep {
         measured_s,
         charge_as: current_a * measured_s,
+        offset_s: measured_s,
         unmeasured_s,
         current_a: Some(current_a),
         temperature_c: Some(25.0),

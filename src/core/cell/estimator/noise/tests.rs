@@ -23,7 +23,8 @@ fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
 fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
     let (mut config, mut model) = (config(), small_model());
     config.voltage.noise_v = 0.0;
-    let mut x = Gaussian::<4> { mean: nalgebra::SVector::zeros(), covariance: SMatrix::identity() };
+    let mut x =
+        Gaussian::<4> { mean: SVector::zeros(), covariance: SMatrix::identity(), by_constant: SMatrix::zeros() };
     (x.mean[0], x.mean[3], x.mean[2]) = (0.5, 0.05, 2.0);
     let of = |model: &CellModel, load_a: f64, current_a: f64, information_s: f64| {
         VoltageReading {
@@ -32,6 +33,7 @@ fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
             load_a,
             temperature: model.temperature_position(0.0),
             information_s,
+            curve: ScalarGaussian::from_std(2.0, 0.1),
         }
         .noise(&x, model, &config)
     };

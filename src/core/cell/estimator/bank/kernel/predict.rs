@@ -7,7 +7,8 @@ use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, su
 use super::types::{FilterState, KernelConstants, StepInput, at};
 use crate::cell::estimator::bank::tables::{LineCache, TablePoint, Tables};
 use crate::cell::estimator::noise::MAX_WALK_S;
-use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
+use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, LOG_RESISTANCE};
+use crate::filter::CONSTANT_ERRORS;
 use crate::filter::simd::{Lanes, Mask};
 
 /// A branch at L table points, over the measured time.
@@ -66,6 +67,8 @@ struct BranchPrediction<const L: usize> {
     centre_v: Lanes<L>,
     /// Remaining part of its voltage, at the centre.
     decay: Lanes<L>,
+    /// Voltage that a current adds to a new cell's, at the centre, ohm.
+    gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,
 }
@@ -83,7 +86,8 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     let one = Lanes::splat(1.0);
     let here = BranchStep::new(c, input, &table_points[0], i);
     let decay = here.decay;
-    let gain = here.r_ohm * drive * (one - decay);
+    let gain_ohm = here.r_ohm * (one - decay);
+    let gain = gain_ohm * drive;
     let centre_v = gain + before_v * decay;
     let reach = l[0][i] * c.scale;
     let plus = BranchStep::new(c, input, &table_points[1], i).voltage_v(drive * ratios.first[0], before_v + reach);
@@ -94,10 +98,19 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     parts.even[1] = gain * ratios.second[1];
     parts.odd[2] = decay * l[2][i];
     let noise = here.tau_s * (0.5 * c.process.branch_per_s) * (one - here.exact.square());
-    BranchPrediction { centre_v, decay, noise, parts }
+    BranchPrediction { centre_v, decay, gain_ohm, noise, parts }
 }
 
-/// Predicts mean and covariance; the mask is true where the covariance before was positive definite.
+/// Charge that one standard deviation of each constant error adds to the measured one, A s.
+#[inline(always)]
+fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lanes<L>; CONSTANT_ERRORS] {
+    let mut excess_as = [Lanes::splat(0.0); CONSTANT_ERRORS];
+    excess_as[CURRENT_OFFSET] = input.offset_s * c.sensor.current_offset_a;
+    excess_as[CURRENT_GAIN] = input.charge_as * c.sensor.current_gain;
+    excess_as
+}
+
+/// Predicts the state; the mask is true where the covariance before was positive definite.
 #[inline(always)]
 pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
@@ -106,7 +119,7 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
     x: &FilterState<L, N, T>,
     input: &StepInput<L>,
     ratio: Lanes<L>,
-) -> ([Lanes<L>; N], [Lanes<L>; T], Mask<L>) {
+) -> (FilterState<L, N, T>, Mask<L>) {
     let PartialCholesky { columns: l, is_positive, .. } = PartialCholesky::<L, N>::new(&x.covariance);
     let dt = input.measured_s;
     let charge_ah = input.charge_as * (1.0 / 3600.0);
@@ -116,7 +129,13 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
     let drive = ratio * (input.charge_as * input.decay.per_s);
 
     let soc_shift = soc.shift(c);
-    let (mut mean, mut p) = (x.mean, x.covariance);
+    let (mut mean, mut p, mut by_constant) = (x.mean, x.covariance, x.by_constant);
+    let excess_as = excess_as(c, input);
+    let moved_per_ah = moved / x.mean[CAPACITY];
+    let per_as = x.mean[CAPACITY].reciprocal() * (1.0 / 3600.0);
+    for k in 0..CONSTANT_ERRORS {
+        by_constant[k][0] = by_constant[k][0] + excess_as[k] * per_as + moved_per_ah * x.by_constant[k][CAPACITY];
+    }
     mean[0] = x.mean[0] - moved + soc_shift;
     let capacity_column = [l[0][CAPACITY], l[1][CAPACITY], l[2][CAPACITY]];
     let soc_noise = dt * c.process.soc_per_s + moved.abs() * c.process.soc_per_charge;
@@ -131,6 +150,10 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
         let OddEvenParts { odd, even } = branch.parts;
         let u_shift = branch.parts.shift(c);
         done[i] = (branch.parts, branch.decay);
+        for k in 0..CONSTANT_ERRORS {
+            let driven = drive * x.by_constant[k][LOG_RESISTANCE] - ratio * (excess_as[k] * input.decay.per_s);
+            by_constant[k][i] = x.by_constant[k][i] * branch.decay + branch.gain_ohm * driven;
+        }
         mean[i] = branch.centre_v + u_shift;
         p[at(i, 0)] = sum(soc.odd, odd) + sum(soc.even, even) + soc_shift * u_shift * c.excess;
         p[at(i, LOG_RESISTANCE)] = l[0][LOG_RESISTANCE] * odd[0] + l[1][LOG_RESISTANCE] * odd[1];
@@ -148,5 +171,5 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
         }
         p[at(i, i)] = p[at(i, i)] + branch.noise;
     }
-    (mean, p, is_positive)
+    (FilterState { mean, covariance: p, by_constant, memory: x.memory }, is_positive)
 }

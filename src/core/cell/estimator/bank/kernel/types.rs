@@ -5,7 +5,8 @@
 use std::array::from_fn;
 
 use crate::cell::estimator::state_vector::{BRANCHES, square};
-use crate::cell::{CellModel, Discretisation, EstimatorConfig};
+use crate::cell::{CellModel, Discretisation, EstimatorConfig, SensorErrors};
+use crate::filter::CONSTANT_ERRORS;
 use crate::filter::simd::{Lanes, Mask};
 
 /// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.
@@ -13,14 +14,16 @@ use crate::filter::simd::{Lanes, Mask};
 pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N: usize, const T: usize> {
     /// Means in the order of the estimator's state.
     pub(in crate::cell::estimator::bank) mean: [Lanes<L>; N],
-    /// Covariance, row by row to the diagonal.
+    /// Covariance without the constant errors, row by row to the diagonal.
     pub(in crate::cell::estimator::bank) covariance: [Lanes<L>; T],
-    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`REST_S`].
+    /// Errors of the means by one standard deviation of each constant error.
+    pub(in crate::cell::estimator::bank) by_constant: [[Lanes<L>; N]; CONSTANT_ERRORS],
+    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`CURVE_STD_AH`].
     pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
 }
 
-/// Number of memory values that every step changes.
-pub(in crate::cell::estimator::bank) const MEMORY: usize = 4;
+/// Number of memory values that steps change or read.
+pub(in crate::cell::estimator::bank) const MEMORY: usize = 8;
 /// |current| low-passed, A.
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
@@ -29,6 +32,14 @@ pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
 pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
 /// Time at rest, s.
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
+/// Information about the current's offset.
+pub(in crate::cell::estimator::bank) const OFFSET_INFORMATION: usize = 4;
+/// What it says.
+pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
+/// Capacity of the open-circuit curve, Ah. No step changes it.
+pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
+/// Its standard deviation, Ah. No step changes it.
+pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 
 /// Index of the covariance of `i` and `j` <= `i`.
 pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {
@@ -40,6 +51,7 @@ pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {
 pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
     pub(in crate::cell::estimator::bank) measured_s: Lanes<L>,
     pub(in crate::cell::estimator::bank) charge_as: Lanes<L>,
+    pub(in crate::cell::estimator::bank) offset_s: Lanes<L>,
     pub(in crate::cell::estimator::bank) current_a: Lanes<L>,
     pub(in crate::cell::estimator::bank) voltage_v: Lanes<L>,
     pub(in crate::cell::estimator::bank) temperature_c: Lanes<L>,
@@ -104,6 +116,7 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     pub(super) euler: bool,
     pub(super) process: ProcessVariances,
     pub(super) reading: ReadingVariances,
+    pub(in crate::cell::estimator::bank) sensor: SensorErrors,
     pub(super) rest_current_a: f64,
     pub(super) load_memory_s: f64,
     pub(super) max_information_s: f64,
@@ -158,6 +171,7 @@ impl KernelConstants {
                 gate_soc: square(config.gate.soc_error),
                 gate_limit: square(config.gate.sigma),
             },
+            sensor: config.sensor,
             rest_current_a: config.gap.rest_current_a,
             load_memory_s: config.voltage.load_memory_s,
             max_information_s: config.voltage.max_information_s,
@@ -173,6 +187,7 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         Self {
             mean: from_fn(|i| take(&all.mean[i])),
             covariance: from_fn(|i| take(&all.covariance[i])),
+            by_constant: from_fn(|k| from_fn(|i| take(&all.by_constant[k][i]))),
             memory: from_fn(|i| take(&all.memory[i])),
         }
     }
@@ -187,6 +202,9 @@ impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
         for i in 0..T {
             self.covariance[i].0[lane] = one.covariance[i].0[0];
         }
+        for (all, one) in self.by_constant.iter_mut().flatten().zip(one.by_constant.iter().flatten()) {
+            all.0[lane] = one.0[0];
+        }
         for i in 0..MEMORY {
             self.memory[i].0[lane] = one.memory[i].0[0];
         }
@@ -200,6 +218,9 @@ impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
         }
         for i in 0..T {
             self.covariance[i] = new.covariance[i].or_else(mask, self.covariance[i]);
+        }
+        for (old, new) in self.by_constant.iter_mut().flatten().zip(new.by_constant.iter().flatten()) {
+            *old = new.or_else(mask, *old);
         }
         for i in 0..MEMORY {
             self.memory[i] = new.memory[i].or_else(mask, self.memory[i]);

@@ -4,11 +4,18 @@
 //! ratio, which is 1 for an innovation of one standard deviation. A lane outside the gate is marked as not usable.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
-use super::types::{FilterState, KernelConstants, LOAD_A, StepInput, StepOutcome, at};
+use super::types::{
+    CURVE_STD_AH, FilterState, KernelConstants, LOAD_A, OFFSET_INFORMATION, OFFSET_SCORE, StepInput, StepOutcome, at,
+};
+use crate::cell::aged_ocv::MIXES;
 use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
-use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY};
+use crate::cell::estimator::state_vector::{
+    BRANCH_RESISTANCE, BRANCHES, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
+    VOLTAGE_OFFSET,
+};
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
+use crate::filter::{CONSIDERED, CONSTANT_ERRORS};
 
 /// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
@@ -18,8 +25,12 @@ struct PredictedVoltage<const L: usize> {
     parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,
+    /// Changes of that voltage with the capacity, V per Ah, and by the mixes of losses, V.
+    changes_v: [Lanes<L>; 1 + MIXES],
     /// Present voltage drop in the cell, V.
     lost_v: Lanes<L>,
+    /// Series resistance, ohm.
+    r0_ohm: Lanes<L>,
     /// Standard deviation of the model's error over one second, squared.
     base_variance: Lanes<L>,
     /// Resistance of new cells once every branch has settled, ohm.
@@ -37,14 +48,13 @@ impl<const L: usize> PredictedVoltage<L> {
         l: &[[Lanes<L>; N]; COLUMNS],
         ratio: Lanes<L>,
     ) -> Self {
-        let (reach, capacity_ah) = (l[0][0] * c.scale, x.mean[CAPACITY]);
-        let reach_ah = l[0][CAPACITY] * c.scale;
+        let reach = l[0][0] * c.scale;
         let table_points = tables.table_points(cache, x.mean[0], reach);
         let ratios = ResistanceRatios::new(c, l);
-        let (ocv_v, slope_v, r0_ohm) = table_points[0].ocv_and_r0(capacity_ah);
-        let (plus_v, _, plus_ohm) = table_points[1].ocv_and_r0(capacity_ah + reach_ah);
-        let (minus_v, _, minus_ohm) = table_points[2].ocv_and_r0(capacity_ah - reach_ah);
-        let per_ah_v = table_points[0].ocv_per_ah();
+        let (ocv_v, slope_v, r0_ohm) = table_points[0].ocv_and_r0();
+        let (plus_v, _, plus_ohm) = table_points[1].ocv_and_r0();
+        let (minus_v, _, minus_ohm) = table_points[2].ocv_and_r0();
+        let changes_v = table_points[0].ocv_changes();
         let mut settled_ohm = r0_ohm;
         let mut branches_v = Lanes::splat(0.0);
         let mut branches = [Lanes::splat(0.0); COLUMNS];
@@ -62,16 +72,44 @@ impl<const L: usize> PredictedVoltage<L> {
         let mut parts = OddEvenParts::NONE;
         parts.put(c, 0, plus, minus, centre_v + branches_v);
         parts.odd[0] = parts.odd[0] - branches[0];
-        parts.odd[1] = per_ah_v * l[1][CAPACITY] - branches[1] - drop_v * ratios.second[0];
+        parts.odd[1] = -branches[1] - drop_v * ratios.second[0];
         parts.even[1] = -(drop_v * ratios.second[1]);
-        parts.odd[2] = per_ah_v * l[2][CAPACITY] - branches[2];
+        parts.odd[2] = -branches[2];
         let base_variance = if tables.has_error() {
             table_points[0].one(ERROR_V).square() * ERROR_WINDOW_S
         } else {
             Lanes::splat(c.reading.model)
         };
-        Self { centre_v, parts, slope_v, lost_v: drop_v + branches_v, base_variance, settled_ohm }
+        let lost_v = drop_v + branches_v;
+        Self { centre_v, parts, slope_v, changes_v, lost_v, r0_ohm: r0_ohm * ratio, base_variance, settled_ohm }
     }
+}
+
+/// Effect of one standard deviation of each constant error on the voltage less its prediction, V.
+#[inline(always)]
+fn by_constant<const L: usize, const N: usize, const T: usize>(
+    c: &KernelConstants,
+    x: &FilterState<L, N, T>,
+    input: &StepInput<L>,
+    predicted: &PredictedVoltage<L>,
+) -> [Lanes<L>; CONSTANT_ERRORS] {
+    let drop_v = predicted.r0_ohm * input.current_a;
+    let is_live = input.current_a.abs().above_number(0.0);
+    let mut effect_v = [Lanes::splat(0.0); CONSTANT_ERRORS];
+    effect_v[VOLTAGE_OFFSET] = Lanes::splat(c.sensor.voltage_offset_v);
+    effect_v[CURRENT_OFFSET] = (predicted.r0_ohm * c.sensor.current_offset_a).or_else(is_live, Lanes::splat(0.0));
+    effect_v[CURRENT_GAIN] = drop_v * c.sensor.current_gain;
+    effect_v[BRANCH_RESISTANCE] = (drop_v - predicted.lost_v) * c.sensor.branch_resistance;
+    effect_v[CURVE_CAPACITY] = -(predicted.changes_v[0] * x.memory[CURVE_STD_AH]);
+    effect_v[CURVE_MIXES..].copy_from_slice(&predicted.changes_v[1..]);
+    for k in 0..CONSTANT_ERRORS {
+        let column = &x.by_constant[k];
+        effect_v[k] = effect_v[k] + predicted.slope_v * column[0] - drop_v * column[LOG_RESISTANCE];
+        for i in BRANCHES..N {
+            effect_v[k] = effect_v[k] - column[i];
+        }
+    }
+    effect_v
 }
 
 /// The measurement update. Moves `x` in every lane; the outcome marks the usable ones.
@@ -113,19 +151,39 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
     // Measurement noise: see `noise::VoltageReading`.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
     let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
-    let total = variance + (model / information_s + c.reading.sensor);
+    let own_variance = variance + (model / information_s + c.reading.sensor);
     let innovation_v = input.voltage_v - (predicted.centre_v + shift_v);
-    let gate = variance + (predicted.slope_v.square() * c.reading.gate_soc + c.reading.gate);
+
+    // The constant errors.
+    let by_constant = by_constant(c, x, input, &predicted);
+    let mut constant_variance = Lanes::splat(0.0);
+    for k in 0..CONSIDERED {
+        constant_variance = constant_variance + by_constant[k].square();
+    }
+    let total = own_variance + constant_variance;
+    let gate = variance + constant_variance + (predicted.slope_v.square() * c.reading.gate_soc + c.reading.gate);
     let test_ratio = innovation_v.square() / gate;
+    let offset_v = by_constant[CURRENT_OFFSET];
+    let per_variance = offset_v / (total - offset_v.square());
+    x.memory[OFFSET_INFORMATION] = x.memory[OFFSET_INFORMATION] + per_variance * offset_v;
+    x.memory[OFFSET_SCORE] = x.memory[OFFSET_SCORE] + per_variance * innovation_v;
 
     let inverse = total.reciprocal();
+    let mut gain = cross;
     for i in 0..N {
-        let gain = cross[i] * inverse;
-        x.mean[i] = x.mean[i] + gain * innovation_v;
-        for j in 0..N {
-            if j <= i {
-                x.covariance[at(i, j)] = x.covariance[at(i, j)] - gain * cross[j];
-            }
+        for k in 0..CONSIDERED {
+            gain[i] = gain[i] + x.by_constant[k][i] * by_constant[k];
+        }
+        gain[i] = gain[i] * inverse;
+        x.mean[i] = x.mean[i] + gain[i] * innovation_v;
+        for k in 0..CONSTANT_ERRORS {
+            x.by_constant[k][i] = x.by_constant[k][i] - gain[i] * by_constant[k];
+        }
+    }
+    for i in 0..N {
+        let weighed = gain[i] * own_variance - cross[i];
+        for j in 0..=i {
+            x.covariance[at(i, j)] = x.covariance[at(i, j)] + weighed * gain[j] - gain[i] * cross[j];
         }
     }
     let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.reading.gate_limit);
