@@ -34,13 +34,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "AH", value_parser = above_0)]
     rated: Option<f64>,
     /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
-    /// of a new cell determines it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
+    /// of a new cell determines it [default: the electrodes found in the slow test say it; without them 0, for an ageing cell 0.5,
+    /// chosen on two whole lives]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
-    /// Find the two electrodes in the slow test: the open-circuit curve then ages by lost lithium and material. Good for capacity
-    /// from partial swings; a cold drive may be read as lost capacity
-    #[arg(long, requires = "ocv", conflicts_with = "ageing_shift")]
-    electrodes: bool,
     /// Lowest voltage under load [default: from the data]
     #[arg(long, value_name = "V", value_parser = above_0)]
     voltage_min: Option<f64>,
@@ -128,7 +125,6 @@ fn request(args: &Args) -> FitRequest {
         voltage_min_v: args.voltage_min,
         voltage_max_v: args.voltage_max,
         ageing_shift: args.ageing_shift,
-        find_electrodes: args.electrodes,
         ocv: args.ocv.clone(),
         branches: args.grid.branches.map(usize::from),
         tau_s: args.grid.tau.clone(),

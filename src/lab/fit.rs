@@ -64,10 +64,9 @@ pub struct FitRequest {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity; `None` = 0, of an ageing cell [`AGEING_SHIFT`].
+    /// How far the open-circuit curve shifts with lost capacity; `None` = by the electrodes found in a slow test, without them
+    /// 0, of an ageing cell [`AGEING_SHIFT`].
     pub ageing_shift: Option<f64>,
-    /// Whether to find the electrodes in a slow test instead.
-    pub find_electrodes: bool,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
     /// RC branches, 1 to 3; `None` = 2, of an ageing cell 1.
@@ -155,7 +154,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
     // The curve of full discharges under load is too coarse.
-    let has_curve = !prepared.ocv.is_empty() && request.find_electrodes;
+    let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
     let found = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
     let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(fitted.grid.soc.len()).map(<[f64]>::to_vec).collect();
     let ages = |found: &FittedElectrodes| {
@@ -267,7 +266,7 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
     if let Some(found) = &outcome.electrodes {
         let (positive, negative) = found.electrodes.names();
         outcome.notes.push(format!("electrodes {positive} and {negative}, within {:.1} mV", 1e3 * found.residual_v));
-    } else if request.find_electrodes {
+    } else if !request.ocv.is_empty() && request.ageing_shift.is_none() {
         let most_mv = 1e3 * electrodes::MAX_RESIDUAL_V;
         let what = format!("no known electrodes within {most_mv} mV of a slow test's curve: how it ages is not known");
         outcome.notes.push(what);

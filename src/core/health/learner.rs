@@ -4,8 +4,8 @@
 //! and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
 //!
 //! A half-cycle runs from where charge or discharge began to where it ended (both dated by the transition
-//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also fade and
-//! offset, [`super::drift`]) gets its measurement by one of two rules:
+//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also the
+//! fade, [`super::drift`]) gets its measurement by one of two rules:
 //! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample-by-sample filter
 //!   carries the capacity with its correlation to the SOC; the measurement is the step from its estimate then to its
 //!   estimate now, `ScalarGaussian::information_until`. Charge / swing with the SOC of that same filter would return the
@@ -15,10 +15,14 @@
 use serde::{Deserialize, Serialize};
 
 use super::drift::DriftFilter;
+use super::offset::CurrentOffset;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::{InvalidState, Mode, Timestamp};
+
+/// Largest part of a half-cycle's capacity that may come from the capacity of the curve itself.
+const MAX_BY_CURVE: f64 = 0.8;
 
 /// Smallest swing in the variance of a half-cycle's ends: below it the measurement has no use.
 const MIN_WEIGHED_SWING: f64 = 0.02;
@@ -125,8 +129,11 @@ pub struct Learner {
     joining: bool,
     /// Whether each cell has a measured capacity.
     learned: Vec<bool>,
-    /// Capacity, fade and offset (`Swing`).
+    /// Capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
+    /// Offset of the current sensor.
+    #[serde(default)]
+    offset: CurrentOffset,
 }
 
 impl Learner {
@@ -239,7 +246,7 @@ impl Learner {
             }
         };
         self.learned[cell] |= measurement.is_some();
-        CapacityUpdate { measurement, capacity: self.capacity(config, cell) }
+        CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
     /// Whether a cell's capacity has been measured since its configured start.
@@ -265,9 +272,16 @@ impl Learner {
             value: z.value,
             variance: z.variance + end_variance_ah2(model, config, half_cycle, after.mean),
         });
+        let measurement = measurement.map(|z| {
+            // With the curve of the capacity that comes out: z = C + s (C_curve - C).
+            let weight = 1.0 - after.variance / self.prior[cell].variance;
+            let by_curve = (estimator.capacity_by_curve() / weight).clamp(-MAX_BY_CURVE, MAX_BY_CURVE);
+            let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
+            Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
+        });
         let drift = &mut self.drift[cell];
         if let Some(z) = measurement {
-            drift.update(z, half_cycle.mean_current_a);
+            drift.update(z);
         }
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
@@ -282,18 +296,20 @@ impl Learner {
         measurement
     }
 
-    /// The published capacity of a cell: the filter's, with a variance widened by the gain error of the current sensor,
-    /// which half-cycles do not average out.
-    pub fn capacity(&self, config: &CapacityConfig, cell: usize) -> ScalarGaussian {
-        let filtered = self.capacity[cell];
-        let gain_ah = config.current_gain_std * filtered.mean;
-        ScalarGaussian { mean: filtered.mean, variance: filtered.variance + gain_ah * gain_ah }
+    /// The published capacity of a cell.
+    pub fn capacity(&self, cell: usize) -> ScalarGaussian {
+        self.capacity[cell]
     }
 
-    /// Offset of the current by a cell's half-cycles, per cell, A: measured less true.
+    /// Offset of the current, per cell, A: measured less true.
     #[inline]
-    pub fn current_offset_a(&self, cell: usize) -> f64 {
-        self.drift[cell].offset_a()
+    pub fn current_offset(&self) -> &CurrentOffset {
+        &self.offset
+    }
+
+    /// Offset of the current, to be changed.
+    pub fn current_offset_mut(&mut self) -> &mut CurrentOffset {
+        &mut self.offset
     }
 
     /// Whether a stored learner has this number of cells.
@@ -312,6 +328,7 @@ impl Learner {
             InvalidState::unless_positive("the variance of a learned capacity", capacity.variance)?;
         }
         self.drift.iter().try_for_each(DriftFilter::check)?;
+        self.offset.check()?;
         InvalidState::unless_natural("the time at rest", self.rest_s)?;
         let marks = [&self.start, &self.candidate].into_iter().flatten();
         let charges_as = marks.clone().map(|mark| mark.charge_as);
@@ -333,16 +350,11 @@ impl Learner {
 fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &HalfCycle, capacity_ah: f64) -> f64 {
     let Some(ends) = &half_cycle.ends else { return 0.0 };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    let lost = 1.0 - capacity_ah / model.capacity_ah;
     let soc_variance = ends.iter().fold(0.0, |sum, end| {
         let position = model.grid_position(end.soc, temperature_c);
         let slope_v = model.ocv_slope_v(&position, capacity_ah);
         let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
-        let shape = match model.aged_ocv_error_v(&position, capacity_ah) {
-            Some(error_v) => error_v / slope_v,
-            None => config.ageing_shift_error * lost * end.soc * (1.0 - end.soc),
-        };
-        sum + volts * volts + shape * shape
+        sum + volts * volts
     });
     let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
     (capacity_ah / swing) * (capacity_ah / swing) * soc_variance
@@ -375,9 +387,7 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cell::AgedOcv;
     use crate::cell::CellStep;
-    use crate::cell::electrodes::tests::M50;
     use crate::cell::estimator::tests::config as estimator_config;
     use crate::cell::model::tests::small_model;
 
@@ -388,7 +398,6 @@ mod tests {
             noise_ah_per_rest_day: 0.0,
             end_error_v: 0.0,
             end_load_error: 0.0,
-            ageing_shift_error: 0.0,
             current_gain_std: 0.0,
             current_offset_std_a: 0.0,
             fade_std_ah_per_cycle: 0.0,
@@ -402,6 +411,7 @@ mod tests {
             let step = CellStep {
                 measured_s: 10.0,
                 charge_as: 10.0,
+                offset_s: 10.0,
                 unmeasured_s: 0.0,
                 current_a: Some(1.0),
                 temperature_c: Some(20.0),
@@ -449,34 +459,20 @@ mod tests {
     }
 
     #[test]
-    fn the_repeating_error_of_both_ends_depends_on_slope_load_ageing_and_swing() {
+    fn the_error_of_both_ends_depends_on_slope_load_and_swing() {
         let mut config = config();
-        (config.end_error_v, config.end_load_error, config.ageing_shift_error) = (0.004, 0.1, 0.5);
+        (config.end_error_v, config.end_load_error) = (0.004, 0.1);
         let model = small_model();
         let mark =
             |soc, load_v| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v, ..CellMark::default() };
         let moved = half_cycle(1.0, 3600.0, &mark(0.9, 0.03), &mark(0.4, 0.0));
-        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. A tenth of 2 Ah is lost.
+        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below.
         let (start_v2, end_v2) = (0.004 * 0.004 + 0.003 * 0.003, 0.004 * 0.004);
-        let shape = |soc: f64| 0.5 * 0.1 * soc * (1.0 - soc);
-        let soc_variance =
-            start_v2 / (1.075 * 1.075) + end_v2 / (1.325 * 1.325) + shape(0.9) * shape(0.9) + shape(0.4) * shape(0.4);
+        let soc_variance = start_v2 / (1.075 * 1.075) + end_v2 / (1.325 * 1.325);
         let swing: f64 = 1.0 / 1.8;
         let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
         let found = end_variance_ah2(&model, &config, &moved, 1.8);
         assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
-        // With electrodes the model states the error of the aged curve; a new cell has none.
-        let mut known = model.clone();
-        known.aged_ocv =
-            AgedOcv::of_electrodes(&M50, &model.soc, model.capacity_ah, &model.ocv_v.values).expect("a table");
-        config.ageing_shift_error = 9.0;
-        let with = |model: &CellModel, capacity_ah: f64| end_variance_ah2(model, &config, &moved, capacity_ah);
-        let plain = CapacityConfig { ageing_shift_error: 0.0, ..config };
-        let without = |capacity_ah: f64| end_variance_ah2(&known, &plain, &moved, capacity_ah);
-        assert!((with(&known, 2.0) / without(2.0) - 1.0).abs() < 1e-9, "the shift's error does not count");
-        let slopes = with(&known, 1.7) / end_variance_ah2(&model, &plain, &moved, 1.7);
-        assert!(slopes > 1.05, "{slopes}");
-        config.ageing_shift_error = 0.5;
         // A tiny swing counts as the smallest one; a half-cycle without an estimated end has no ends.
         let tiny = HalfCycle { charge_ah: 0.001, ..moved };
         let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;

@@ -8,6 +8,7 @@ pub mod config;
 pub mod drift;
 pub mod forecast;
 pub mod learner;
+pub mod offset;
 pub mod pack;
 pub mod recharge;
 pub mod transition;

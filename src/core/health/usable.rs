@@ -35,10 +35,9 @@ pub fn usable_ah(
     let mut branch_v = [0.0; MAX_BRANCHES];
     let mut soc = full_soc;
     let temperature = model.temperature_position(config.temperature_c);
-    let segment = model.aged_ocv.segment(capacity_ah);
     let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
         let state = (soc, resistance_ratio, capacity_ah);
-        aged_terminal_v(model, state, segment, &temperature, branch_v.iter().sum(), config.current_a)
+        aged_terminal_v(model, state, &temperature, branch_v.iter().sum(), config.current_a)
     };
     let mut before_v = voltage(soc, &branch_v);
     if before_v <= config.cutoff_v {

@@ -42,6 +42,8 @@ struct CellProgress {
 pub(super) struct Consumed {
     pub(super) time: Timestamp,
     pub(super) charge_as: f64,
+    #[serde(default)]
+    pub(super) offset_s: f64,
     pub(super) unmeasured_s: f64,
 }
 
@@ -60,8 +62,10 @@ impl Estimation {
     }
 
     /// Other settings for the same cells.
-    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
-        self.bank.reconfigure(&config.model, &config.estimator);
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig, learner: &Learner) {
+        let mut estimator = config.estimator;
+        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
+        self.bank.reconfigure(&config.model, &estimator);
         self.ambient_c = config.sample.ambient_c;
     }
 
@@ -107,12 +111,14 @@ impl Estimation {
     fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
         let index = sample.cell.index();
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
-        let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
-        let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
+        let now =
+            Consumed { time: sample.time, charge_as: charge, offset_s: sample.offset_s, unmeasured_s: unmeasured };
+        let (mut measured_s, mut charge_as, mut offset_s, mut unmeasured_s) = (0.0, 0.0, 0.0, 0.0);
         // Before the first reading, and after a gap of unknown length, nothing was measured for ever.
         let mut gap_s = f64::INFINITY;
         if let Some(before) = self.progress[index].consumed.replace(now) {
             charge_as = charge - before.charge_as;
+            offset_s = sample.offset_s - before.offset_s;
             unmeasured_s = unmeasured - before.unmeasured_s;
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
             gap_s = unmeasured_s;
@@ -120,13 +126,15 @@ impl Estimation {
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
         }
-        // The part of the current that charges and discharges have shown to be the sensor's, not the cell's.
-        let offset_a = learner.current_offset_a(index);
+        // The part of the current that is the sensor's, not the cell's; a reading of exactly zero has none.
+        let offset_a = learner.current_offset().mean_a();
+        let corrected = |current_a: f64| if current_a == 0.0 { 0.0 } else { current_a - offset_a };
         CellStep {
             measured_s,
-            charge_as: charge_as - offset_a * measured_s,
+            charge_as: charge_as - offset_a * offset_s,
+            offset_s,
             unmeasured_s,
-            current_a: sample.current_a.map(|current_a| current_a - offset_a),
+            current_a: sample.current_a.map(corrected),
             temperature_c: sample.temperature_c,
             ambient_c: self.ambient_c,
             voltage_v: sample.voltage_v,

@@ -45,6 +45,9 @@ pub(super) struct LearningState {
     /// When the last half-cycle taught something; `None` = never, or an unknown time ago.
     #[serde(default)]
     pub(super) learned_at: Option<Timestamp>,
+    /// When the offset of the current was last corrected.
+    #[serde(default)]
+    pub(super) offset_at: Option<Timestamp>,
     pub(super) recharge: RechargeTimer,
     pub(super) recharge_period_s: Option<f64>,
     #[serde(default)]
@@ -80,7 +83,9 @@ impl LearningState {
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.detector.rebase(by_nanos);
         self.learner.rebase(by_nanos);
-        self.learned_at = self.learned_at.map(|at| at.plus_nanos(by_nanos));
+        for stamp in [&mut self.learned_at, &mut self.offset_at].into_iter().flatten() {
+            *stamp = stamp.plus_nanos(by_nanos);
+        }
         self.recharge.rebase(by_nanos);
     }
 }
@@ -113,12 +118,16 @@ impl Learning {
 
     /// Published capacity of a cell.
     pub(super) fn capacity(&self, index: usize) -> ScalarGaussian {
-        self.state.learner.capacity(&self.config.capacity, index)
+        self.state.learner.capacity(index)
     }
 
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.
     pub(super) fn complete_mode(&mut self, change: ModeChange, bank: &mut EstimatorBank, to: &mut Publisher<'_>) {
         to.event(EventKind::Mode { from: change.from, to: change.to });
+        // At a loss of the current nothing new is learned: the evidence waits.
+        if change.to != Mode::Unknown {
+            self.learn_offset(bank, to.now);
+        }
         let mut half_cycles = std::mem::take(&mut self.half_cycles);
         let rated_ah = bank.model().rated_capacity_ah;
         self.state.learner.complete(&self.config.transition, rated_ah, change.from, &mut half_cycles);
@@ -140,6 +149,18 @@ impl Learning {
         self.half_cycles = half_cycles;
         if change.to == Mode::Charge {
             self.cells.iter_mut().for_each(|cell| cell.tapered = false);
+        }
+    }
+
+    /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the cells.
+    fn learn_offset(&mut self, bank: &mut EstimatorBank, now: Timestamp) {
+        let configured_a = self.config.capacity.current_offset_std_a;
+        let offset = self.state.learner.current_offset_mut();
+        if configured_a > 0.0 {
+            let deviations = offset.update(configured_a, bank.offset_evidence());
+            bank.absorb_current_offset(deviations, offset.std_a(configured_a));
+            offset.drift(self.state.offset_at.replace(now).map_or(0.0, |before| now.since(before)));
+            bank.absorb_current_offset(0.0, offset.std_a(configured_a));
         }
     }
 

@@ -58,7 +58,7 @@ impl Monitor {
         let changed = old.changed_tables(&config);
         self.intake.reconfigure(&config);
         let stages = &mut self.stages;
-        stages.estimation.reconfigure(&config);
+        stages.estimation.reconfigure(&config, &stages.learning.state.learner);
         stages.sampling.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);
         if old.j1939 != config.j1939 {

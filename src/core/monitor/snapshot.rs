@@ -221,6 +221,8 @@ impl Stages {
         sampling.sampler.restore(snapshot.sampler);
         sampling.identity = snapshot.identity;
         learning.state = snapshot.learning;
+        let configured_a = learning.config.capacity.current_offset_std_a;
+        estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
         self.sender.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.statistics = snapshot.statistics;

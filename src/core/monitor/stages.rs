@@ -201,6 +201,7 @@ impl Stages {
         };
         out.events.push(Event { time: now, kind });
         self.estimation.forget();
+        self.estimation.bank.set_current_offset_std(self.learning.config.capacity.current_offset_std_a);
         self.learning.forget(&self.estimation.bank);
         self.forget_pack_state();
         self.alarming.knows_all_valid = false;

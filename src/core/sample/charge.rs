@@ -18,6 +18,9 @@ use crate::quantity::{InvalidState, Timestamp};
 pub struct ChargeTotals {
     /// Charge taken out of the pack, As.
     pub charge_as: f64,
+    /// Time in which the reading was other than exactly zero, s: the charge of that time has the sensor's offset.
+    #[serde(default)]
+    pub offset_s: f64,
     /// Time without a usable current, s.
     pub unmeasured_s: f64,
     /// Time in which current flowed in either direction, s.
@@ -46,7 +49,10 @@ impl ChargeCounter {
     pub(super) fn handle_current(&mut self, time: Timestamp, current_a: f64, max_age_s: f64, flow_a: f64) {
         let dt_s = self.passed_s(time);
         match self.current_a {
-            Some(last_a) if dt_s <= max_age_s => self.totals.add((last_a + current_a) / 2.0, dt_s, flow_a),
+            Some(last_a) if dt_s <= max_age_s => {
+                self.totals.add((last_a + current_a) / 2.0, dt_s, flow_a);
+                self.totals.offset_s += dt_s * (offset_part(last_a) + offset_part(current_a)) / 2.0;
+            }
             _ => self.totals = self.totals_at(time, max_age_s),
         }
         self.counted_to = Some(self.counted_to.map_or(time, |last| last.max(time)));
@@ -60,6 +66,7 @@ impl ChargeCounter {
         let mut totals = self.totals;
         let held_s = self.current_a.map_or(0.0, |_| dt_s.min(max_age_s));
         totals.charge_as += self.current_a.unwrap_or(0.0) * held_s;
+        totals.offset_s += offset_part(self.current_a.unwrap_or(0.0)) * held_s;
         totals.unmeasured_s += dt_s - held_s;
         totals
     }
@@ -77,14 +84,19 @@ impl ChargeCounter {
 
     /// Checks a stored counter; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
-        let ChargeTotals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
-        let all = [charge_as, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
+        let ChargeTotals { charge_as, offset_s, unmeasured_s, flowing_s, discharging_s } = self.totals;
+        let all = [charge_as, offset_s, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
         InvalidState::unless_numbers("the counted charge, a time or its current", all)
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {
         self.counted_to.map_or(0.0, |from| time.since(from).max(0.0))
     }
+}
+
+/// Part of a reading's time in which it has the sensor's offset: a reading of exactly zero has none.
+fn offset_part(current_a: f64) -> f64 {
+    if current_a == 0.0 { 0.0 } else { 1.0 }
 }
 
 impl ChargeTotals {

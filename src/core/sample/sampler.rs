@@ -36,6 +36,9 @@ pub struct CellSample {
     /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it for
     /// the current between its last reading and `time`.
     pub charge_as: f64,
+    /// Time so far in which the current's reading was other than exactly zero, s.
+    #[serde(default)]
+    pub offset_s: f64,
     /// Time so far without a usable current, s: the charge of that time is unknown.
     pub unmeasured_s: f64,
     /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
@@ -49,7 +52,7 @@ impl CellSample {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         let known = [self.current_a, self.temperature_c].into_iter().flatten();
-        let numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
+        let numbers = [self.voltage_v, self.charge_as, self.offset_s, self.unmeasured_s].into_iter().chain(known);
         InvalidState::unless_numbers("a sample that waits for its step", numbers)
     }
 }
@@ -446,6 +449,7 @@ impl Sampler {
             voltage_v,
             current_a: self.shared.cell_current_a,
             charge_as: self.shared.cell_charge_as,
+            offset_s: self.shared.totals.offset_s,
             unmeasured_s: self.shared.totals.unmeasured_s,
             temperature_c,
         }

@@ -129,7 +129,7 @@ impl TruthCell {
 
     fn unloaded_v(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         let place = model.grid_position(self.soc, self.temperature_c);
-        let ocv_v = model.aged_ocv_v(&place, model.aged_ocv.segment(self.capacity_ah), self.capacity_ah);
+        let ocv_v = model.aged_ocv_v(&place, self.capacity_ah);
         ocv_v + hysteresis.magnitude_v * self.hysteresis - self.branch_v.iter().sum::<f64>()
     }
 

@@ -70,7 +70,7 @@ section! {
 }
 
 section! {
-    /// The electrodes of the new cell, as `packwatch fit --electrodes` finds them: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a fraction of its maximum.
+    /// The electrodes of the new cell, as `packwatch fit` finds them in a slow test: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a fraction of its maximum.
     ElectrodesKeys at "electrodes" gives Electrodes, |keys| {
         /// Material of the positive electrode.
         positive: PositiveMaterial, "", Any, Required;

@@ -35,6 +35,8 @@ pub(super) fn monitor(
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
     let rated = RatedCell::new(rated_ah, raw.recharge.as_ref()?);
+    model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
+    let capacity = raw.capacity.as_ref()?.config(rated_ah);
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
         interfaces: raw.interfaces.len(),
@@ -46,10 +48,10 @@ pub(super) fn monitor(
         commands: traffic.commands,
         j1939: traffic.j1939,
         sample: sample(raw, pack, &model, found)?,
-        estimator: raw.estimator.as_ref()?.config(pack, &model),
+        estimator: raw.estimator.as_ref()?.config(pack, &model, &capacity),
         health: HealthConfig {
             transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
-            capacity: raw.capacity.as_ref()?.config(rated_ah),
+            capacity,
             recharge: raw.recharge.as_ref()?.config(rated_ah),
             end_of_life_ah: raw.capacity.as_ref()?.end_of_life * rated_ah,
             usable: raw.usable.as_ref().map(|keys| keys.config(rated_ah)),

@@ -4,15 +4,20 @@
 use super::{DEVIATION, MethodKey, Pack, TEMPERATURE_C};
 use crate::cell::{
     CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
-    InitialState, ProcessNoise, SigmaPointSettings, VoltageError,
+    InitialState, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Any, Between};
+use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 
 /// A month of 365.25 / 12 days.
 const SECONDS_PER_MONTH: f64 = 2_629_800.0;
+
+/// Standard deviation of the capacity that a cell may have lost before its first half-cycle, part of the new cell's: its
+/// open-circuit curve is that of a new one until then.
+const FIRST_LOSS_STD: f64 = 0.03;
 
 section! {
     /// The unscented Kalman filter of each cell. Noises are densities, per square root of a second, so that the sample rate does not change the result.
@@ -53,6 +58,10 @@ section! {
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
+        /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out.
+        voltage_offset_std_v: f64, "V", DEVIATION, Default("0.004");
+        /// Standard deviation of the error of the model's branch resistances against its series resistance: ageing and temperature change them apart.
+        branch_resistance_std: f64, "fraction", DEVIATION, Default("0.1");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second add no information beyond this. A `voltage_error_v` of the cell model replaces it.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
         /// Slow error of the cell model, relative to the voltage dropped in the cell at the reading: standard deviation of its average over one second.
@@ -80,7 +89,7 @@ section! {
 
 impl Estimator {
     /// The parameters these keys stand for.
-    pub(crate) fn config(&self, pack: &Pack, model: &CellModel) -> EstimatorConfig {
+    pub(crate) fn config(&self, pack: &Pack, model: &CellModel, capacity: &CapacityConfig) -> EstimatorConfig {
         let initial_ah = pack.initial_capacity_ah.unwrap_or(model.capacity_ah);
         EstimatorConfig {
             points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
@@ -92,6 +101,12 @@ impl Estimator {
                 branch_std_v: self.initial_branch_std_v,
                 capacity_ah: initial_ah,
                 capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * initial_ah),
+                curve: match self.capacity_state {
+                    CapacityState::Joint => {
+                        ScalarGaussian::from_std(model.capacity_ah, FIRST_LOSS_STD * model.capacity_ah)
+                    }
+                    CapacityState::Held => ScalarGaussian::from_std(initial_ah, 0.0),
+                },
                 log_resistance_std: self.initial_log_resistance_std,
             },
             process: ProcessNoise {
@@ -113,6 +128,15 @@ impl Estimator {
                 load_error_sqrt_s: self.load_error_sqrt_s,
                 load_memory_s: self.load_memory_s,
                 max_information_s: self.max_information_s,
+            },
+            sensor: match self.capacity_state {
+                CapacityState::Joint => SensorErrors {
+                    voltage_offset_v: self.voltage_offset_std_v,
+                    current_offset_a: capacity.current_offset_std_a,
+                    current_gain: capacity.current_gain_std,
+                    branch_resistance: self.branch_resistance_std,
+                },
+                CapacityState::Held => SensorErrors::NONE,
             },
             gate: GateSettings {
                 sigma: self.gate_sigma,
@@ -159,29 +183,48 @@ section! {
         /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.5 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional
             => noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(keys.usual_noise_ah(rated_ah));
-        /// Standard deviation gained in a day of rest, in which some capacity recovers ("swing" only). Without it: 2 % of the rated capacity.
+        /// Standard deviation gained in a day of rest, in which some capacity recovers ("swing" only). Without it: 1 % of the rated capacity.
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional
-            => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah);
+            => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah);
         /// Error of the cell model's open-circuit voltage at the ends of a half-cycle ("swing" only). It repeats from half-cycle to half-cycle and limits the information of each.
-        end_error_v: f64, "V", DEVIATION, Default("0.005");
+        end_error_v: f64, "V", DEVIATION, Default("0.0");
         /// The same, relative to the voltage that the load drops in the cell ("swing" only).
-        end_load_error: f64, "", DEVIATION, Default("0.075");
+        end_load_error: f64, "", DEVIATION, Default("0.0");
         /// Standard deviation of the cell model's `ocv_ageing_shift` ("swing" only): uncertainty of how the curve changes with lost capacity. With `[electrodes]` the model states its own.
-        ageing_shift_error: f64, "", DEVIATION, Default("0.3");
-        /// Standard deviation of the current sensor's gain: no capacity is more accurate than this.
+        ageing_shift_error: f64, "", DEVIATION, Default("0.3") =>;
+        /// Standard deviation of the current sensor's gain error: no capacity is more accurate than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
-        /// Standard deviation of the current sensor's offset, per cell. The offset is learned from the difference between charges and discharges and subtracted from the current ("swing" only; 0 = not learned). Use it where the cell model is accurate to a few mV.
-        current_offset_std_a: f64, "A", DEVIATION, Default("0.0");
-        /// Standard deviation of the capacity lost in a full cycle, at the start. The loss is learned and predicted at the end of each charge ("swing" only; 0 = not learned). For cells that lose several percent in a cycle; in others, capacity that recovers in rest would be mistaken for it.
-        fade_std_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
-        /// Rate at which that loss may change: standard deviation gained per equivalent full cycle.
-        fade_noise_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
+        /// Standard deviation of the current sensor's offset, per cell. The offset is learned from the charge that the voltages do not confirm, at rest most of all, and subtracted from the current ("swing" only; 0 = none). A reading of exactly zero has none. Without it: the rated capacity over 100 h (C/100).
+        current_offset_std_a: Option<f64>, "A", DEVIATION, Optional
+            => current_offset_std_a: keys.current_offset_std_a(rated_ah);
+        /// Standard deviation of the capacity lost in a full cycle, at the start. The loss is learned and predicted at the end of each charge ("swing" only; 0 = not learned). Without it: 0.05 % of the rated capacity; cells that lose several percent in a cycle need more.
+        fade_std_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional
+            => fade_std_ah_per_cycle: keys.fade_std_ah_per_cycle.unwrap_or(5e-4 * rated_ah);
+        /// Rate at which that loss may change: standard deviation gained per equivalent full cycle. Without it: 0.005 % of the rated capacity.
+        fade_noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional
+            => fade_noise_ah_per_cycle: keys.fade_noise_ah_per_cycle.unwrap_or(5e-5 * rated_ah);
         /// Part of the rated capacity at which the life of a cell ends; the remaining life until then is forecast.
         end_of_life: f64, "fraction", Above(0.0, 1.0), Default("0.8") =>;
     }
 }
 
 impl Capacity {
+    /// Deviation of the current's offset; the paper's filter knows none.
+    pub(super) fn current_offset_std_a(&self, rated_ah: f64) -> f64 {
+        match self.method {
+            MethodKey::Swing => self.current_offset_std_a.unwrap_or(rated_ah / 100.0),
+            MethodKey::Nominal => 0.0,
+        }
+    }
+
+    /// Deviation of a shift of the open-circuit curve; the paper's filter knows none.
+    pub(crate) fn shift_std(&self) -> f64 {
+        match self.method {
+            MethodKey::Swing => self.ageing_shift_error,
+            MethodKey::Nominal => 0.0,
+        }
+    }
+
     fn method(&self) -> CapacityMethod {
         match self.method {
             MethodKey::Swing => CapacityMethod::Swing,

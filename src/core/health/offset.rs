@@ -1,0 +1,126 @@
+//! The offset of the current sensor, which all cells share.
+//!
+//! In: what the voltages of all cells say about it ([`EstimatorBank::offset_evidence`]), and the time passed, s. Out: its
+//! mean and standard deviation, A per cell, measured less true. A cell at rest shows it best: the counted charge drifts away
+//! from the voltage. Readings of exactly zero have none: such a sensor cuts it off.
+//!
+//! Source: Friedland (1969), separate estimation of a bias: given a filter that ignores the bias, the innovations are a
+//! measurement of it. Here the filter considers it, and its correction is made at changes of mode.
+//!
+//! [`EstimatorBank::offset_evidence`]: crate::cell::EstimatorBank::offset_evidence
+
+use serde::{Deserialize, Serialize};
+
+use crate::quantity::InvalidState;
+
+/// Drift of the offset in a day, part of its first standard deviation: sensors drift with temperature.
+const DRIFT_PER_DAY: f64 = 0.1;
+
+/// Largest correction at a time, standard deviations: evidence beyond it is not that of an offset.
+const MAX_DEVIATIONS: f64 = 3.0;
+
+/// Largest mean, in first standard deviations.
+const MAX_FIRST_DEVIATIONS: f64 = 5.0;
+
+/// A learned offset.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CurrentOffset {
+    /// Mean, A per cell: it is subtracted from the current.
+    mean_a: f64,
+    /// Standard deviation relative to the configured one, 0 to 1; `None` = nothing learned yet, 1.
+    part: Option<f64>,
+}
+
+impl CurrentOffset {
+    /// Mean, A per cell.
+    pub fn mean_a(&self) -> f64 {
+        self.mean_a
+    }
+
+    /// Standard deviation, A per cell, with `configured_a` before any evidence.
+    pub fn std_a(&self, configured_a: f64) -> f64 {
+        self.part() * configured_a
+    }
+
+    fn part(&self) -> f64 {
+        self.part.unwrap_or(1.0)
+    }
+
+    /// Takes evidence: sums of d^2 / R and d x innovation / R with d the effect of one standard deviation. Returns the
+    /// correction in standard deviations from before.
+    pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
+        let std_a = self.std_a(configured_a);
+        if !(information > 0.0 && score.is_finite() && std_a > 0.0) {
+            return 0.0;
+        }
+        let most_a = MAX_FIRST_DEVIATIONS * configured_a;
+        let deviations = (score / (1.0 + information)).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS);
+        let mean_a = (self.mean_a + deviations * std_a).clamp(-most_a, most_a);
+        let corrected = (mean_a - self.mean_a) / std_a;
+        self.mean_a = mean_a;
+        self.part = Some(self.part() / (1.0 + information).sqrt());
+        corrected
+    }
+
+    /// Lets the offset drift for a time, s.
+    pub fn drift(&mut self, seconds: f64) {
+        if let Some(part) = &mut self.part {
+            *part = (*part * *part + DRIFT_PER_DAY * DRIFT_PER_DAY * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
+        }
+    }
+
+    /// Checks a stored offset; the error is its first impossible number.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless_number("the offset of the current", self.mean_a)?;
+        let part = self.part();
+        InvalidState::unless(
+            part > 0.0 && part <= 1.0,
+            "the deviation of the current's offset",
+            part,
+            "above 0, at most 1",
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn evidence_is_weighed_by_the_deviation_and_counts_once() {
+        let mut offset = CurrentOffset::default();
+        assert_eq!((offset.mean_a(), offset.std_a(0.05)), (0.0, 0.05));
+        // Innovations that say one deviation, with three times the prior's information.
+        let corrected = offset.update(0.05, (3.0, 3.0));
+        assert!((corrected - 0.75).abs() < 1e-12 && (offset.mean_a() - 0.0375).abs() < 1e-12, "{offset:?}");
+        assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
+        // The rest of the way: half a deviation of the present one.
+        offset.update(0.05, (99.0, 50.0));
+        assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");
+    }
+
+    #[test]
+    fn no_evidence_no_deviation_and_numbers_that_are_none_change_nothing() {
+        for evidence in [(0.0, 0.0), (-1.0, 3.0), (f64::NAN, 1.0), (2.0, f64::INFINITY)] {
+            let mut offset = CurrentOffset::default();
+            assert_eq!((offset.update(0.05, evidence), offset), (0.0, CurrentOffset::default()), "{evidence:?}");
+        }
+        let mut unlearned = CurrentOffset::default();
+        assert_eq!((unlearned.update(0.0, (5.0, 5.0)), unlearned.mean_a()), (0.0, 0.0));
+    }
+
+    #[test]
+    fn the_mean_is_bounded_and_the_deviation_returns_with_time() {
+        let mut offset = CurrentOffset::default();
+        for _ in 0..100 {
+            offset.update(0.05, (1.0, 1e3));
+            offset.drift(86_400.0);
+        }
+        assert!((offset.mean_a() - 0.25).abs() < 1e-12, "{offset:?}");
+        offset.drift(400.0 * 86_400.0);
+        assert_eq!(offset.std_a(0.05), 0.05);
+        assert!(offset.check().is_ok());
+        assert!(CurrentOffset { part: Some(0.0), ..offset }.check().is_err());
+    }
+}
