@@ -5,6 +5,7 @@
 //! the first and of the last 60 s count, each with the charge that had flowed by then, so nothing is assumed of the
 //! capacity but the curve's change of shape with it. The deviation of an end is the product's own (`[capacity]`).
 
+use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
 use packwatch::cell::{CellModel, Discretisation, MAX_BRANCHES};
 use packwatch::health::CapacityConfig;
@@ -69,7 +70,7 @@ impl Weighed {
         let lost = 1.0 - capacity_ah / model.capacity_ah;
         let [(a, a_variance), (b, b_variance)] = self.ends.map(|end| {
             let soc = aged_soc(model, end.new_soc, capacity_ah);
-            let shape = config.ageing_shift_error * lost * soc * (1.0 - soc);
+            let shape = SHIFT_STD * lost * soc * (1.0 - soc);
             (soc, end.variance + shape * shape)
         });
         self.between(config, a - b, a_variance + b_variance)
