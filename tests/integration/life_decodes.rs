@@ -131,6 +131,7 @@ fn every_protected_frame_of_a_pack_of_eight_cells_says_what_the_replay_reports()
     let life = Life { config: protected_pack(), simulate, rated_capacity_ah: "2.6" };
     let found = decode(&python, &life, folder.path());
     assert_eq!(found["cells"], 8);
+    assert!(found["untold"].as_u64().unwrap() < 100, "at changes of mode only, and the last charge");
     assert!(found["frames"]["Alarm at once"].as_u64().unwrap() >= 8, "each cell has its own: {}", found["frames"]);
     assert!(count(&found, "Health.UsableCapacity") > 50_000);
     let checked = check_headers(&folder.path().join("out.log"), &folder.path().join("pack.toml"));
