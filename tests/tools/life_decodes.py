@@ -183,9 +183,9 @@ class Comparison:
         self.frames, self.values = Counter(), Counter()
         self.faults, self.told = 0, []
         self.counters = {}
-        # Values that neither rows nor events give: recharge periods whose event is not in the log, and resistances between a
-        # change of mode, where the current's offset is learned, and the next rows.
-        self.untold = 0
+        self.untold = 0  # recharge periods whose event is not in the log
+        # Resistances between a change of mode, where the current's offset is learned, and the next rows: no report has them.
+        self.restated = 0
 
     def fault(self, time, message, what):
         self.faults += 1
@@ -251,7 +251,7 @@ def compare(reader, life, estimates, events, frame_list):
                             result.untold += 1
                             continue
                     if signal == "ResistanceRatio" and wanted is not None and values[signal] is not None and life.moved:
-                        result.untold += 1
+                        result.restated += 1
                         continue
                     result.value(time, message, signal, values[signal], wanted)
         else:
@@ -302,7 +302,7 @@ def main():
     for line in result.told:
         print(line)
     print(json.dumps({"faults": result.faults, "cells": life.cells, "frames": dict(result.frames),
-                      "values": sum(result.values.values()), "untold": result.untold, "per_signal": dict(result.values)}))
+                      "values": sum(result.values.values()), "untold": result.untold, "restated": result.restated, "per_signal": dict(result.values)}))
     sys.exit(result.faults != 0)
 
 
