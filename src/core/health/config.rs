@@ -37,11 +37,9 @@ pub struct CapacityConfig {
     /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah; at
     /// most one day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Error of the cell's open-circuit voltage at the ends of a half-cycle, V: it repeats, so readings there do not average
-    /// it out. `Swing` only, as the next one.
-    pub end_error_v: f64,
-    /// Error of that voltage in proportion to the voltage that the load drops in the cell, fraction.
-    pub end_load_error: f64,
+    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = the model's own error there. Not used by
+    /// `Nominal`.
+    pub end_error_v: Option<f64>,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
     pub current_gain_std: f64,
     /// Standard deviation of the current sensor's offset at the start, per cell, A; 0 = not learned. Not used by `Nominal`.

@@ -3,12 +3,17 @@
 //! State x = [C (Ah), fade (Ah per full cycle)]. Measurement: the capacity by the half-cycle alone
 //! (`ScalarGaussian::information_until`). At the end of a charge of w full cycles: C -= w fade. C walks (the caller's noise).
 //!
+//! The measurement's lasting errors ([`super::end_errors`]) are considered, not estimated (Schmidt; Woodbury and Junkins
+//! 2010): beside P stands, per error, what one standard deviation of it makes of x. They count in the gain and in the
+//! published variance, and never average out.
+//!
 //! Assumed: the fade of a cycle shows from its end on. Inputs are not checked; a stored state is.
 
 use serde::{Deserialize, Serialize};
 
 use super::CapacityConfig;
-use crate::filter::{Measurement, ScalarGaussian, update_states};
+use super::end_errors::END_ERRORS;
+use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 
 const C: usize = 0;
@@ -20,15 +25,20 @@ const N: usize = 2;
 #[serde(from = "StoredDrift")]
 pub struct DriftFilter {
     x: [f64; N],
+    /// Covariance without the lasting errors.
     p: [[f64; N]; N],
+    /// Error of the state (true less estimated) by one standard deviation of each lasting error.
+    by_end: [[f64; N]; END_ERRORS],
 }
 
-/// A stored filter; those of earlier versions have more states.
+/// A stored filter; those of earlier versions have more states, or no lasting errors.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct StoredDrift {
     x: Vec<f64>,
     p: Vec<Vec<f64>>,
+    #[serde(default)]
+    by_end: [[f64; N]; END_ERRORS],
 }
 
 impl From<StoredDrift> for DriftFilter {
@@ -36,7 +46,7 @@ impl From<StoredDrift> for DriftFilter {
     fn from(stored: StoredDrift) -> Self {
         let number = |row: &[f64], i: usize| row.get(i).copied().unwrap_or(f64::NAN);
         let row = |i: usize| stored.p.get(i).map_or([f64::NAN; N], |row| std::array::from_fn(|j| number(row, j)));
-        Self { x: std::array::from_fn(|i| number(&stored.x, i)), p: std::array::from_fn(row) }
+        Self { x: std::array::from_fn(|i| number(&stored.x, i)), p: std::array::from_fn(row), by_end: stored.by_end }
     }
 }
 
@@ -46,18 +56,19 @@ impl DriftFilter {
         let mut p = [[0.0; N]; N];
         p[C][C] = capacity.variance;
         p[FADE][FADE] = config.fade_std_ah_per_cycle * config.fade_std_ah_per_cycle;
-        Self { x: [capacity.mean, 0.0], p }
+        Self { x: [capacity.mean, 0.0], p, by_end: [[0.0; N]; END_ERRORS] }
     }
 
-    /// Capacity, Ah.
+    /// Capacity, Ah, with the lasting errors in its variance.
     pub fn capacity(&self) -> ScalarGaussian {
-        ScalarGaussian { mean: self.x[C], variance: self.p[C][C] }
+        let lasting: f64 = self.by_end.iter().map(|column| column[C] * column[C]).sum();
+        ScalarGaussian { mean: self.x[C], variance: self.p[C][C] + lasting }
     }
 
     /// Checks a stored filter; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
-        let all = self.x.iter().chain(self.p.iter().flatten());
+        let all = self.x.iter().chain(self.p.iter().flatten()).chain(self.by_end.iter().flatten());
         InvalidState::unless_numbers("a number of a learned capacity's filter", all.copied())?;
         InvalidState::unless_positive("the variance of a learned capacity", self.p[C][C])?;
         for i in 0..N {
@@ -77,11 +88,28 @@ impl DriftFilter {
         Ok(())
     }
 
-    /// Updates with the capacity measured by a half-cycle.
-    pub fn update(&mut self, z: Measurement) {
-        let ph: [f64; N] = std::array::from_fn(|i| self.p[i][C]);
+    /// Updates with the capacity measured by a half-cycle, of which one standard deviation of each lasting error moves
+    /// `effects_ah`.
+    pub fn update(&mut self, z: Measurement, effects_ah: &[f64; END_ERRORS]) {
+        // The innovation's error: C's and the measurement's own.
+        let by_end: [f64; END_ERRORS] = std::array::from_fn(|k| self.by_end[k][C] + effects_ah[k]);
+        let lasting: f64 = by_end.iter().map(|b| b * b).sum();
+        let own_variance = self.p[C][C] + z.variance;
         let innovation = z.value - self.x[C];
-        update_states(&mut self.x, &mut self.p, &ph, innovation, z.variance + ph[C]);
+        let cross: [f64; N] = std::array::from_fn(|i| self.p[i][C]);
+        let gain: [f64; N] = std::array::from_fn(|i| {
+            let considered: f64 = by_end.iter().zip(&self.by_end).map(|(b, column)| b * column[i]).sum();
+            (cross[i] + considered) / (own_variance + lasting)
+        });
+        for i in 0..N {
+            self.x[i] += gain[i] * innovation;
+            for (column, b) in self.by_end.iter_mut().zip(by_end) {
+                column[i] -= gain[i] * b;
+            }
+            for j in 0..N {
+                self.p[i][j] += gain[i] * gain[j] * own_variance - gain[i] * cross[j] - cross[i] * gain[j];
+            }
+        }
     }
 
     /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the
@@ -91,7 +119,7 @@ impl DriftFilter {
         for j in 0..N {
             self.p[C][j] -= charged * self.p[FADE][j];
         }
-        for row in &mut self.p {
+        for row in self.p.iter_mut().chain(&mut self.by_end) {
             row[C] -= charged * row[FADE];
         }
         let walk = |std: f64| std * std * cycles;
@@ -109,8 +137,7 @@ mod tests {
         method: CapacityMethod::Swing,
         noise_ah_per_cycle: 0.01,
         noise_ah_per_rest_day: 0.0,
-        end_error_v: 0.0,
-        end_load_error: 0.0,
+        end_error_v: Some(0.0),
         current_gain_std: 0.005,
         current_offset_std_a: 0.02,
         fade_std_ah_per_cycle: 0.1,
@@ -122,7 +149,7 @@ mod tests {
         let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;
         for k in 0..40 {
-            drift.update(Measurement { value: true_ah, variance: 1e-4 });
+            drift.update(Measurement { value: true_ah, variance: 1e-4 }, &[0.0; END_ERRORS]);
             if k == 39 {
                 break;
             }

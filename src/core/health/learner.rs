@@ -15,6 +15,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::drift::DriftFilter;
+use super::end_errors::effects_ah;
 use super::offset::CurrentOffset;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
@@ -23,9 +24,6 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Largest part of a half-cycle's capacity that may come from the capacity of the curve itself.
 const MAX_BY_CURVE: f64 = 0.8;
-
-/// Smallest swing in the variance of a half-cycle's ends: below it the measurement has no use.
-const MIN_WEIGHED_SWING: f64 = 0.02;
 
 /// One completed half-cycle of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,32 +37,14 @@ pub struct HalfCycle {
     pub swing: Option<ScalarGaussian>,
     /// SOC at its end, fraction.
     pub end_soc: Option<f64>,
-    /// Both ends on the voltage curve; `None` when the SOC was not estimated.
-    pub ends: Option<[HalfCycleEnd; 2]>,
+    /// SOC at both ends, fractions; `None` when it was not estimated.
+    pub ends: Option<[f64; 2]>,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
     pub mean_current_a: f64,
     /// Mean temperature, degrees C; `None` when there was none.
     pub mean_temperature_c: Option<f64>,
-}
-
-/// One end of a half-cycle.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HalfCycleEnd {
-    /// State of charge, fraction.
-    pub soc: f64,
-    /// Voltage that the load of the minutes before dropped in the cell, V.
-    pub load_v: f64,
-}
-
-/// A cell's present condition: the end of a half-cycle that begins or ends now.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CellCondition {
-    /// State of charge; `None` before the first estimate.
-    pub soc: Option<ScalarGaussian>,
-    /// Voltage that the load of the last minutes drops in the cell, V.
-    pub load_v: f64,
 }
 
 /// Outcome of the capacity filter's step over a half-cycle.
@@ -80,20 +60,14 @@ pub struct CapacityUpdate {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
-    #[serde(default)]
-    load_v: f64,
     temperature_integral: f64,
     temperature_s: f64,
 }
 
 impl CellMark {
-    fn put(&mut self, end: CellCondition) {
-        (self.soc, self.load_v) = (end.soc, end.load_v);
-    }
-
     fn check(&self) -> Result<(), InvalidState> {
-        let numbers = [self.load_v, self.temperature_integral, self.temperature_s];
-        InvalidState::unless_numbers("a load or temperature at a half-cycle's end", numbers)?;
+        let numbers = [self.temperature_integral, self.temperature_s];
+        InvalidState::unless_numbers("a temperature at a half-cycle's end", numbers)?;
         let Some(soc) = self.soc else { return Ok(()) };
         InvalidState::unless_number("the SOC at a half-cycle's end", soc.mean)?;
         InvalidState::unless_natural("its variance", soc.variance)
@@ -153,7 +127,7 @@ impl Learner {
     ///
     /// `measured_s` and `gap_s` are the times since the sample before with and without a measured current, s; the gap is
     /// infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in that gap:
-    /// the candidate then begins at the cell's condition after the gap ([`Self::move_mark`]).
+    /// the candidate then begins at the cell's SOC after the gap ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -171,10 +145,10 @@ impl Learner {
         gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
     }
 
-    /// Moves the candidate's mark of a cell to its present condition.
-    pub fn move_mark(&mut self, cell: usize, end: CellCondition) {
+    /// Moves the candidate's mark of a cell to its present SOC.
+    pub fn move_mark(&mut self, cell: usize, soc: Option<ScalarGaussian>) {
         if let Some(mark) = &mut self.candidate {
-            mark.cells[cell].put(end);
+            mark.cells[cell].soc = soc;
         }
     }
 
@@ -183,11 +157,11 @@ impl Learner {
         self.rest_s = 0.0;
     }
 
-    /// Marks the beginning of a mode that may follow the present one; `end` gives the condition of each cell.
-    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, end: impl Fn(usize) -> CellCondition) {
+    /// Marks the beginning of a mode that may follow the present one; `soc` gives that of each cell.
+    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
-        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.put(end(cell)));
+        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.soc = soc(cell));
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
@@ -268,11 +242,7 @@ impl Learner {
         half_cycle: &HalfCycle,
     ) -> Option<Measurement> {
         let after = estimator.capacity();
-        let measurement = self.prior[cell].information_until(&after).map(|z| Measurement {
-            value: z.value,
-            variance: z.variance + end_variance_ah2(model, config, half_cycle, after.mean),
-        });
-        let measurement = measurement.map(|z| {
+        let measurement = self.prior[cell].information_until(&after).map(|z| {
             // With the curve of the capacity that comes out: z = C + s (C_curve - C).
             let weight = 1.0 - after.variance / self.prior[cell].variance;
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-MAX_BY_CURVE, MAX_BY_CURVE);
@@ -281,7 +251,7 @@ impl Learner {
         });
         let drift = &mut self.drift[cell];
         if let Some(z) = measurement {
-            drift.update(z);
+            drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
         }
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
@@ -345,21 +315,6 @@ impl Learner {
     }
 }
 
-/// Variance of a half-cycle's capacity by the voltage model's repeating error at both ends, Ah^2: (C / swing)^2 times the
-/// variance of both ends' SOC.
-fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &HalfCycle, capacity_ah: f64) -> f64 {
-    let Some(ends) = &half_cycle.ends else { return 0.0 };
-    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    let soc_variance = ends.iter().fold(0.0, |sum, end| {
-        let position = model.grid_position(end.soc, temperature_c);
-        let slope_v = model.ocv_slope_v(&position, capacity_ah);
-        let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
-        sum + volts * volts
-    });
-    let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
-    (capacity_ah / swing) * (capacity_ah / swing) * soc_variance
-}
-
 /// One cell's half-cycle between two marks in which `moved_ah` left it.
 fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
     let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
@@ -372,11 +327,8 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .zip(b.soc)
             .map(|(a, b)| ScalarGaussian { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
-        ends: b.soc.map(|soc| {
-            let end = HalfCycleEnd { soc: soc.mean, load_v: b.load_v };
-            // An unobserved beginning counts as uncertain as the end.
-            [a.soc.map_or(end, |soc| HalfCycleEnd { soc: soc.mean, load_v: a.load_v }), end]
-        }),
+        // An unobserved beginning counts as uncertain as the end.
+        ends: b.soc.map(|end| [a.soc.unwrap_or(end).mean, end.mean]),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)
@@ -396,8 +348,7 @@ mod tests {
             method: CapacityMethod::Swing,
             noise_ah_per_cycle: 0.01,
             noise_ah_per_rest_day: 0.0,
-            end_error_v: 0.0,
-            end_load_error: 0.0,
+            end_error_v: Some(0.0),
             current_gain_std: 0.0,
             current_offset_std_a: 0.0,
             fade_std_ah_per_cycle: 0.0,
@@ -427,7 +378,7 @@ mod tests {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
         let mut learner = Learner::new(&config(), 1, ScalarGaussian::from_std(2.0, 0.1));
-        let at = |soc: f64| CellCondition { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v: 0.0 };
+        let at = |soc: f64| Some(ScalarGaussian::from_std(soc, 0.01));
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
         assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
         learner.mark_candidate(start, 0.0, |_| at(0.1));
@@ -456,27 +407,5 @@ mod tests {
         let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
-    }
-
-    #[test]
-    fn the_error_of_both_ends_depends_on_slope_load_and_swing() {
-        let mut config = config();
-        (config.end_error_v, config.end_load_error) = (0.004, 0.1);
-        let model = small_model();
-        let mark =
-            |soc, load_v| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v, ..CellMark::default() };
-        let moved = half_cycle(1.0, 3600.0, &mark(0.9, 0.03), &mark(0.4, 0.0));
-        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below.
-        let (start_v2, end_v2) = (0.004 * 0.004 + 0.003 * 0.003, 0.004 * 0.004);
-        let soc_variance = start_v2 / (1.075 * 1.075) + end_v2 / (1.325 * 1.325);
-        let swing: f64 = 1.0 / 1.8;
-        let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
-        let found = end_variance_ah2(&model, &config, &moved, 1.8);
-        assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
-        // A tiny swing counts as the smallest one; a half-cycle without an estimated end has no ends.
-        let tiny = HalfCycle { charge_ah: 0.001, ..moved };
-        let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;
-        assert!((end_variance_ah2(&model, &config, &tiny, 1.8) / least - 1.0).abs() < 1e-9);
-        assert_eq!(end_variance_ah2(&model, &config, &HalfCycle { ends: None, ..moved }, 1.8), 0.0);
     }
 }

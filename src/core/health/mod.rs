@@ -6,6 +6,7 @@
 
 pub mod config;
 pub mod drift;
+mod end_errors;
 pub mod forecast;
 pub mod learner;
 pub mod offset;
@@ -18,7 +19,7 @@ pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
 pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
-pub use learner::{CapacityUpdate, CellCondition, HalfCycle, Learner};
+pub use learner::{CapacityUpdate, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
 pub use recharge::{ChargeRecord, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

@@ -9,7 +9,7 @@ use super::batch::CellBatch;
 use super::{Estimate, MeasuredValues, MonitorConfig};
 use crate::cell::{CellStep, EstimatorBank};
 use crate::filter::ScalarGaussian;
-use crate::health::{CellCondition, Learner};
+use crate::health::Learner;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
@@ -104,7 +104,7 @@ impl Estimation {
         samples.clear();
         self.batch.waiting = samples;
         let bank = &self.bank;
-        self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, end_state(bank, cell)));
+        self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, bank.filtered_soc(cell)));
     }
 
     /// The filter step from the sample before to this one.
@@ -223,9 +223,4 @@ pub(super) fn resistance(bank: &EstimatorBank, index: usize) -> ScalarGaussian {
     let log_resistance = bank.log_resistance(index);
     let ratio = libm::exp(log_resistance.mean);
     ScalarGaussian::from_std(ratio, ratio * log_resistance.std())
-}
-
-/// Where a half-cycle that begins or ends now begins or ends for a cell.
-pub(super) fn end_state(bank: &EstimatorBank, index: usize) -> CellCondition {
-    CellCondition { soc: bank.filtered_soc(index), load_v: bank.load_v(index) }
 }

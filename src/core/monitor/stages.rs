@@ -4,7 +4,7 @@
 //! input at hand.
 
 use super::alarming::Alarming;
-use super::estimation::{Estimation, end_state};
+use super::estimation::Estimation;
 use super::learning::Learning;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
@@ -162,7 +162,7 @@ impl Stages {
         if observed.candidate_begins {
             let (charge_as, _) = self.sampling.sampler.counted(now);
             let bank = &self.estimation.bank;
-            self.learning.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
+            self.learning.state.learner.mark_candidate(now, charge_as, |cell| bank.filtered_soc(cell));
         }
     }
 

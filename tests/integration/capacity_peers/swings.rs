@@ -217,7 +217,7 @@ impl Circuit {
         }
         load_v += current_a * model.r0_ohm(&place) * resistance_ratio;
         let new_soc = model.soc_of_ocv(voltage_v + load_v, temperature_c);
-        let volts = config.end_error_v.hypot(config.end_load_error * load_v).hypot(0.25 * VOLTAGE_NOISE_V);
+        let volts = config.end_error_v.unwrap_or(0.0).hypot(0.25 * VOLTAGE_NOISE_V);
         let deviation = volts / model.ocv_slope_v(&model.grid_position(new_soc, temperature_c), model.capacity_ah);
         self.last = Some(*reading);
         Point {

@@ -250,11 +250,6 @@ impl EstimatorBank {
         self.cells[cell].memory.is_carried_over()
     }
 
-    /// Voltage that the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
-    pub fn load_v(&self, cell: usize) -> f64 {
-        self.cell(cell).load_v(&self.model)
-    }
-
     /// A copy of a cell's estimator.
     pub fn cell(&self, cell: usize) -> CellEstimator {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);

@@ -216,13 +216,6 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
     }
 
-    /// Voltage that the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
-    pub fn load_v(&self, model: &CellModel) -> f64 {
-        let Some(soc) = self.soc() else { return 0.0 };
-        let position = model.grid_position(soc.mean, self.memory.temperature_c.unwrap_or(25.0));
-        model.settled_ohm(&position) * libm::exp(self.log_resistance().mean) * self.memory.load_a
-    }
-
     /// Capacity of the open-circuit curve, Ah.
     pub fn curve(&self) -> ScalarGaussian {
         self.memory.curve()

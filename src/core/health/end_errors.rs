@@ -1,0 +1,110 @@
+//! Errors of the cell model at the ends of half-cycles. They are the same in every half-cycle that ends there, so many
+//! half-cycles do not average them out.
+//!
+//! In: a half-cycle's ends. Out: the effect of one standard deviation of each error on its capacity, Ah.
+//!
+//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the curve at an end moves its SOC by e / slope, and
+//! the capacity by C / swing times that. The errors are those of the curve at some nodes of the SOC, independent of each
+//! other, and linear between nodes. How large they are the model's fit has found on the cell's own measurements.
+
+use super::CapacityConfig;
+use super::learner::HalfCycle;
+use crate::cell::CellModel;
+use crate::quantity::Mode;
+
+/// Number of errors: nodes of the SOC, evenly from empty to full. Curves of real cells err differently a quarter of it apart.
+pub(super) const END_ERRORS: usize = 5;
+
+/// Smallest swing that a half-cycle counts with: below it the measurement has no use.
+const MIN_WEIGHED_SWING: f64 = 0.02;
+
+/// Model's error where neither model nor configuration states one, V.
+const UNKNOWN_ERROR_V: f64 = 0.005;
+
+/// Effect of one standard deviation of each error on the capacity by a half-cycle, Ah; zero when its ends are not known.
+pub(super) fn effects_ah(
+    model: &CellModel,
+    config: &CapacityConfig,
+    half_cycle: &HalfCycle,
+    capacity_ah: f64,
+) -> [f64; END_ERRORS] {
+    let mut effects = [0.0; END_ERRORS];
+    let Some(ends) = &half_cycle.ends else { return effects };
+    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
+    let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
+    // From a discharge's first end, the fuller one, to its last; a charge the other way round.
+    let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
+    for (soc, fuller) in ends.iter().zip([sign, -sign]) {
+        let position = model.grid_position(*soc, temperature_c);
+        let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
+        let error_v = config.end_error_v.or_else(|| model.voltage_error_v(&position)).unwrap_or(UNKNOWN_ERROR_V);
+        let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
+        let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();
+        let share = along - node as f64;
+        effects[node] += per_volt * error_v * (1.0 - share);
+        effects[node + 1] += per_volt * error_v * share;
+    }
+    effects
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::model::tests::small_model;
+    use crate::health::CapacityMethod;
+
+    const CONFIG: CapacityConfig = CapacityConfig {
+        method: CapacityMethod::Swing,
+        noise_ah_per_cycle: 0.0,
+        noise_ah_per_rest_day: 0.0,
+        end_error_v: Some(0.004),
+        current_gain_std: 0.0,
+        current_offset_std_a: 0.0,
+        fade_std_ah_per_cycle: 0.0,
+        fade_noise_ah_per_cycle: 0.0,
+    };
+
+    fn discharge(charge_ah: f64, from: f64, to: f64) -> HalfCycle {
+        HalfCycle {
+            mode: Mode::Discharge,
+            charge_ah,
+            swing: None,
+            end_soc: Some(to),
+            ends: Some([from, to]),
+            duration_s: 3600.0,
+            mean_current_a: charge_ah,
+            mean_temperature_c: Some(25.0),
+        }
+    }
+
+    #[test]
+    fn an_error_of_the_curve_moves_the_capacity_by_slope_and_swing() {
+        let model = small_model();
+        let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8);
+        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. Swing 0.5.
+        let per_volt = 1.8 / 0.5 * 0.004;
+        let lower = 0.5 * per_volt / 1.325;
+        let expected = [0.0, lower, lower, 0.0, -per_volt / 1.075];
+        for (found, expected) in found.into_iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-9, "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_charge_errs_as_the_discharge_over_the_same_swing() {
+        let model = small_model();
+        let down = discharge(0.9, 0.8, 0.3);
+        let up = HalfCycle { mode: Mode::Charge, ends: down.ends.map(|[a, b]| [b, a]), ..down };
+        assert_eq!(effects_ah(&model, &CONFIG, &up, 1.8), effects_ah(&model, &CONFIG, &down, 1.8));
+    }
+
+    #[test]
+    fn a_tiny_swing_counts_as_the_smallest_one_and_unknown_ends_have_no_effect() {
+        let model = small_model();
+        let tiny = effects_ah(&model, &CONFIG, &discharge(0.001, 0.8, 0.8), 1.8);
+        let least = effects_ah(&model, &CONFIG, &discharge(0.036, 0.8, 0.8), 1.8);
+        assert_eq!(tiny, least);
+        let unknown = HalfCycle { ends: None, ..discharge(0.9, 0.8, 0.3) };
+        assert_eq!(effects_ah(&model, &CONFIG, &unknown, 1.8), [0.0; END_ERRORS]);
+    }
+}
