@@ -128,19 +128,18 @@ pub struct SensorErrors {
     pub current_offset_a: f64,
     /// Gain error of the current, fraction.
     pub current_gain: f64,
-    /// Error of the model's branch resistances against its series resistance, which ageing and temperature change apart,
-    /// fraction.
-    pub branch_resistance: f64,
+    /// Error of the slowest branch's resistance in the model, beside that of all resistances, as far as it has not been
+    /// learned: fraction.
+    pub slow_branch: f64,
 }
 
 impl SensorErrors {
     /// Sensors without constant errors, as in the paper.
-    pub const NONE: Self =
-        Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, branch_resistance: 0.0 };
+    pub const NONE: Self = Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, slow_branch: 0.0 };
 
     /// The deviations in the order of the filter's constant errors.
     pub fn deviations(&self) -> [f64; CONSIDERED] {
-        [self.voltage_offset_v, self.current_offset_a, self.current_gain, self.branch_resistance]
+        [self.voltage_offset_v, self.current_offset_a, self.current_gain, self.slow_branch]
     }
 }
 

@@ -24,6 +24,8 @@
 //!
 //! Deviation 7: constant errors of sensors and model are followed, those of [`SensorErrors`](crate::cell::SensorErrors) also
 //! considered ([`crate::filter::unscented`]); deviation 8: the current's offset is learned ([`crate::health::offset`]).
+//! Deviation 9: the slowest branch has a resistance ratio of its own, also learned ([`slow_branch`]): U_n counts in the voltage
+//! with that ratio.
 //!
 //! A reading beyond the gate leaves the state unchanged. After every reading has been beyond it for `lost_after_s`, the
 //! filter restarts: SOC and branches from the voltage, resistance and capacity are kept.
@@ -34,6 +36,7 @@ mod downtime;
 mod filter;
 mod memory;
 mod noise;
+mod slow_branch;
 mod state;
 mod state_vector;
 mod step;

@@ -112,6 +112,11 @@ impl DriftFilter {
         }
     }
 
+    /// Widens the capacity to at least a variance, Ah^2: what was measured does not hold.
+    pub fn doubt(&mut self, variance: f64) {
+        self.p[C][C] = self.p[C][C].max(variance);
+    }
+
     /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the
     /// capacity's process noise.
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
@@ -183,6 +188,45 @@ mod tests {
                 assert!(drift.p[i][j] * drift.p[i][j] <= drift.p[i][i] * drift.p[j][j] * (1.0 + 1e-9));
             }
         }
+    }
+
+    #[test]
+    fn a_lasting_error_counts_once_however_often_it_is_measured() {
+        let lasting = |first_ah: f64| [first_ah, 0.0, 0.0, 0.0, 0.0];
+        let measured = |effect_ah: f64| {
+            let mut drift = DriftFilter::new(&CONFIG, ScalarGaussian::from_std(2.5, 0.2));
+            for _ in 0..1000 {
+                drift.update(Measurement { value: 2.65, variance: 1e-4 }, &lasting(effect_ah));
+            }
+            drift.capacity()
+        };
+        // One deviation of 0.05 Ah and the prior of 0.2 Ah: what one reading without noise would leave.
+        let (kept, expected) = (measured(0.05).std(), 0.05 * 0.2 / f64::hypot(0.05, 0.2));
+        assert!((kept - expected).abs() < 1e-3, "{kept} {expected}");
+        assert!(measured(0.0).std() < 0.001);
+    }
+
+    #[test]
+    fn an_error_that_two_swings_show_with_opposite_signs_cancels() {
+        let mut drift = DriftFilter::new(&CONFIG, ScalarGaussian::from_std(2.5, 0.2));
+        for k in 0..200 {
+            let error = if k % 2 == 0 { 0.05 } else { -0.05 };
+            drift.update(Measurement { value: 2.6 + error, variance: 1e-4 }, &[error, 0.0, 0.0, 0.0, 0.0]);
+        }
+        let capacity = drift.capacity();
+        assert!((capacity.mean - 2.6).abs() < 0.003 && capacity.std() < 0.003, "{capacity:?}");
+    }
+
+    #[test]
+    fn a_filter_stored_without_lasting_errors_is_read_and_continues() {
+        let text = r#"{"x":[2.5,0.01],"p":[[0.01,0],[0,0.1]]}"#;
+        let mut drift = serde_json::from_str::<DriftFilter>(text).expect("reads");
+        assert_eq!((drift.by_end, drift.check()), ([[0.0; N]; END_ERRORS], Ok(())));
+        drift.update(Measurement { value: 2.5, variance: 1e-4 }, &[0.05, 0.0, 0.0, 0.0, 0.0]);
+        let again: DriftFilter = serde_json::from_value(serde_json::to_value(drift).expect("writes")).expect("reads");
+        assert_eq!(again, drift);
+        let broken = DriftFilter { by_end: [[f64::NAN; N]; END_ERRORS], ..drift };
+        assert!(broken.check().is_err());
     }
 
     #[test]

@@ -105,6 +105,9 @@ pub struct Learner {
     learned: Vec<bool>,
     /// Capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
+    /// Cells whose sample filter was restarted in this half-cycle: it teaches them nothing.
+    #[serde(default)]
+    in_doubt: Vec<usize>,
     /// Offset of the current sensor.
     #[serde(default)]
     offset: CurrentOffset,
@@ -223,6 +226,28 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
 
+    /// After a restart of a cell's sample filter: voltages contradicted what it had learned, so its capacity is no more
+    /// certain than a new cell's. The half-cycle at hand teaches nothing.
+    pub fn doubt(
+        &mut self,
+        config: &CapacityConfig,
+        cell: usize,
+        new_variance_ah2: f64,
+        estimator: &mut CellEstimator,
+    ) {
+        if config.method != CapacityMethod::Swing {
+            return;
+        }
+        if !self.in_doubt.contains(&cell) {
+            self.in_doubt.push(cell);
+        }
+        let drift = &mut self.drift[cell];
+        drift.doubt(new_variance_ah2);
+        self.capacity[cell] = drift.capacity();
+        estimator.restate_capacity(self.capacity[cell]);
+        self.prior[cell] = estimator.capacity();
+    }
+
     /// Whether a cell's capacity has been measured since its configured start.
     pub fn has_learned(&self, cell: usize) -> bool {
         self.learned.get(cell).copied().unwrap_or(false)
@@ -242,7 +267,10 @@ impl Learner {
         half_cycle: &HalfCycle,
     ) -> Option<Measurement> {
         let after = estimator.capacity();
-        let measurement = self.prior[cell].information_until(&after).map(|z| {
+        let is_in_doubt = self.in_doubt.contains(&cell);
+        self.in_doubt.retain(|&other| other != cell);
+        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt);
+        let measurement = evidence.map(|z| {
             // With the curve of the capacity that comes out: z = C + s (C_curve - C).
             let weight = 1.0 - after.variance / self.prior[cell].variance;
             let by_curve = (estimator.capacity_by_curve() / weight).clamp(-MAX_BY_CURVE, MAX_BY_CURVE);
@@ -339,9 +367,9 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cell::CellStep;
-    use crate::cell::estimator::tests::config as estimator_config;
+    use crate::cell::estimator::tests::{config as estimator_config, truth};
     use crate::cell::model::tests::small_model;
+    use crate::cell::{CellStep, SensorErrors};
 
     fn config() -> CapacityConfig {
         CapacityConfig {
@@ -407,5 +435,43 @@ mod tests {
         let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
+    }
+
+    /// The capacity after 1,000 half-cycles between 0.8 and 0.3 at 1 A, with 5 mV too much at the upper end of the curve and too
+    /// little at the lower one, less the true one, in standard deviations.
+    fn after_a_thousand(config: &CapacityConfig, sensor: SensorErrors) -> f64 {
+        let model = small_model();
+        let mut estimator_config = estimator_config();
+        estimator_config.sensor = sensor;
+        let mut estimator = CellEstimator::new(&estimator_config);
+        let mut learner = Learner::new(config, 1, estimator.capacity());
+        let mut truth = truth();
+        truth.soc = 0.8;
+        for k in 0..1000 {
+            let current_a = if k % 2 == 0 { 1.0 } else { -1.0 };
+            let mark = |estimator: &CellEstimator| CellMark { soc: estimator.soc(), ..CellMark::default() };
+            let (start, mut moved_ah) = (mark(&estimator), 0.0);
+            while if current_a > 0.0 { truth.soc > 0.3 } else { truth.soc < 0.8 } {
+                let mut step = truth.step(&model, current_a, 30.0);
+                step.voltage_v += 0.005 * (4.0 * (truth.soc - 0.55)).clamp(-1.0, 1.0);
+                estimator.step(&model, &estimator_config, &step);
+                moved_ah += current_a * 30.0 / 3600.0;
+            }
+            let half_cycle = half_cycle(moved_ah, 3600.0 * moved_ah.abs(), &start, &mark(&estimator));
+            learner.learn(&model, config, 0, &mut estimator, &half_cycle);
+        }
+        let capacity = learner.capacity(0);
+        (capacity.mean - truth.capacity_ah) / capacity.std()
+    }
+
+    #[test]
+    fn a_thousand_equal_half_cycles_with_the_same_errors_are_one_witness() {
+        let config = CapacityConfig { end_error_v: Some(0.005), noise_ah_per_cycle: 0.001, ..config() };
+        let sensor = SensorErrors { voltage_offset_v: 0.004, current_gain: 0.005, ..SensorErrors::NONE };
+        let deviations = after_a_thousand(&config, sensor);
+        assert!(deviations.abs() < 1.96, "{deviations}");
+        // Errors that are taken for noise average out, and the interval is left without the truth.
+        let without = after_a_thousand(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
+        assert!(without.abs() > 3.0, "{without}");
     }
 }

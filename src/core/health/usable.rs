@@ -10,7 +10,7 @@
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
-use crate::cell::{CellEstimator, CellModel, Discretisation, MAX_BRANCHES};
+use crate::cell::{CellEstimator, CellModel, Discretisation, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 
 /// Steps over a full capacity.
@@ -22,13 +22,14 @@ const MAX_STEPS: u32 = 2000;
 /// Steps of the numerical forward derivatives over ln rho and over ln capacity.
 const LOG_STEP: f64 = 0.01;
 
-/// Charge, Ah, that a cell of `capacity_ah` and `resistance_ratio` delivers from `full_soc` down to the cut-off.
+/// Charge, Ah, that a cell of `capacity_ah` delivers from `full_soc` down to the cut-off, with its resistance ratio and that of its
+/// slowest branch beside the others.
 pub fn usable_ah(
     model: &CellModel,
     config: &UsableConfig,
     full_soc: f64,
     capacity_ah: f64,
-    resistance_ratio: f64,
+    (resistance_ratio, slow_ratio): (f64, f64),
 ) -> f64 {
     let step_ah = capacity_ah / STEPS;
     let step_s = 3600.0 * step_ah / config.current_a;
@@ -37,7 +38,9 @@ pub fn usable_ah(
     let temperature = model.temperature_position(config.temperature_c);
     let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
         let state = (soc, resistance_ratio, capacity_ah);
-        aged_terminal_v(model, state, &temperature, branch_v.iter().sum(), config.current_a)
+        let slowest = model.branches.len() - 1;
+        let branches_v = branch_v[..slowest].iter().fold(slow_ratio * branch_v[slowest], |sum, v| sum + v);
+        aged_terminal_v(model, state, &temperature, branches_v, config.current_a)
     };
     let mut before_v = voltage(soc, &branch_v);
     if before_v <= config.cutoff_v {
@@ -65,19 +68,22 @@ pub fn usable_ah(
 pub fn usable_capacity(
     model: &CellModel,
     config: &UsableConfig,
-    cell: &CellEstimator,
+    (cell, estimator): (&CellEstimator, &EstimatorConfig),
     capacity: ScalarGaussian,
     full_soc: f64,
 ) -> ScalarGaussian {
-    let log_r = cell.log_resistance();
-    let at = |log_capacity: f64, log_ratio: f64| {
-        usable_ah(model, config, full_soc, capacity.mean * libm::exp(log_capacity), libm::exp(log_r.mean + log_ratio))
+    let (log_r, slow) = (cell.log_resistance(), cell.slow_ratio(estimator));
+    let at = |log_capacity: f64, log_ratio: f64, more_slow: f64| {
+        let capacity_ah = capacity.mean * libm::exp(log_capacity);
+        usable_ah(model, config, full_soc, capacity_ah, (libm::exp(log_r.mean + log_ratio), slow.mean + more_slow))
     };
-    let mean = at(0.0, 0.0);
-    let by_capacity = (at(LOG_STEP, 0.0) - mean) / (LOG_STEP * capacity.mean);
-    let by_log_r = (at(0.0, LOG_STEP) - mean) / LOG_STEP;
+    let mean = at(0.0, 0.0, 0.0);
+    let by_capacity = (at(LOG_STEP, 0.0, 0.0) - mean) / (LOG_STEP * capacity.mean);
+    let by_log_r = (at(0.0, LOG_STEP, 0.0) - mean) / LOG_STEP;
+    let by_slow = (at(0.0, 0.0, LOG_STEP) - mean) / LOG_STEP;
     let variance = by_capacity * by_capacity * capacity.variance
         + by_log_r * by_log_r * log_r.variance
+        + by_slow * by_slow * slow.variance
         + 2.0 * by_capacity * by_log_r * cell.capacity_resistance_covariance();
     ScalarGaussian { mean, variance: variance.max(0.0) }
 }
@@ -93,9 +99,9 @@ mod tests {
     #[test]
     fn without_resistance_the_cutoff_is_on_the_open_circuit_curve() {
         // OCV 3.0 + 1.2 s up to s = 0.5: 3.3 V at s = 0.25, so 75 % of 2 Ah.
-        let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, 1e-12);
+        let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (1e-12, 1.0));
         assert!((usable - 1.5).abs() < 1e-6, "{usable}");
-        assert!((usable_ah(&small_model(), &CONFIG, 0.9, 2.0, 1e-12) - 1.3).abs() < 1e-6);
+        assert!((usable_ah(&small_model(), &CONFIG, 0.9, 2.0, (1e-12, 1.0)) - 1.3).abs() < 1e-6);
     }
 
     #[test]
@@ -103,9 +109,9 @@ mod tests {
         // At 0.2 A every branch (20 to 40 s) has settled: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
         for ratio in [1.0, 3.0] {
             let end = (0.3 + 0.2 * ratio * 0.12) / (1.2 + 0.2 * ratio * 0.08);
-            let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, ratio);
+            let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (ratio, 1.0));
             assert!((usable - 2.0 * (1.0 - end)).abs() < 1e-3, "ratio {ratio}: {usable}");
         }
-        assert_eq!(usable_ah(&small_model(), &CONFIG, 1.0, 2.0, 1000.0), 0.0);
+        assert_eq!(usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (1000.0, 1.0)), 0.0);
     }
 }

@@ -127,6 +127,7 @@ impl Learning {
         // At a loss of the current nothing new is learned: the evidence waits.
         if change.to != Mode::Unknown {
             self.learn_offset(bank, to.now);
+            bank.learn_slow_branches();
         }
         let mut half_cycles = std::mem::take(&mut self.half_cycles);
         let rated_ah = bank.model().rated_capacity_ah;
@@ -192,7 +193,8 @@ impl Learning {
         let is_restated = is_discharge || health.usable.is_none();
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
             let (capacity, full_soc) = (update.capacity, health.full_soc);
-            health.usable = Some(usable_capacity(bank.model(), usable, &estimator, capacity, full_soc));
+            health.usable =
+                Some(usable_capacity(bank.model(), usable, (&estimator, bank.config()), capacity, full_soc));
         }
         let resistance = resistance(bank, index);
         if is_discharge {
@@ -214,17 +216,22 @@ impl Learning {
         update.measurement.is_some()
     }
 
-    /// Takes a stepped sample. A charge that tapers off at the highest voltage leaves a full cell; after a filter reset
-    /// the SOC has jumped, and what it crossed on the way was not charged.
-    pub(super) fn handle_sample(&mut self, sample: &CellSample, was_reset: bool, model: &CellModel) {
-        if was_reset {
-            self.state.recharge = RechargeTimer::default();
-        }
+    /// Takes a stepped sample. A charge that tapers off at the highest voltage leaves a full cell.
+    pub(super) fn handle_sample(&mut self, sample: &CellSample, model: &CellModel) {
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;
         if is_tapering && sample.voltage_v >= model.voltage_max_v - TAPER_BAND_V {
             self.cells[sample.cell.index()].tapered = true;
         }
+    }
+
+    /// Takes a reset of a cell's filter: its capacity is in doubt, and what the SOC crossed in its jump was not charged.
+    pub(super) fn handle_reset(&mut self, cell: CellIndex, bank: &mut EstimatorBank) {
+        self.state.recharge = RechargeTimer::default();
+        let new_std_ah = bank.config().initial.capacity_std_ah;
+        let mut estimator = bank.cell(cell.index());
+        self.state.learner.doubt(&self.config.capacity, cell.index(), new_std_ah * new_std_ah, &mut estimator);
+        bank.put(cell.index(), &estimator);
     }
 
     /// Combines the cells to the pack; `all_fresh`: every cell's voltage is. A charge that has crossed the recharge window

@@ -133,11 +133,11 @@ impl Stages {
 
     /// Takes the outcome of a cell's step.
     fn handle_step(&mut self, now: Timestamp, sample: &CellSample, out: &mut Outputs) {
-        let was_reset = self.estimation.record(sample);
-        if was_reset {
+        if self.estimation.record(sample) {
             out.events.push(Event { time: now, kind: EventKind::FilterReset { cell: sample.cell } });
+            self.learning.handle_reset(sample.cell, &mut self.estimation.bank);
         }
-        self.learning.handle_sample(sample, was_reset, self.estimation.bank.model());
+        self.learning.handle_sample(sample, self.estimation.bank.model());
         if out.want_estimates {
             out.estimates.extend(self.estimate(sample.cell.index()));
         }

@@ -17,12 +17,16 @@ mod tables;
 
 use filter_array::{BatchStep, FilterArray};
 use input::{BlockInput, CellSlot, WIDTH};
-use kernel::{INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, OFFSET_INFORMATION, OFFSET_SCORE, REST_S, at};
+use kernel::{
+    INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION,
+    SLOW_SCORE, at,
+};
 
 use super::cell_estimator::{CellEstimator, thermal_c};
 use super::filter::Filter;
 use super::memory::Memory;
-use super::state_vector::{LOG_RESISTANCE, widened};
+use super::slow_branch::SlowBranch;
+use super::state_vector::{LOG_RESISTANCE, widened, within_bounds};
 use super::step::{CellStep, StepResult};
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
@@ -179,22 +183,20 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge in the filter's state, without the widening by downtime.
+    /// State of charge in the filter's state, without the widening by downtime and the bounds.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
     }
 
-    /// State of charge; `None` before the first voltage.
+    /// State of charge, between empty and full; `None` before the first voltage.
     #[inline]
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let CellSlot { memory, has_filter, .. } = &self.cells[cell];
         has_filter.then(|| {
             let soc = self.marginal(cell, 0);
             let downtime_std = memory.downtime_std_if_any();
-            ScalarGaussian {
-                variance: downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std)),
-                ..soc
-            }
+            let variance = downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std));
+            within_bounds(ScalarGaussian { variance, ..soc })
         })
     }
 
@@ -204,7 +206,7 @@ impl EstimatorBank {
             return None;
         }
         let (lowest, highest) = each_array!(&self.filters, x => x.extremes(self.cells.len()))?;
-        Some((self.marginal(lowest, 0), self.marginal(highest, 0)))
+        Some((within_bounds(self.marginal(lowest, 0)), within_bounds(self.marginal(highest, 0))))
     }
 
     /// ln of the resistance relative to new.
@@ -266,6 +268,11 @@ impl EstimatorBank {
             rest_s: hot[REST_S],
             offset_information: hot[OFFSET_INFORMATION],
             offset_score: hot[OFFSET_SCORE],
+            slow_branch: SlowBranch {
+                information: hot[SLOW_INFORMATION],
+                score: hot[SLOW_SCORE],
+                ..memory.slow_branch
+            },
             ..memory
         };
         CellEstimator { filter: has_filter.then_some(filter), memory }
@@ -276,12 +283,13 @@ impl EstimatorBank {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         let CellEstimator { filter, memory } = estimator;
         self.cells[cell].memory = *memory;
+        let slow_std = memory.slow_branch.std(self.config.sensor.slow_branch);
         self.cells[cell].has_filter = match (&mut self.filters, filter) {
-            (FilterArrays::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory),
-            (FilterArrays::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory),
-            (FilterArrays::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory),
+            (FilterArrays::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory, slow_std),
+            (FilterArrays::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory, slow_std),
+            (FilterArrays::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory, slow_std),
             // The filter has as many branches as the model: states are checked when they are restored.
-            (filters, _) => each_array!(filters, x => x.clear(block, lane, memory)),
+            (filters, _) => each_array!(filters, x => x.clear(block, lane, memory, slow_std)),
         };
     }
 
@@ -312,6 +320,12 @@ impl EstimatorBank {
         let remains = if before_a > 0.0 { offset_std_a / before_a } else { 1.0 };
         self.change_all(|cell| cell.absorb_current_offset(deviations, remains));
         self.set_current_offset_std(offset_std_a);
+    }
+
+    /// Corrects every cell's slowest branch by the voltages since the last correction.
+    pub fn learn_slow_branches(&mut self) {
+        let config = self.config;
+        self.change_all(|cell| cell.learn_slow_branch(&config));
     }
 
     /// Sets the standard deviation of the current's offset, per cell, A.

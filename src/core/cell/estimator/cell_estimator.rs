@@ -3,15 +3,15 @@
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
 //! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
 
-use nalgebra::SMatrix;
+use nalgebra::{SMatrix, SVector};
 
 use super::downtime::update_after_downtime;
 use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
 use super::memory::Memory;
 use super::noise::VoltageReading;
 use super::state_vector::{
-    BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, UNKNOWN_SOC_VARIANCE, square,
-    widened,
+    BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
+    UNKNOWN_SOC_VARIANCE, square, widened, within_bounds,
 };
 use super::step::{CellStep, StepResult};
 use crate::cell::circuit;
@@ -68,15 +68,28 @@ impl CellEstimator {
         let load_a = self.memory.load_a;
         let temperature = model.temperature_position(temperature_c);
         let curve = self.memory.curve();
-        let reading =
-            VoltageReading { voltage_v: step.voltage_v, current_a, load_a, temperature, information_s, curve };
-        let (update, offset_v) = match downtime_std {
+        let slow_branch = self.memory.slow_branch;
+        let (slow_ratio, slow_std) = (slow_branch.ratio, slow_branch.std(config.sensor.slow_branch));
+        let reading = VoltageReading {
+            voltage_v: step.voltage_v,
+            current_a,
+            load_a,
+            temperature,
+            information_s,
+            curve,
+            slow_ratio,
+            slow_std,
+        };
+        let (update, effects_v) = match downtime_std {
             None => each!(filter, x => update(x, model, config, &reading))?,
-            Some(std) => (each!(filter, x => update_after_downtime(x, model, config, &reading, std))?, 0.0),
+            Some(std) => {
+                (each!(filter, x => update_after_downtime(x, model, config, &reading, std))?, SVector::zeros())
+            }
         };
         (self.memory.downtime_std, self.memory.is_unseen) = (0.0, false);
         if update.accepted {
-            self.memory.note_offset(offset_v, &update);
+            self.memory.note_offset(effects_v[CURRENT_OFFSET], &update);
+            self.memory.slow_branch.note(effects_v[SLOW_BRANCH], &update);
         }
         self.memory.record_update(config, step, &update);
         Ok(Some(update))
@@ -146,18 +159,22 @@ impl CellEstimator {
         });
     }
 
-    /// State of charge; `None` before the first voltage.
+    /// State of charge, between empty and full; `None` before the first voltage.
     pub fn soc(&self) -> Option<ScalarGaussian> {
         let soc = self.marginal(0)?;
         let variance = self.memory.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
-        Some(ScalarGaussian { variance, ..soc })
+        Some(within_bounds(ScalarGaussian { variance, ..soc }))
     }
 
     /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
     pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
         let mut branch_v = [f64::NAN; MAX_BRANCHES];
         if let Some(filter) = &self.filter {
-            each!(filter, x => for i in BRANCHES..x.mean.len() { branch_v[i - BRANCHES] = x.mean[i]; });
+            each!(filter, x => {
+                let slowest = x.mean.len() - 1;
+                (BRANCHES..=slowest).for_each(|i| branch_v[i - BRANCHES] = x.mean[i]);
+                branch_v[slowest - BRANCHES] *= self.memory.slow_branch.ratio;
+            });
         }
         branch_v
     }
@@ -188,15 +205,35 @@ impl CellEstimator {
     /// one before.
     pub fn absorb_current_offset(&mut self, deviations: f64, remains: f64) {
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
+        self.absorb(CURRENT_OFFSET, deviations, remains);
+    }
+
+    /// Corrects the slowest branch's resistance by the voltages since the last correction.
+    pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
+        if let Some(correction) = self.memory.slow_branch.correct(config.sensor.slow_branch) {
+            self.absorb(SLOW_BRANCH, correction.deviations, correction.remains);
+            self.absorb(SLOW_BRANCH, 0.0, correction.widened);
+        }
+    }
+
+    /// Resistance of the slowest branch relative to the model's with the cell's resistance ratio.
+    pub fn slow_ratio(&self, config: &EstimatorConfig) -> ScalarGaussian {
+        let slow_branch = &self.memory.slow_branch;
+        ScalarGaussian::from_std(slow_branch.ratio, slow_branch.std(config.sensor.slow_branch))
+    }
+
+    /// Corrects the state by `deviations` of a constant error, whose remaining deviation becomes `remains` times the one
+    /// before.
+    fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
-            let column = x.by_constant.column(CURRENT_OFFSET).into_owned();
+            let column = x.by_constant.column(constant_error).into_owned();
             x.mean += column * deviations;
             if remains <= 1.0 {
-                x.by_constant.set_column(CURRENT_OFFSET, &(column * remains));
+                x.by_constant.set_column(constant_error, &(column * remains));
             } else {
-                // A part of the larger offset is new and has not moved any state.
-                x.by_constant.set_column(CURRENT_OFFSET, &(column / remains));
+                // A part of the larger error is new and has not moved any state.
+                x.by_constant.set_column(constant_error, &(column / remains));
                 x.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
             }
         });

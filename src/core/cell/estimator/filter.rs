@@ -175,7 +175,7 @@ fn propagate<const N: usize>(
     Ok(())
 }
 
-/// Updates with a voltage reading; also returns the effect of the current's offset on the innovation, V per standard
+/// Updates with a voltage reading; also returns the effects of the constant errors on the innovation, V per standard
 /// deviation.
 #[inline]
 pub(super) fn update<const N: usize>(
@@ -183,13 +183,13 @@ pub(super) fn update<const N: usize>(
     model: &CellModel,
     config: &EstimatorConfig,
     reading: &VoltageReading,
-) -> Result<(Update, f64), FilterError> {
+) -> Result<(Update, SVector<f64, CONSTANT_ERRORS>), FilterError> {
     let h = |x: &SVector<f64, N>| {
-        let branches_v: f64 = (BRANCHES..N).fold(0.0, |sum, i| sum + x[i]);
+        let branches_v = reading.branches_v(x);
         let state = (x[0], libm::exp(x[LOG_RESISTANCE]), reading.curve.mean);
         circuit::aged_terminal_v(model, state, &reading.temperature, branches_v, reading.current_a)
     };
     let noise = reading.noise(x, model, config);
     let update = x.update(&spread::<N>(config), reading.voltage_v, h, &noise)?;
-    Ok((update, noise.by_constant[CURRENT_OFFSET]))
+    Ok((update, noise.by_constant))
 }

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::slow_branch::SlowBranch;
 use super::state_vector::{KNOWN_VARIANCE, square};
 use super::step::CellStep;
 use crate::cell::{CapacityState, CellModel, EstimatorConfig};
@@ -55,6 +56,8 @@ pub(super) struct Memory {
     /// What these voltages say: sum of d x innovation / R.
     #[serde(default)]
     pub(super) offset_score: f64,
+    #[serde(default)]
+    pub(super) slow_branch: SlowBranch,
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
     #[serde(default, rename = "away_std")]
     pub(super) downtime_std: f64,
@@ -85,6 +88,7 @@ impl Memory {
             rest_s: 0.0,
             offset_information: 0.0,
             offset_score: 0.0,
+            slow_branch: SlowBranch::default(),
             downtime_std: 0.0,
             is_unseen: false,
             rejected: 0,
@@ -205,6 +209,7 @@ impl Memory {
         let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a, self.offset_score];
         InvalidState::unless_numbers("a cell's last temperature or current, or its offset", signed)?;
         InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;
+        self.slow_branch.check()?;
         let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
         InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }

@@ -12,7 +12,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::state_vector::{
-    BRANCH_RESISTANCE, BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
+    BRANCHES, CAPACITY, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE, SLOW_BRANCH,
     VOLTAGE_OFFSET, square,
 };
 use crate::cell::aged_ocv::MIXES;
@@ -50,9 +50,18 @@ pub(super) struct VoltageReading {
     /// Capacity of the open-circuit curve, Ah: that by the last half-cycle. A voltage says nothing about the capacity through
     /// the shape of the curve: the model's errors would be mistaken for lost capacity.
     pub(super) curve: ScalarGaussian,
+    /// Resistance of the slowest branch beside the others, relative to the model.
+    pub(super) slow_ratio: f64,
+    /// Its standard deviation.
+    pub(super) slow_std: f64,
 }
 
 impl VoltageReading {
+    /// Voltage over the branches of a state, V.
+    pub(super) fn branches_v<const N: usize>(&self, x: &SVector<f64, N>) -> f64 {
+        (BRANCHES..N - 1).fold(self.slow_ratio * x[N - 1], |sum, i| sum + x[i])
+    }
+
     /// Measurement noise of this reading for a cell at state `x`.
     pub(super) fn noise<const N: usize>(
         &self,
@@ -64,7 +73,7 @@ impl VoltageReading {
         let slope_v = model.ocv_slope_v(&position, self.curve.mean);
         let ratio = libm::exp(x.mean[LOG_RESISTANCE]);
         let r0_ohm = model.r0_ohm(&position) * ratio;
-        let drop_v = (BRANCHES..N).fold(r0_ohm * self.current_a, |sum, i| sum + x.mean[i]);
+        let drop_v = r0_ohm * self.current_a + self.branches_v(&x.mean);
         let load_v = model.settled_ohm(&position) * ratio * self.load_a;
         let base_v_sqrt_s = model
             .voltage_error_v(&position)
@@ -92,19 +101,19 @@ impl VoltageReading {
         slope_v: f64,
         r0_ohm: f64,
     ) -> SVector<f64, CONSTANT_ERRORS> {
-        let SensorErrors { voltage_offset_v, current_offset_a, current_gain, branch_resistance } = config.sensor;
-        let branches_v = (BRANCHES..N).fold(0.0, |sum, i| sum + x.mean[i]);
+        let SensorErrors { voltage_offset_v, current_offset_a, current_gain, .. } = config.sensor;
         let offset_a = if self.current_a == 0.0 { 0.0 } else { current_offset_a };
         let mut direct_v = SVector::<f64, CONSTANT_ERRORS>::zeros();
         direct_v[VOLTAGE_OFFSET] = voltage_offset_v;
         direct_v[CURRENT_OFFSET] = r0_ohm * offset_a;
         direct_v[CURRENT_GAIN] = r0_ohm * current_gain * self.current_a;
-        direct_v[BRANCH_RESISTANCE] = -branch_resistance * branches_v;
+        direct_v[SLOW_BRANCH] = -self.slow_std * x.mean[N - 1];
         let (per_ah_v, mixes_v) = model.aged_ocv_changes_v(position, self.curve.mean);
         direct_v[CURVE_CAPACITY] = -per_ah_v * self.curve.std();
         direct_v.fixed_rows_mut::<MIXES>(CURVE_MIXES).copy_from_slice(&mixes_v);
         let mut slopes = SVector::<f64, N>::repeat(-1.0);
         (slopes[0], slopes[LOG_RESISTANCE], slopes[CAPACITY]) = (slope_v, -r0_ohm * self.current_a, 0.0);
+        slopes[N - 1] = -self.slow_ratio;
         direct_v + x.by_constant.tr_mul(&slopes)
     }
 }

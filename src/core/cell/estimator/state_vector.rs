@@ -2,6 +2,8 @@
 //!
 //! In and out: means and variances in the units of the states. Inputs are not checked.
 
+use crate::filter::ScalarGaussian;
+
 /// Variance of a known value: small against any noise, large against rounding.
 pub(super) const KNOWN_VARIANCE: f64 = 1e-12;
 
@@ -26,14 +28,20 @@ pub(super) fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
 }
 
+/// A state of charge that a cell can have: what lies beyond empty or full is an error of the model.
+#[inline]
+pub(super) fn within_bounds(soc: ScalarGaussian) -> ScalarGaussian {
+    ScalarGaussian { mean: soc.mean.clamp(0.0, 1.0), ..soc }
+}
+
 /// Index of the voltage sensor's offset among the constant errors: measured less true.
 pub(super) const VOLTAGE_OFFSET: usize = 0;
 /// Index of the current sensor's offset: measured less true.
 pub(super) const CURRENT_OFFSET: usize = 1;
 /// Index of the current sensor's gain error: measured over true, less 1.
 pub(super) const CURRENT_GAIN: usize = 2;
-/// Index of the error of the branches' resistances against the series resistance: relative.
-pub(super) const BRANCH_RESISTANCE: usize = 3;
+/// Index of the error of the slowest branch's ratio ([`super::slow_branch`]): true less estimated.
+pub(super) const SLOW_BRANCH: usize = 3;
 /// Index of the error of the open-circuit curve's capacity: that of the curve less the true one.
 pub(super) const CURVE_CAPACITY: usize = 4;
 /// Index of the first mix of losses that may be other than assumed.

@@ -53,15 +53,15 @@ pub(crate) fn config() -> EstimatorConfig {
 }
 
 /// The simulated cell: true capacity, and resistance relative to the model.
-struct Truth {
-    soc: f64,
+pub(crate) struct Truth {
+    pub(crate) soc: f64,
     branch_v: f64,
-    capacity_ah: f64,
+    pub(crate) capacity_ah: f64,
     ratio: f64,
 }
 
 impl Truth {
-    fn step(&mut self, model: &CellModel, current_a: f64, dt_s: f64) -> CellStep {
+    pub(crate) fn step(&mut self, model: &CellModel, current_a: f64, dt_s: f64) -> CellStep {
         let position = model.grid_position(self.soc, 25.0);
         let branch = BranchAt::new(model, 0, &position, self.ratio);
         self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, dt_s);
@@ -96,7 +96,7 @@ fn cycle(estimator: &mut CellEstimator, config: &EstimatorConfig, truth: &mut Tr
     }
 }
 
-fn truth() -> Truth {
+pub(crate) fn truth() -> Truth {
     Truth { soc: 0.9, branch_v: 0.0, capacity_ah: 1.7, ratio: 1.3 }
 }
 
@@ -180,6 +180,36 @@ fn an_unmeasured_load_widens_the_deviation() {
     assert_eq!(result.update, None);
     // 1 A for half an hour out of 1.7 Ah is 0.29 of SOC.
     assert!(soc(&estimator).std() > before.std() + 0.1, "{:?}", soc(&estimator));
+}
+
+#[test]
+fn a_load_found_after_a_gap_began_in_it_or_now() {
+    let (model, config) = (small_model(), config());
+    let branch_after = |current_a: f64, unmeasured_s: f64| {
+        let mut estimator = CellEstimator::new(&config);
+        let mut truth = truth();
+        estimator.step(&model, &config, &truth.step(&model, 0.0, 600.0));
+        let filter = |estimator: &CellEstimator| {
+            let filter = estimator.filter.as_ref().expect("started");
+            each!(filter, x => (x.mean[BRANCHES], x.covariance[(BRANCHES, BRANCHES)]))
+        };
+        let before = filter(&estimator);
+        let step = CellStep { measured_s: 0.0, charge_as: 0.0, unmeasured_s, ..truth.step(&model, current_a, 1e-6) };
+        // A voltage that says nothing leaves what was predicted.
+        let mut deaf = config.clone();
+        deaf.voltage.noise_v = 1e3;
+        estimator.step(&model, &deaf, &step);
+        (before, filter(&estimator))
+    };
+    let settled_v = BranchAt::new(&model, 0, &model.grid_position(0.9, 25.0), 1.0).r_ohm;
+    let ((_, _), (mean, variance)) = branch_after(1.0, 1e6);
+    // Long ago or now, both as likely: half the settled voltage, and as much deviation.
+    assert!((mean / settled_v - 0.5).abs() < 0.02, "{mean} {settled_v}");
+    assert!((variance.sqrt() / settled_v - 0.5).abs() < 0.1, "{variance} {settled_v}");
+    let ((before, _), (mean, _)) = branch_after(1.0, 1e-3);
+    assert!((mean - before).abs() < 1e-4, "too short a gap for a load to show: {mean} {before}");
+    let (_, (mean, _)) = branch_after(0.0, 1e6);
+    assert!(mean.abs() < 1e-6, "{mean}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use nalgebra::{SMatrix, SVector};
 use super::input::{BlockInput, CellSlot, WIDTH};
 use super::kernel::{
     self, CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS,
-    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, at,
+    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION, SLOW_RATIO, SLOW_SCORE, SLOW_STD, at,
 };
 use super::tables::{LineCache, Tables};
 use crate::cell::estimator::filter::Filter;
@@ -171,9 +171,17 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (make(Gaussian { mean, covariance, by_constant }), state.memory.map(|number| number.0[0]))
     }
 
-    /// Puts a filter into a lane; returns true, the cell's new `has_filter`.
-    pub(super) fn set(&mut self, block: usize, lane: usize, filter: &Gaussian<N>, memory: &Memory) -> bool {
-        self.clear(block, lane, memory);
+    /// Puts a filter into a lane, with the standard deviation of the slowest branch's ratio; returns true, the cell's new
+    /// `has_filter`.
+    pub(super) fn set(
+        &mut self,
+        block: usize,
+        lane: usize,
+        filter: &Gaussian<N>,
+        memory: &Memory,
+        slow_std: f64,
+    ) -> bool {
+        self.clear(block, lane, memory, slow_std);
         let state = &mut self.blocks[block];
         for i in 0..N {
             state.mean[i].0[lane] = filter.mean[i];
@@ -188,7 +196,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     }
 
     /// Puts the memory of a cell without a filter into its lane; returns false, the cell's new `has_filter`.
-    pub(super) fn clear(&mut self, block: usize, lane: usize, memory: &Memory) -> bool {
+    pub(super) fn clear(&mut self, block: usize, lane: usize, memory: &Memory, slow_std: f64) -> bool {
         let hot = &mut self.blocks[block].memory;
         hot[LOAD_A].0[lane] = memory.load_a;
         hot[MEAN_NIS].0[lane] = memory.mean_nis;
@@ -196,6 +204,9 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         hot[REST_S].0[lane] = memory.rest_s;
         hot[OFFSET_INFORMATION].0[lane] = memory.offset_information;
         hot[OFFSET_SCORE].0[lane] = memory.offset_score;
+        (hot[SLOW_RATIO].0[lane], hot[SLOW_STD].0[lane]) = (memory.slow_branch.ratio, slow_std);
+        hot[SLOW_INFORMATION].0[lane] = memory.slow_branch.information;
+        hot[SLOW_SCORE].0[lane] = memory.slow_branch.score;
         (hot[CURVE_AH].0[lane], hot[CURVE_STD_AH].0[lane]) = (memory.curve().mean, memory.curve().std());
         false
     }

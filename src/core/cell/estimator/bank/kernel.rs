@@ -24,7 +24,8 @@ mod update;
 use predict::predict;
 pub(super) use types::{
     CURVE_AH, CURVE_STD_AH, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY,
-    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, StepInput, StepOutcome, at,
+    OFFSET_INFORMATION, OFFSET_SCORE, REST_S, SLOW_INFORMATION, SLOW_RATIO, SLOW_SCORE, SLOW_STD, StepInput,
+    StepOutcome, at,
 };
 use update::update;
 
@@ -59,7 +60,9 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     for i in 0..T {
         sum = sum + x.covariance[i];
     }
-    sum = sum + x.memory[OFFSET_INFORMATION] + x.memory[OFFSET_SCORE];
+    for i in [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE] {
+        sum = sum + x.memory[i];
+    }
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
     (x, outcome)

@@ -10,7 +10,7 @@ use crate::cell::{AgedOcv, SensorErrors, Table};
 /// Settings with every constant error.
 fn config() -> EstimatorConfig {
     let sensor =
-        SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, branch_resistance: 0.1 };
+        SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, slow_branch: 0.1 };
     EstimatorConfig { sensor, ..without_errors() }
 }
 

@@ -34,6 +34,8 @@ fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
             temperature: model.temperature_position(0.0),
             information_s,
             curve: ScalarGaussian::from_std(2.0, 0.1),
+            slow_ratio: 1.0,
+            slow_std: 0.0,
         }
         .noise(&x, model, &config)
     };

@@ -18,12 +18,12 @@ pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N:
     pub(in crate::cell::estimator::bank) covariance: [Lanes<L>; T],
     /// Errors of the means by one standard deviation of each constant error.
     pub(in crate::cell::estimator::bank) by_constant: [[Lanes<L>; N]; CONSTANT_ERRORS],
-    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`CURVE_STD_AH`].
+    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`SLOW_STD`].
     pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
 }
 
 /// Number of memory values that steps change or read.
-pub(in crate::cell::estimator::bank) const MEMORY: usize = 8;
+pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
 /// |current| low-passed, A.
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
@@ -40,6 +40,15 @@ pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
 pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
 /// Its standard deviation, Ah. No step changes it.
 pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
+
+/// Information about the ratio of the slowest branch.
+pub(in crate::cell::estimator::bank) const SLOW_INFORMATION: usize = 8;
+/// What it says.
+pub(in crate::cell::estimator::bank) const SLOW_SCORE: usize = 9;
+/// Ratio of the slowest branch's resistance to the model's, beside the others. No step changes it.
+pub(in crate::cell::estimator::bank) const SLOW_RATIO: usize = 10;
+/// Its standard deviation. No step changes it.
+pub(in crate::cell::estimator::bank) const SLOW_STD: usize = 11;
 
 /// Index of the covariance of `i` and `j` <= `i`.
 pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {

@@ -5,13 +5,13 @@
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
-    CURVE_STD_AH, FilterState, KernelConstants, LOAD_A, OFFSET_INFORMATION, OFFSET_SCORE, StepInput, StepOutcome, at,
+    CURVE_STD_AH, FilterState, KernelConstants, LOAD_A, OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_RATIO,
+    SLOW_SCORE, SLOW_STD, StepInput, StepOutcome, at,
 };
 use crate::cell::aged_ocv::MIXES;
 use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
 use crate::cell::estimator::state_vector::{
-    BRANCH_RESISTANCE, BRANCHES, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE,
-    VOLTAGE_OFFSET,
+    BRANCHES, CURRENT_GAIN, CURRENT_OFFSET, CURVE_CAPACITY, CURVE_MIXES, LOG_RESISTANCE, SLOW_BRANCH, VOLTAGE_OFFSET,
 };
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
@@ -60,9 +60,9 @@ impl<const L: usize> PredictedVoltage<L> {
         let mut branches = [Lanes::splat(0.0); COLUMNS];
         for i in BRANCHES..N {
             settled_ohm = settled_ohm + table_points[0].one(branch(i - BRANCHES));
-            branches_v = branches_v + x.mean[i];
+            branches_v = branches_v + weighed(x, i, x.mean[i]);
             for k in 0..COLUMNS {
-                branches[k] = branches[k] + l[k][i];
+                branches[k] = branches[k] + weighed(x, i, l[k][i]);
             }
         }
         let drop_v = r0_ohm * ratio * input.current_a;
@@ -85,6 +85,16 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
+/// A part of branch `i`'s voltage as it counts in the cell's: that of the slowest with its ratio.
+#[inline(always)]
+fn weighed<const L: usize, const N: usize, const T: usize>(
+    x: &FilterState<L, N, T>,
+    i: usize,
+    part_v: Lanes<L>,
+) -> Lanes<L> {
+    if i == N - 1 { part_v * x.memory[SLOW_RATIO] } else { part_v }
+}
+
 /// Effect of one standard deviation of each constant error on the voltage less its prediction, V.
 #[inline(always)]
 fn by_constant<const L: usize, const N: usize, const T: usize>(
@@ -99,14 +109,14 @@ fn by_constant<const L: usize, const N: usize, const T: usize>(
     effect_v[VOLTAGE_OFFSET] = Lanes::splat(c.sensor.voltage_offset_v);
     effect_v[CURRENT_OFFSET] = (predicted.r0_ohm * c.sensor.current_offset_a).or_else(is_live, Lanes::splat(0.0));
     effect_v[CURRENT_GAIN] = drop_v * c.sensor.current_gain;
-    effect_v[BRANCH_RESISTANCE] = (drop_v - predicted.lost_v) * c.sensor.branch_resistance;
+    effect_v[SLOW_BRANCH] = -(x.mean[N - 1] * x.memory[SLOW_STD]);
     effect_v[CURVE_CAPACITY] = -(predicted.changes_v[0] * x.memory[CURVE_STD_AH]);
     effect_v[CURVE_MIXES..].copy_from_slice(&predicted.changes_v[1..]);
     for k in 0..CONSTANT_ERRORS {
         let column = &x.by_constant[k];
         effect_v[k] = effect_v[k] + predicted.slope_v * column[0] - drop_v * column[LOG_RESISTANCE];
         for i in BRANCHES..N {
-            effect_v[k] = effect_v[k] - column[i];
+            effect_v[k] = effect_v[k] - weighed(x, i, column[i]);
         }
     }
     effect_v
@@ -138,14 +148,14 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
         }
     }
     for i in BRANCHES..N {
-        let mut others = rest[i][i];
+        let mut others = weighed(x, i, rest[i][i]);
         for j in BRANCHES..N {
             if j != i {
-                others = others + rest[i.max(j)][i.min(j)];
+                others = others + weighed(x, j, rest[i.max(j)][i.min(j)]);
             }
         }
         cross[i] = cross[i] - others;
-        variance = variance + others;
+        variance = variance + weighed(x, i, others);
     }
 
     // Measurement noise: see `noise::VoltageReading`.
@@ -163,10 +173,14 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
     let total = own_variance + constant_variance;
     let gate = variance + constant_variance + (predicted.slope_v.square() * c.reading.gate_soc + c.reading.gate);
     let test_ratio = innovation_v.square() / gate;
-    let offset_v = by_constant[CURRENT_OFFSET];
-    let per_variance = offset_v / (total - offset_v.square());
-    x.memory[OFFSET_INFORMATION] = x.memory[OFFSET_INFORMATION] + per_variance * offset_v;
-    x.memory[OFFSET_SCORE] = x.memory[OFFSET_SCORE] + per_variance * innovation_v;
+    for (k, information, score) in
+        [(CURRENT_OFFSET, OFFSET_INFORMATION, OFFSET_SCORE), (SLOW_BRANCH, SLOW_INFORMATION, SLOW_SCORE)]
+    {
+        let effect_v = by_constant[k];
+        let per_variance = effect_v / (total - effect_v.square());
+        x.memory[information] = x.memory[information] + per_variance * effect_v;
+        x.memory[score] = x.memory[score] + per_variance * innovation_v;
+    }
 
     let inverse = total.reciprocal();
     let mut gain = cross;
