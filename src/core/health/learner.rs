@@ -437,6 +437,31 @@ mod tests {
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
     }
 
+    #[test]
+    fn after_a_restart_of_its_filter_a_capacity_is_in_doubt_and_the_half_cycle_teaches_nothing() {
+        let config = config();
+        let mut estimator = CellEstimator::new(&estimator_config());
+        let mut learner = Learner::new(&config, 1, estimator.capacity());
+        let at = |soc| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), ..CellMark::default() };
+        let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
+        let learn = |learner: &mut Learner, estimator: &mut CellEstimator| {
+            discharge(estimator);
+            learner.learn(&small_model(), &config, 0, estimator, &moved)
+        };
+        let sure = learn(&mut learner, &mut estimator).capacity;
+        let new_variance = 0.2 * 0.2;
+        assert!(sure.variance < 0.5 * new_variance, "{sure:?}");
+        learner.doubt(&config, 0, new_variance, &mut estimator);
+        assert_eq!(learner.capacity(0).mean, sure.mean);
+        assert!((learner.capacity(0).variance / new_variance - 1.0).abs() < 1e-9, "{:?}", learner.capacity(0));
+        assert!(estimator.capacity().variance >= new_variance * (1.0 - 1e-9), "{:?}", estimator.capacity());
+        // As stored and restored between the restart and the half-cycle's end.
+        let text = serde_json::to_string(&learner).expect("writes");
+        let mut learner: Learner = serde_json::from_str(&text).expect("reads");
+        assert_eq!(learn(&mut learner, &mut estimator).measurement, None);
+        assert!(learn(&mut learner, &mut estimator).measurement.is_some());
+    }
+
     /// The capacity after 1,000 half-cycles between 0.8 and 0.3 at 1 A, with 5 mV too much at the upper end of the curve and too
     /// little at the lower one, less the true one, in standard deviations.
     fn after_a_thousand(config: &CapacityConfig, sensor: SensorErrors) -> f64 {

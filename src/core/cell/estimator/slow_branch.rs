@@ -17,8 +17,12 @@ use crate::quantity::InvalidState;
 /// Least standard deviation, part of the first one: the ratio changes with temperature and SOC, and no evidence is for good.
 const LEAST_PART: f64 = 1.0 / 3.0;
 
-/// Largest correction at a time, standard deviations.
-const MAX_DEVIATIONS: f64 = 3.0;
+/// Most information of the voltages between two corrections, in that of the ratio's own standard deviation: the model's errors in
+/// them are the same from voltage to voltage, so that many voltages are hardly more than one.
+const MAX_INFORMATION: f64 = 0.3;
+
+/// Largest disagreement that counts, in standard deviations of what is to be expected: beyond it something else is wrong.
+const MAX_DISAGREEMENT: f64 = 2.0;
 
 /// Least and largest ratio.
 const RANGE: (f64, f64) = (0.05, 3.0);
@@ -73,10 +77,13 @@ impl SlowBranch {
         let (information, score) = (self.information, self.score);
         (self.information, self.score) = (0.0, 0.0);
         let std = self.std(configured);
-        if !(information > 0.0 && score.is_finite() && std > 0.0) {
+        if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        let deviations = (score / (1.0 + information)).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS);
+        let most = MAX_DISAGREEMENT * (information * (1.0 + information)).sqrt();
+        let counted = information.min(MAX_INFORMATION) / information;
+        let (information, score) = (counted * information, counted * score.clamp(-most, most));
+        let deviations = score / (1.0 + information);
         let ratio = (self.ratio + deviations * std).clamp(RANGE.0, RANGE.1);
         let remains = 1.0 / (1.0 + information).sqrt();
         let part = (self.part * remains).max(LEAST_PART);
@@ -112,25 +119,39 @@ mod tests {
 
     #[test]
     fn evidence_corrects_the_ratio_once_and_leaves_a_least_deviation() {
-        let mut slow = SlowBranch { information: 3.0, score: -3.0, ..SlowBranch::default() };
+        let mut slow = SlowBranch { information: 0.25, score: -0.25, ..SlowBranch::default() };
         let correction = slow.correct(0.4).expect("evidence");
-        // Three times the prior's information say one deviation: three quarters of it, and half the deviation.
-        assert_eq!(correction, Correction { deviations: -0.75, remains: 0.5, widened: 1.0 });
-        assert!((slow.ratio - 0.7).abs() < 1e-12 && (slow.std(0.4) - 0.2).abs() < 1e-12, "{slow:?}");
+        // A quarter of the prior's information says one deviation: a fifth of it.
+        assert!((correction.deviations + 0.2).abs() < 1e-12, "{correction:?}");
+        assert!((correction.remains - 0.8_f64.sqrt()).abs() < 1e-12 && correction.widened == 1.0, "{correction:?}");
+        assert!((slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");
         assert_eq!(slow.correct(0.4), None);
-        slow = SlowBranch { information: 99.0, score: 0.0, ..slow };
-        let correction = slow.correct(0.4).expect("evidence");
-        assert!((slow.std(0.4) - 0.4 / 3.0).abs() < 1e-12, "{slow:?}");
-        assert!((correction.remains * correction.widened - 2.0 / 3.0).abs() < 1e-12, "{correction:?}");
+        for _ in 0..100 {
+            slow = SlowBranch { information: 0.25, score: 0.0, ..slow };
+            slow.correct(0.4).expect("evidence");
+        }
+        assert!((slow.std(0.4) - 0.4 / 3.0).abs() < 1e-12 && (slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");
         assert_eq!(slow.check(), Ok(()));
+    }
+
+    #[test]
+    fn one_half_cycle_is_one_witness_however_many_voltages_it_has_and_a_contradiction_counts_in_part() {
+        let ratio = |information: f64, score: f64| {
+            let mut slow = SlowBranch { information, score, ..SlowBranch::default() };
+            slow.correct(0.4).expect("evidence");
+            slow.ratio
+        };
+        assert!((ratio(30.0, -30.0) - ratio(MAX_INFORMATION, -MAX_INFORMATION)).abs() < 1e-12);
+        assert_eq!(ratio(0.25, 50.0), ratio(0.25, 2.0 * (0.25_f64 * 1.25).sqrt()));
     }
 
     #[test]
     fn the_ratio_stays_within_its_range_whatever_the_evidence() {
         let mut slow = SlowBranch::default();
-        for score in [f64::NAN, f64::INFINITY] {
-            slow.score = score;
-            slow.information = 1.0;
+        for (information, score) in
+            [(1.0, f64::NAN), (1.0, f64::INFINITY), (f64::INFINITY, 1.0), (0.0, 1.0), (f64::NAN, 1.0)]
+        {
+            (slow.information, slow.score) = (information, score);
             assert_eq!((slow.correct(0.3), slow), (None, SlowBranch::default()));
         }
         for score in [-1e3, 1e6] {
@@ -140,7 +161,7 @@ mod tests {
                 assert_eq!(slow.check(), Ok(()), "{score}");
             }
         }
-        assert_eq!(slow.ratio, 3.0);
+        assert_eq!(slow.ratio, RANGE.1);
         assert!(SlowBranch { ratio: 0.0, ..slow }.check().is_err());
         assert!(SlowBranch { part: f64::NAN, ..slow }.check().is_err());
     }

@@ -2,7 +2,8 @@
 
 mod robust;
 
-use super::state_vector::UNKNOWN_SOC_VARIANCE;
+use super::filter::{Filter, each};
+use super::state_vector::{BRANCHES, UNKNOWN_SOC_VARIANCE};
 use super::{CellEstimator, CellStep};
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
@@ -180,6 +181,42 @@ fn an_unmeasured_load_widens_the_deviation() {
     assert_eq!(result.update, None);
     // 1 A for half an hour out of 1.7 Ah is 0.29 of SOC.
     assert!(soc(&estimator).std() > before.std() + 0.1, "{:?}", soc(&estimator));
+}
+
+#[test]
+fn the_slowest_branch_is_learned_and_no_longer_mistaken_for_charge() {
+    let mut model = small_model();
+    let mut slow = model.branches[0].clone();
+    slow.c_farad.values.iter_mut().flatten().for_each(|c_farad| *c_farad *= 10.0);
+    model.branches.push(slow);
+    let soc_error_points = |config: &EstimatorConfig| {
+        let mut estimator = CellEstimator::new(config);
+        let (mut truth, mut slow_v, mut worst) = (truth(), 0.0, 0.0_f64);
+        for half_cycle in 0..20 {
+            let current_a = if half_cycle % 2 == 0 { 1.0 } else { -1.0 };
+            for k in 0..240 {
+                let current_a = if k < 80 { 0.0 } else { current_a };
+                let mut step = truth.step(&model, current_a, 15.0);
+                // The cell has half of the model's slow branch.
+                let position = model.grid_position(truth.soc, 25.0);
+                let branch = BranchAt::new(&model, 1, &position, 0.5 * truth.ratio);
+                slow_v = branch.voltage_after(Discretisation::Exact, slow_v, current_a, 15.0);
+                step.voltage_v -= slow_v;
+                estimator.step(&model, config, &step);
+            }
+            estimator.learn_slow_branch(config);
+            if half_cycle >= 16 {
+                worst = worst.max(100.0 * (soc(&estimator).mean - truth.soc).abs());
+            }
+        }
+        (estimator.slow_ratio(config), worst)
+    };
+    let mut config = config();
+    let (_, unlearned) = soc_error_points(&config);
+    config.sensor.slow_branch = 0.3;
+    let (ratio, learned) = soc_error_points(&config);
+    assert!((ratio.mean - 0.5).abs() < 1.96 * ratio.std(), "{ratio:?}");
+    assert!(learned < 0.5 * unlearned, "{learned} {unlearned} points");
 }
 
 #[test]

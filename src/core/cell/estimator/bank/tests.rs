@@ -10,7 +10,7 @@ use crate::cell::{AgedOcv, SensorErrors, Table};
 /// Settings with every constant error.
 fn config() -> EstimatorConfig {
     let sensor =
-        SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, slow_branch: 0.1 };
+        SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, slow_branch: 0.3 };
     EstimatorConfig { sensor, ..without_errors() }
 }
 
@@ -161,6 +161,14 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
                     .max((ours.innovation - theirs.innovation).abs())
                     .max((ours.innovation_variance - theirs.innovation_variance).abs())
                     .max((ours.test_ratio - theirs.test_ratio).abs());
+            }
+        }
+        if time % 2500 == 2499 {
+            bank.learn_slow_branches();
+            readable.iter_mut().for_each(|estimator| estimator.learn_slow_branch(config));
+            for (cell, estimator) in readable.iter().enumerate() {
+                let ratio = |estimator: &CellEstimator| estimator.slow_ratio(config);
+                learned = learned.max((ratio(&bank.cell(cell)).mean - ratio(estimator).mean).abs());
             }
         }
         let worst_nis = (0..CELLS).map(|cell| bank.mean_nis(cell)).fold(0.0, f64::max);
