@@ -187,7 +187,8 @@ fn an_unmeasured_load_widens_the_deviation() {
 fn the_slowest_branch_is_learned_and_no_longer_mistaken_for_charge() {
     let mut model = small_model();
     let mut slow = model.branches[0].clone();
-    slow.c_farad.values.iter_mut().flatten().for_each(|c_farad| *c_farad *= 10.0);
+    slow.r_ohm.values.iter_mut().flatten().for_each(|r_ohm| *r_ohm *= 5.0);
+    slow.c_farad.values.iter_mut().flatten().for_each(|c_farad| *c_farad *= 2.0);
     model.branches.push(slow);
     let soc_error_points = |config: &EstimatorConfig| {
         let mut estimator = CellEstimator::new(config);
