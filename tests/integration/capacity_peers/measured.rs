@@ -170,7 +170,7 @@ impl Life {
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
-            let usable = usable_ah(&self.config.model, self.usable(), middle, capacity_ah, ratio);
+            let usable = usable_ah(&self.config.model, self.usable(), middle, capacity_ah, (ratio, 1.0));
             if usable < ours.mean { low = middle } else { high = middle }
         }
         let (ratio_std, full_soc) = (number("resistance_ratio_std"), 0.5 * (low + high));
@@ -184,7 +184,7 @@ impl Life {
     /// What a capacity makes usable, the resistance's doubt included (its correlation with a peer's capacity is not known).
     fn made_usable(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
-            usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, ratio)
+            usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
         };
         let mean = at(capacity.mean, reported.ratio);
         let by_capacity = (at(1.01 * capacity.mean, reported.ratio) - mean) / (0.01 * capacity.mean);

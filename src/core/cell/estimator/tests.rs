@@ -234,7 +234,7 @@ fn a_load_found_after_a_gap_began_in_it_or_now() {
         let before = filter(&estimator);
         let step = CellStep { measured_s: 0.0, charge_as: 0.0, unmeasured_s, ..truth.step(&model, current_a, 1e-6) };
         // A voltage that says nothing leaves what was predicted.
-        let mut deaf = config.clone();
+        let mut deaf = config;
         deaf.voltage.noise_v = 1e3;
         estimator.step(&model, &deaf, &step);
         (before, filter(&estimator))
