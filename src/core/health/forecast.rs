@@ -171,7 +171,9 @@ pub enum InsufficientData {
         std: f64,
     },
     /// The interval is too wide.
-    #[error("the median would be {median:.1}, the interval's upper end {high:.1}, may not be more than {MAX_SPREAD} times that")]
+    #[error(
+        "the median would be {median:.1}, the interval's upper end {high:.1}, may not be more than {MAX_SPREAD} times that"
+    )]
     Spread {
         /// 50 % quantile, units of use.
         median: f64,

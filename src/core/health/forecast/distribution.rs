@@ -169,7 +169,8 @@ mod tests {
                 let before = walk;
                 walk += walk_variance(from, to).sqrt() * normal;
                 for (total, sign) in uses.iter_mut().zip([-1.0, 1.0]) {
-                    *total += loss / f64::from(steps) * 0.5 * ((sign * before - growth).exp() + (sign * walk - growth).exp());
+                    *total +=
+                        loss / f64::from(steps) * 0.5 * ((sign * before - growth).exp() + (sign * walk - growth).exp());
                 }
             }
             for total in uses {
@@ -186,7 +187,10 @@ mod tests {
     #[test]
     fn a_small_loss_takes_its_use_at_the_present_rate() {
         let (log_mean, log_variance) = use_of_loss(0.3, 1e-9);
-        assert!((log_mean - 1e-9_f64.ln()).abs() < 1e-6 && (0.0..1e-6).contains(&log_variance), "{log_mean} {log_variance}");
+        assert!(
+            (log_mean - 1e-9_f64.ln()).abs() < 1e-6 && (0.0..1e-6).contains(&log_variance),
+            "{log_mean} {log_variance}"
+        );
     }
 
     #[test]
