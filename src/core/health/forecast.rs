@@ -47,10 +47,10 @@ const RATE_WALK: f64 = 1.0;
 const RATE_WALK_USE: f64 = 0.3;
 /// The knee: losses between which fade is expected to accelerate, parts of the reference.
 const KNEE: (f64, f64) = (0.1, 0.2);
-/// Expected growth of the logarithm of the rate in the knee, per part of the reference lost: e^0.8 over the whole knee.
-const KNEE_DRIFT: f64 = 8.0;
-/// As `RATE_WALK`, in the knee: e^0.63 either way over the whole knee, so that no knee at all is likely too.
-const KNEE_WALK: f64 = 2.0;
+/// Expected growth of the logarithm of the rate in the knee, per part of the reference lost: e^0.9 over the whole knee.
+const KNEE_DRIFT: f64 = 9.0;
+/// As `RATE_WALK`, in the knee: e^0.47 either way over the whole knee, so that hardly any knee lies in the interval too.
+const KNEE_WALK: f64 = 1.5;
 /// Standard deviation of the recovery while the cell is used, part of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Use over which the recovery decays by an e-fold, equivalent full cycles.

@@ -35,7 +35,7 @@ fn a_straight_fade_is_continued_before_the_knee() {
 fn a_knee_is_expected_and_a_fade_without_one_stays_in_the_interval() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let cycles = forecast.remaining(1.6).expect("enough is known").cycles.expect("cycles are counted");
-    // 1.8 Ah left, 0.2 Ah to go: 100 cycles straight on, 45 at a rate that grows at once to e^0.8 times itself.
+    // 1.8 Ah left, 0.2 Ah to go: 100 cycles straight on, 41 at a rate that grows at once to e^0.9 times itself.
     assert!((45.0..90.0).contains(&cycles.median) && cycles.low < 45.0 && cycles.high > 100.0, "{cycles:?}");
 }
 
