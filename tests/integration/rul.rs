@@ -263,5 +263,5 @@ fn the_command_refuses_what_it_cannot_read_with_its_place() {
     std::fs::write(&few, "date,capacity_ah\n0,2\n5,1.9\n").unwrap();
     let text = command(&[few.to_str().unwrap(), "--end-of-life", "1.4"]).success();
     let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
-    assert!(text.contains("no forecast: 2 capacity readings, needs 6"), "{text}");
+    assert!(text.contains("no forecast: 2 capacity readings, needs 3"), "{text}");
 }

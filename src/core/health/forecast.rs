@@ -7,9 +7,10 @@
 //! history. State x = [level, rate, recovery, first], capacities in parts of a reference capacity:
 //! * level: the capacity that only falls; level -= rate dt, with t the use (equivalent full cycles; days where the
 //!   cycles are unknown);
-//! * rate: loss per unit of use. Its logarithm walks: by `RATE_WALK` per square root of capacity lost, and by
-//!   `RATE_WALK_USE` per e-fold of use. Both are relative, so one pair of numbers serves cells that live for 50 cycles
-//!   and for 5,000; in the linear filter they become Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
+//! * rate: loss per unit of use. Its logarithm walks: by `RATE_WALK` per square root of capacity lost (`KNEE_WALK` in the
+//!   knee, see [`knee`]), and by `RATE_WALK_USE` per e-fold of use. Both are relative, so one pair of numbers serves cells
+//!   that live for 50 cycles and for 5,000; in the linear filter they become
+//!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
 //! * recovery: capacity that returns in rest and is used up again (an Ornstein-Uhlenbeck process; measured cells show
 //!   1 to 5 % after days of rest). It correlates successive readings, so that ten readings in one cycle do not count as
 //!   ten;
@@ -17,11 +18,16 @@
 //!
 //! A reading is level + recovery + noise; an outlier counts less. The forecast uses the loss as the free variable, not
 //! the time: the use until the level has fallen by L is the integral of 1 / rate over the loss, a sum of lognormals,
-//! approximated by one lognormal of the same mean and variance (closed form, see [`distribution`]). The level only falls,
-//! so there is no first-passage problem, and no sampling.
+//! approximated by one lognormal of the same mean and variance (see [`distribution`]). The level only falls, so there is no
+//! first-passage problem, and no sampling.
 //!
-//! Assumed: fade has no preferred curvature (it may slow down as well as speed up), so the median is the present rate
-//! held; a knee that no reading has shown lies outside the interval. `tests/rul.md` lists the alternatives and figures.
+//! Assumed: outside the knee fade has no preferred curvature (it may slow down as well as speed up), so the median is the
+//! present rate held. In the knee, between 10 and 20 % of loss, many cells fade faster and faster: resistance and current
+//! per active area grow with the loss, and lithium plates. The forecast expects it before a reading shows it.
+//!
+//! Deviation: the filter's mean does not follow the expected acceleration, only its variance does. Reason: cells without a
+//! knee (NASA's) would have their rate overestimated after each recovery. Effect: the readings alone say when a knee has
+//! begun. `tests/rul.md` lists the alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -39,6 +45,12 @@ use crate::quantity::InvalidState;
 const RATE_WALK: f64 = 1.0;
 /// Standard deviation of the logarithm of the rate per square root of an e-fold of use since the first reading.
 const RATE_WALK_USE: f64 = 0.3;
+/// The knee: losses between which fade is expected to accelerate, parts of the reference.
+const KNEE: (f64, f64) = (0.1, 0.2);
+/// Expected growth of the logarithm of the rate in the knee, per part of the reference lost: e^0.9 over the whole knee.
+const KNEE_DRIFT: f64 = 9.0;
+/// As `RATE_WALK`, in the knee: e^0.47 either way over the whole knee, so that hardly any knee lies in the interval too.
+const KNEE_WALK: f64 = 1.5;
 /// Standard deviation of the recovery while the cell is used, part of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Use over which the recovery decays by an e-fold, equivalent full cycles.
@@ -57,12 +69,12 @@ const LEVEL_PRIOR: f64 = 1.0;
 /// Standard deviation of the rate before the first reading, part of the reference per unit of use: 2 % a cycle.
 const RATE_PRIOR: f64 = 0.02;
 
-/// Fewest readings of a forecast.
-pub const MIN_READINGS: u32 = 6;
+/// Fewest readings of a forecast: two make a rate, the third can contradict it.
+pub const MIN_READINGS: u32 = 3;
 /// Smallest capacity loss of a forecast, in its standard deviations.
-pub const MIN_FADE_DEVIATIONS: f64 = 1.5;
-/// Largest ratio of the interval's ends, where it reaches further ahead than the use so far.
-pub const MAX_SPREAD: f64 = 100.0;
+pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
+/// Largest ratio of the interval's upper end to the median, where it reaches further ahead than the use so far.
+pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
 
@@ -159,10 +171,12 @@ pub enum InsufficientData {
         std: f64,
     },
     /// The interval is too wide.
-    #[error("the interval would be from {low:.1} to {high:.1}, may not span more than a factor of {MAX_SPREAD}")]
+    #[error(
+        "the median would be {median:.1}, the interval's upper end {high:.1}, may not be more than {MAX_SPREAD} times that"
+    )]
     Spread {
-        /// 5 % quantile, units of use.
-        low: f64,
+        /// 50 % quantile, units of use.
+        median: f64,
         /// 95 % quantile, units of use.
         high: f64,
     },
@@ -213,7 +227,8 @@ impl Usage {
 }
 
 impl Forecast {
-    /// A filter for a cell of this capacity when new, Ah. The reference is only a scale: an approximate value is enough.
+    /// A filter for a cell of this capacity when new, Ah. An approximate value is enough: the knee is expected between 10
+    /// and 20 % below it.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         p[LEVEL][LEVEL] = LEVEL_PRIOR * LEVEL_PRIOR;
@@ -319,9 +334,9 @@ impl Forecast {
         self.check_fade()?;
         let crossing = self.crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // Near the threshold the lower end tends to 0 at any precision.
-        if high > MAX_SPREAD * low && high > self.used {
-            return Err(InsufficientData::Spread { low, high });
+        // The lower end says nothing about precision: near the threshold it tends to 0 at any.
+        if high > MAX_SPREAD * median && high > self.used {
+            return Err(InsufficientData::Spread { median, high });
         }
         Ok(Remaining { low, median, high })
     }
@@ -377,7 +392,8 @@ impl Forecast {
         let rate = self.x[RATE].max(0.0);
         // The first step counts as one e-fold.
         let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
-        let relative = RATE_WALK * RATE_WALK * rate * used + RATE_WALK_USE * RATE_WALK_USE * e_folds;
+        let lost = self.lost();
+        let relative = walk_variance(lost, lost + rate * used) + RATE_WALK_USE * RATE_WALK_USE * e_folds;
         relative * (rate * rate + self.p[RATE][RATE])
     }
 
@@ -417,8 +433,14 @@ impl Forecast {
         Crossing::new(
             [self.x[LEVEL] - threshold, self.x[RATE]],
             [self.level_variance(), self.p[LEVEL][RATE], self.p[RATE][RATE]],
+            self.lost(),
             self.used,
         )
+    }
+
+    /// Capacity lost since the cell was new, part of the reference; the filter's first reading may be an aged cell's.
+    fn lost(&self) -> f64 {
+        1.0 - self.x[LEVEL]
     }
 
     /// Quantile of the capacity after `ahead` units of use: the threshold passed by then with that probability.
@@ -427,6 +449,17 @@ impl Forecast {
         let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
         self.reference_ah * bisect((0.0, level + 5.0 * std), distribution::HALVINGS, is_below).1
     }
+}
+
+/// Part of the knee that lies below this loss, part of the reference.
+fn knee(lost: f64) -> f64 {
+    lost.clamp(KNEE.0, KNEE.1) - KNEE.0
+}
+
+/// Variance that the logarithm of the rate gains while the loss grows, parts of the reference.
+fn walk_variance(from: f64, to: f64) -> f64 {
+    let in_knee = knee(to) - knee(from);
+    RATE_WALK * RATE_WALK * (to - from - in_knee) + KNEE_WALK * KNEE_WALK * in_knee
 }
 
 impl Remaining {

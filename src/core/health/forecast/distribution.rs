@@ -3,16 +3,16 @@
 //! In: mean and covariance of loss and rate (parts of the reference, per unit of use). Out: probabilities and quantiles of
 //! the use. Extreme inputs saturate within [`LOG_RANGE`].
 //!
-//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-w W(l)) / r, W a Brownian motion
-//! (the rate's logarithm walks with the loss). With k = w^2:
-//! E T = (L / r) (e^a - 1) / a with a = k L / 2, and
-//! E T^2 = (4 / (k r^2)) (e^a (e^{3a} - 1) / (1.5 k) - (e^{4a} - 1) / (2 k)); a lognormal of that mean and variance.
+//! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-g(l) - W(l)) / r, with g the growth
+//! that the knee adds to the rate's logarithm and W its walk, a Brownian motion of variance v(l). With m = exp(v / 2 - g):
+//! E T = (1 / r) integral of m(l), and E T^2 = (2 / r^2) integral over l of m(l) (integral over s from 0 to l of
+//! m(s) e^v(s)), both by the midpoint rule; a lognormal of that mean and variance.
 //! The rate, positive, is a lognormal of its truncated normal's mean and variance; the walk with use adds its variance;
 //! the loss is normal. Its part at or below 0 counts as a crossing in the past: T = 0 with that probability. The rest is
 //! divided into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for
 //! its own width w, an added variance of (w / L)^2 / 12.
 
-use super::{RATE_WALK, RATE_WALK_USE};
+use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
 use crate::filter::bisect;
 
 /// Slices of the loss.
@@ -29,8 +29,8 @@ const REACH: f64 = 6.0;
 /// Range of the logarithm of use and rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 
-/// Below this the moments' closed form loses digits, and the series applies.
-const SMALL: f64 = 1e-3;
+/// Steps of the integrals over the loss.
+const STEPS: usize = 16;
 
 /// A slice: its probability, and mean and standard deviation of the logarithm of its use.
 type Slice = (f64, (f64, f64));
@@ -44,8 +44,8 @@ pub(super) struct Crossing {
 }
 
 impl Crossing {
-    /// From mean [loss to come, rate], covariance [loss, loss and rate, rate] and the use so far.
-    pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], used: f64) -> Self {
+    /// From mean [loss to come, rate], covariance [loss, loss and rate, rate], the loss and the use so far.
+    pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], lost: f64, used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
         // With a certain loss all slices are equal.
         let loss_std = loss_variance.max(1e-24).sqrt();
@@ -65,7 +65,7 @@ impl Crossing {
             let deviation = upper - 0.5 * width;
             let loss = mean[0] + loss_std * deviation;
             let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
-            let (log_use, walked) = use_of_loss(loss);
+            let (log_use, walked) = use_of_loss(lost, loss);
             let log_mean = log_use - log_rate;
             // The rate continues its walk with use; the mean over the walk counts, about half.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
@@ -126,27 +126,34 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     (libm::log(first) - 0.5 * log_variance, log_variance)
 }
 
-/// Mean and variance of the logarithm of the use that a loss takes at rate 1.
-fn use_of_loss(loss: f64) -> (f64, f64) {
-    let k = RATE_WALK * RATE_WALK;
-    let a = 0.5 * k * loss;
-    if a < SMALL {
-        return (libm::log(loss) + a / 6.0, 2.0 * a / 3.0);
+/// Mean and variance of the logarithm of the use that a further loss takes at rate 1.
+fn use_of_loss(lost: f64, loss: f64) -> (f64, f64) {
+    let step = loss / STEPS as f64;
+    // Sums over the losses so far: of m, of m e^v, and of the second moment.
+    let (mut mean, mut inner, mut second) = (0.0, 0.0, 0.0);
+    for index in 0..STEPS {
+        let at = lost + (index as f64 + 0.5) * step;
+        let variance = walk_variance(lost, at);
+        let m = libm::exp(0.5 * variance - KNEE_DRIFT * (knee(at) - knee(lost)));
+        let own = m * libm::exp(variance);
+        second += m * (2.0 * inner + own);
+        mean += m;
+        inner += own;
     }
-    let mean = loss * libm::expm1(a) / a;
-    let second = 4.0 / k * (libm::exp(a) * libm::expm1(3.0 * a) / (1.5 * k) - libm::expm1(4.0 * a) / (2.0 * k));
-    let log_variance = libm::log(second / (mean * mean));
-    (libm::log(mean) - 0.5 * log_variance, log_variance)
+    let log_variance = libm::log(second / (mean * mean)).max(0.0);
+    (libm::log(mean * step) - 0.5 * log_variance, log_variance)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::KNEE;
     use super::*;
 
     #[test]
     fn the_moments_of_the_use_agree_with_a_sampled_walk() {
         // Antithetic pairs of a fixed generator: reproducible, and the first moment nearly exact.
-        let (loss, steps, paths) = (0.3, 200, 4000);
+        // From before the knee to behind it.
+        let (lost, loss, steps, paths) = (0.05, 0.3, 200, 4000);
         let mut seed = 1_u64;
         let mut uniform = || {
             seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -155,12 +162,15 @@ mod tests {
         let mut sum = [0.0; 2];
         for _ in 0..paths {
             let (mut walk, mut uses) = (0.0, [0.0; 2]);
-            for _ in 0..steps {
+            for step in 0..steps {
+                let [from, to] = [step, step + 1].map(|step| lost + loss * f64::from(step) / f64::from(steps));
+                let growth = KNEE_DRIFT * (knee(0.5 * (from + to)) - knee(lost));
                 let normal = (-2.0 * uniform().ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
                 let before = walk;
-                walk += RATE_WALK * (loss / f64::from(steps)).sqrt() * normal;
+                walk += walk_variance(from, to).sqrt() * normal;
                 for (total, sign) in uses.iter_mut().zip([-1.0, 1.0]) {
-                    *total += loss / f64::from(steps) * 0.5 * ((sign * before).exp() + (sign * walk).exp());
+                    *total +=
+                        loss / f64::from(steps) * 0.5 * ((sign * before - growth).exp() + (sign * walk - growth).exp());
                 }
             }
             for total in uses {
@@ -168,16 +178,25 @@ mod tests {
                 sum[1] += total * total / f64::from(2 * paths);
             }
         }
-        let (log_mean, log_variance) = use_of_loss(loss);
+        let (log_mean, log_variance) = use_of_loss(lost, loss);
         let (mean, second) = ((log_mean + 0.5 * log_variance).exp(), (2.0 * log_mean + 2.0 * log_variance).exp());
         assert!((sum[0] / mean - 1.0).abs() < 0.01, "{} {mean}", sum[0]);
         assert!(((sum[1] - sum[0] * sum[0]) / (second - mean * mean) - 1.0).abs() < 0.1, "{} {second}", sum[1]);
     }
 
     #[test]
-    fn series_and_closed_form_meet() {
-        let (below, above) = (use_of_loss(1.999e-3), use_of_loss(2.001e-3));
-        assert!((below.0 - above.0).abs() < 2e-3 && (below.1 - above.1).abs() < 1e-5, "{below:?} {above:?}");
+    fn a_small_loss_takes_its_use_at_the_present_rate() {
+        let (log_mean, log_variance) = use_of_loss(0.3, 1e-9);
+        assert!(
+            (log_mean - 1e-9_f64.ln()).abs() < 1e-6 && (0.0..1e-6).contains(&log_variance),
+            "{log_mean} {log_variance}"
+        );
+    }
+
+    #[test]
+    fn a_loss_takes_less_use_through_the_knee_than_behind_it() {
+        let (through, behind) = (use_of_loss(KNEE.0, 0.1).0, use_of_loss(KNEE.1, 0.1).0);
+        assert!((through - behind) < -0.2, "{through} {behind}");
     }
 
     #[test]
@@ -190,10 +209,10 @@ mod tests {
 
     #[test]
     fn quantile_and_probability_are_each_others_inverse() {
-        let crossing = Crossing::new([0.1, 0.002], [1e-4, -1e-7, 1e-7], 50.0);
+        let crossing = Crossing::new([0.1, 0.002], [1e-4, -1e-7, 1e-7], 0.1, 50.0);
         for probability in [0.05, 0.5, 0.95] {
             assert!((crossing.probability(crossing.quantile(probability)) - probability).abs() < 1e-6);
         }
-        assert_eq!(Crossing::new([-0.1, 0.002], [1e-6, 0.0, 1e-7], 50.0).quantile(0.95), 0.0);
+        assert_eq!(Crossing::new([-0.1, 0.002], [1e-6, 0.0, 1e-7], 0.3, 50.0).quantile(0.95), 0.0);
     }
 }

@@ -20,15 +20,23 @@ fn passed(cycles: f64) -> Usage {
 }
 
 #[test]
-fn a_straight_fade_is_continued() {
-    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
-    let life = forecast.remaining(1.5).expect("enough is known");
+fn a_straight_fade_is_continued_before_the_knee() {
+    let forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
+    let life = forecast.remaining(1.8).expect("enough is known");
     let cycles = life.cycles.expect("cycles are counted");
-    // 1.8 Ah left, 0.3 Ah to go.
-    assert!((cycles.median - 150.0).abs() < 10.0, "{cycles:?}");
-    assert!(cycles.low < 150.0 && cycles.high > 150.0 && cycles.high < 6.0 * cycles.low, "{cycles:?}");
+    // 1.9 Ah left, 0.1 Ah to go.
+    assert!((cycles.median - 100.0).abs() < 10.0, "{cycles:?}");
+    assert!(cycles.low < 100.0 && cycles.high > 100.0 && cycles.high < 8.0 * cycles.low, "{cycles:?}");
     let days = life.days.expect("the rate of use is known");
     assert!((days.median / cycles.median - 0.25).abs() < 1e-9, "{days:?}");
+}
+
+#[test]
+fn a_knee_is_expected_and_a_fade_without_one_stays_in_the_interval() {
+    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let cycles = forecast.remaining(1.6).expect("enough is known").cycles.expect("cycles are counted");
+    // 1.8 Ah left, 0.2 Ah to go: 100 cycles straight on, 41 at a rate that grows at once to e^0.9 times itself.
+    assert!((45.0..90.0).contains(&cycles.median) && cycles.low < 45.0 && cycles.high > 100.0, "{cycles:?}");
 }
 
 #[test]
@@ -61,7 +69,7 @@ fn a_recovery_after_rest_does_not_end_the_fade() {
 #[test]
 fn few_readings_or_no_fade_give_no_forecast() {
     assert_eq!(Forecast::new(Axis::Cycles, 2.0).remaining(1.5), Err(InsufficientData::Readings { found: 0 }));
-    assert_eq!(fed(|efc| 2.0 - 0.01 * efc, 1.0, 3.0).remaining(1.5), Err(InsufficientData::Readings { found: 4 }));
+    assert_eq!(fed(|efc| 2.0 - 0.01 * efc, 1.0, 1.0).remaining(1.5), Err(InsufficientData::Readings { found: 2 }));
     let flat = fed(|_| 2.0, 1.0, 300.0).remaining(1.5);
     assert!(matches!(flat, Err(InsufficientData::Fade { .. })), "{flat:?}");
     let rising = fed(|efc| 2.0 + 0.001 * efc, 1.0, 100.0).remaining(1.5);
@@ -104,10 +112,10 @@ fn the_axis_of_days_gives_days_alone() {
 
 #[test]
 fn use_without_a_reading_counts() {
-    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
-    let before = forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
+    let mut forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
+    let before = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
     (0..50).for_each(|_| forecast.update(passed(1.0), None));
-    let after = forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
+    let after = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
     assert!((before - after - 50.0).abs() < 8.0, "{before} {after}");
 }
 
