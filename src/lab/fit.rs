@@ -4,9 +4,12 @@
 //! [`FitOutcome`] with the model's tables, residuals per file and all values of the written TOML ([`toml`]).
 //! One error names all files whose SOC cannot be determined, with the reasons.
 
+mod limits;
+mod nodes;
 mod picture;
 mod prepare;
 mod toml;
+mod verdict;
 
 use std::path::PathBuf;
 
@@ -33,7 +36,7 @@ const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// SOC breakpoints where slow tests give the OCV's shape.
+/// SOC breakpoints where slow tests give the OCV's shape; more where it bends ([`nodes`]).
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
 /// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
@@ -132,6 +135,8 @@ pub struct FitOutcome {
     pub file_of_record: Vec<usize>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
+    /// What the model is good for, to print at the end.
+    pub verdict: Vec<String>,
 }
 
 /// Reads and prepares the files, and fits the model.
@@ -172,10 +177,12 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         records,
         file_of_record,
         notes: prepared.notes,
+        verdict: vec![],
         fit: fitted,
     };
     outcome.notes.extend(thermal.err());
     add_notes(request, &mut outcome);
+    outcome.verdict = verdict::verdict(&outcome);
     Ok(outcome)
 }
 
@@ -214,7 +221,9 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
         (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
-        (false, Some(_)) => (SLOW_TEST_SOC_NODES.to_vec(), PriorDeviations::SLOW_TEST),
+        (false, Some(_)) => {
+            (nodes::by_curvature(&SLOW_TEST_SOC_NODES, &prepared.ocv), PriorDeviations::SLOW_TEST)
+        }
         (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
     Ok(FitSettings {
@@ -223,7 +232,6 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
-        empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
         deviations,
     })
 }

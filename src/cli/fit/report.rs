@@ -36,6 +36,9 @@ pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Resu
     for note in &outcome.notes {
         writeln!(out, "note: {note}")?;
     }
+    for said in &outcome.verdict {
+        writeln!(out, "verdict: {said}")?;
+    }
     let fit = &outcome.fit;
     let ended = if fit.converged { "converged" } else { "stopped" };
     writeln!(out, "{ended} after {} passes, {seconds:.1} s; written to {}", fit.passes, path.display())
@@ -57,6 +60,7 @@ pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
         "passes": outcome.fit.passes,
         "converged": outcome.fit.converged,
         "notes": outcome.notes,
+        "verdict": outcome.verdict,
         "seconds": seconds,
     });
     writeln!(io::stdout().lock(), "{value}")
