@@ -221,9 +221,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
         (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
-        (false, Some(_)) => {
-            (nodes::by_curvature(&SLOW_TEST_SOC_NODES, &prepared.ocv), PriorDeviations::SLOW_TEST)
-        }
+        (false, Some(_)) => (nodes::by_curvature(&SLOW_TEST_SOC_NODES, &prepared.ocv), PriorDeviations::SLOW_TEST),
         (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
     Ok(FitSettings {

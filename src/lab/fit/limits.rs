@@ -190,7 +190,8 @@ mod tests {
 
     #[test]
     fn cycles_end_at_the_cut_off_and_a_discharge_broken_off_does_not_count() {
-        let discharge = |key: &str, end_v: f64| part(key, "discharge", [(0.0, 2.0, 4.0), (60.0, 2.0, end_v), (70.0, 0.0, 3.3)]);
+        let discharge =
+            |key: &str, end_v: f64| part(key, "discharge", [(0.0, 2.0, 4.0), (60.0, 2.0, end_v), (70.0, 0.0, 3.3)]);
         let charge = part("2", "charge", [(0.0, -1.0, 3.8), (60.0, -1.0, 4.208), (90.0, 0.0, 4.1)]);
         let files = [file(vec![
             discharge("1", 2.6601),

@@ -69,7 +69,8 @@ mod tests {
         assert!(nodes.windows(2).all(|pair| pair[1] - pair[0] > 0.99 * LEAST_DISTANCE), "{nodes:?}");
         let added = || nodes.iter().filter(|node| !first.contains(node));
         assert!(added().all(|node| (0.55..0.75).contains(node)), "{nodes:?}");
-        let worst = |nodes: &[f64]| (1..100).map(|k| misread(&[stepped()], nodes, f64::from(k) / 100.0)).fold(0.0, f64::max);
+        let worst =
+            |nodes: &[f64]| (1..100).map(|k| misread(&[stepped()], nodes, f64::from(k) / 100.0)).fold(0.0, f64::max);
         assert!(worst(&first) > 0.01 && worst(&nodes) <= MOST_POINTS, "{} {}", worst(&first), worst(&nodes));
     }
 

@@ -43,7 +43,8 @@ fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
 }
 
 fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
-    let middle: Vec<f64> = soc.iter().zip(points).filter(|(soc, _)| MIDDLE.contains(*soc)).map(|(_, p)| p * p).collect();
+    let middle: Vec<f64> =
+        soc.iter().zip(points).filter(|(soc, _)| MIDDLE.contains(*soc)).map(|(_, p)| p * p).collect();
     (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
 }
 
@@ -73,7 +74,8 @@ fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > FLAT_POINTS);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");
-    (!flat.is_empty()).then(|| format!("the curve is too flat for the SOC by voltage near {list}: there the charge is counted"))
+    (!flat.is_empty())
+        .then(|| format!("the curve is too flat for the SOC by voltage near {list}: there the charge is counted"))
 }
 
 fn ranges(outcome: &FitOutcome) -> Option<String> {
