@@ -38,10 +38,11 @@ const SOC_NODES: [f64; 24] = [
 ];
 /// SOC breakpoints where slow tests give the OCV's shape; more where it bends ([`nodes`]).
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
-/// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
-const AGEING_SOC_NODES: [f64; 25] = [
-    0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
-    0.9, 0.93, 0.96, 0.98, 1.0,
+/// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp. No breakpoint lies at the cut-off: below it is no
+/// data, and the lowest interval goes on as a straight line through the knee instead of falling to the cut-off's voltage.
+const AGEING_SOC_NODES: [f64; 22] = [
+    0.0, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.93, 0.96,
+    0.98, 1.0,
 ];
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];

@@ -112,8 +112,7 @@ fn judged(discharge: bool, current_a: &[f64], soc: &[f64], capacity_ah: f64) -> 
     let step = STEP_PER_AH * capacity_ah;
     let of_row = |k: usize| {
         let before_a = if k == 0 { current_a[0] } else { current_a[k - 1] };
-        let recovering =
-            std::env::var("PW_REC").is_err() && discharge && current_a[k] < 2.0 * step && soc[k] < RECOVERY_SOC;
+        let recovering = discharge && current_a[k] < 2.0 * step && soc[k] < RECOVERY_SOC;
         (current_a[k] - before_a).abs() < step && !recovering
     };
     (0..soc.len()).map(of_row).collect()
