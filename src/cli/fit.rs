@@ -72,7 +72,7 @@ struct GridArgs {
     /// Temperature nodes, degrees C, rising [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
-    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 to 31 with a slow test, closer where its curve bends; 22 for an ageing cell, else 24, closer near both ends]
+    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 to 31 with a slow test, closer where its curve bends; 25 for an ageing cell, else 24, closer near both ends]
     #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
 }
