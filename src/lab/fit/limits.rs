@@ -20,7 +20,7 @@ const STRAY: usize = 10_000;
 const BEYOND_V: f64 = 0.02;
 /// A discharge that ends further than this above the median end was broken off, V.
 const BROKEN_OFF_V: f64 = 0.3;
-/// Error of a reading at the cut-off, V.
+/// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;
 
 /// A reading and where it is.
@@ -67,13 +67,14 @@ pub(super) fn voltage_limits(
 
 type Limit<'a> = (f64, Reading<'a>);
 
-/// The range of the rows that are no pulses; of all rows where there are pulses only.
+/// The range of the rows that are no pulses, in steps of 10 mV; of all rows where there are pulses only.
 fn held_limits<'a>(files: impl Iterator<Item = &'a MeasuredFile> + Clone) -> Option<(Limit<'a>, Limit<'a>)> {
     let held = readings(files.clone(), HELD_S);
     let all = if held.is_empty() { readings(files, 0.0) } else { held };
     let stray = all.len() / STRAY;
     let (low, high) = (*all.get(stray)?, *all.get(all.len().checked_sub(1 + stray)?)?);
-    Some((((low.voltage_v * 100.0).floor() / 100.0, low), ((high.voltage_v * 100.0).ceil() / 100.0, high)))
+    let (low_v, high_v) = (low.voltage_v + READING_V, high.voltage_v - READING_V);
+    Some((((low_v * 100.0).floor() / 100.0, low), ((high_v * 100.0).ceil() / 100.0, high)))
 }
 
 fn strays<'a>(files: impl Iterator<Item = &'a MeasuredFile>) -> usize {

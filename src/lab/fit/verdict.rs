@@ -64,7 +64,7 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     }
     if !poor.is_empty() {
         let each: Vec<String> = poor.iter().map(|(t, points)| format!("{} at {t}", rounded(*points))).collect();
-        said.push(format!("not good for SOC elsewhere: about {} degrees C", each.join(", ")));
+        said.push(format!("not good for SOC: about {} degrees C", each.join(", ")));
     }
     said
 }
@@ -103,7 +103,7 @@ mod tests {
         let rows = [(-20.0, 6.1), (-10.0, 2.9), (0.0, 1.6), (25.0, 0.6), (40.0, 0.3)];
         let expected = [
             "good for SOC to about 1.5 points between 0 and 40 degrees C",
-            "not good for SOC elsewhere: about 6 points at -20, 3 points at -10 degrees C",
+            "not good for SOC: about 6 points at -20, 3 points at -10 degrees C",
         ];
         assert_eq!(accuracy(&rows), expected);
         assert_eq!(accuracy(&rows[3..4]), ["good for SOC to about 0.5 points at 25 degrees C"]);
