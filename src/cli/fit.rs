@@ -1,6 +1,6 @@
 //! `packwatch fit`: measured data to a cell model.
 //!
-//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is complete.
+//! Prints a table of files with their residuals, warnings, a verdict, and how the fit went; writes the model when it is complete.
 
 mod report;
 
@@ -38,10 +38,10 @@ pub(crate) struct Args {
     /// chosen on two whole lives]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
-    /// Lowest voltage under load [default: from the data]
+    /// Lowest voltage under load [default: where discharges end; pulses do not count]
     #[arg(long, value_name = "V", value_parser = above_0)]
     voltage_min: Option<f64>,
-    /// Highest voltage under charge [default: from the data]
+    /// Highest voltage under charge [default: where charges end; pulses do not count]
     #[arg(long, value_name = "V", value_parser = above_0)]
     voltage_max: Option<f64>,
     /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
@@ -72,7 +72,7 @@ struct GridArgs {
     /// Temperature nodes, degrees C, rising [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
-    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 with a slow test, 25 for an ageing cell, else 24; closer near both ends]
+    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 to 31 with a slow test, closer where its curve bends; 25 for an ageing cell, else 24, closer near both ends]
     #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
 }

@@ -4,9 +4,12 @@
 //! [`FitOutcome`] with the model's tables, residuals per file and all values of the written TOML ([`toml`]).
 //! One error names all files whose SOC cannot be determined, with the reasons.
 
+mod limits;
+mod nodes;
 mod picture;
 mod prepare;
 mod toml;
+mod verdict;
 
 use std::path::PathBuf;
 
@@ -24,7 +27,7 @@ use crate::ident::fit::{FitSettings, FittedTables, Residual};
 use crate::ident::grid::Grid;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
-use crate::ident::{error_table, fit, thermal};
+use crate::ident::{ageing, error_table, fit, thermal};
 
 /// Least share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
@@ -33,13 +36,15 @@ const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// SOC breakpoints where slow tests give the OCV's shape.
+/// SOC breakpoints where slow tests give the OCV's shape; more where it bends ([`nodes`]).
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
 /// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
 ];
+/// Interval above the cut-off whose slope an ageing cell's curve keeps below it, SOC.
+const LOW_END_SOC: f64 = 0.03;
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
@@ -132,6 +137,8 @@ pub struct FitOutcome {
     pub file_of_record: Vec<usize>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
+    /// What the model is good for, to print at the end.
+    pub verdict: Vec<String>,
 }
 
 /// Reads and prepares the files, and fits the model.
@@ -145,7 +152,10 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let (records, scale) = prepared.records(&settings.grid);
     check_range(&records)?;
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(FitProgress::Pass(pass, cost)));
-    let fitted = fitted?;
+    let mut fitted = fitted?;
+    if request.first_cycles.is_some() && request.soc.is_none() {
+        continue_low_end(&mut fitted);
+    }
     let energy_wh = prepared.capacity_ah * fitted.mean_ocv_v();
     let thermal = thermal::fit(&records, &fitted.tables, energy_wh);
     let file_of_record: Vec<usize> = prepared.sources.iter().map(|source| source.file).collect();
@@ -172,11 +182,28 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         records,
         file_of_record,
         notes: prepared.notes,
+        verdict: vec![],
         fit: fitted,
     };
     outcome.notes.extend(thermal.err());
     add_notes(request, &mut outcome);
+    outcome.verdict = verdict::verdict(&outcome);
     Ok(outcome)
+}
+
+/// Replaces the open-circuit curve of an ageing cell below the cut-off of its discharges, where there are no data, by a straight
+/// line with the slope of [`LOW_END_SOC`] above. A curve that falls to the cut-off's voltage there, or wherever the last rows
+/// under load pull it, is so steep that an aged cell's first rest is beyond every gate.
+fn continue_low_end(fitted: &mut FittedTables) {
+    let soc = &fitted.grid.soc;
+    let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);
+    let above = soc.partition_point(|&node| node < ageing::SOC_LEFT + LOW_END_SOC);
+    for row in fitted.tables.ocv_v.chunks_mut(soc.len()) {
+        let slope_v = (row[above] - row[cut_off]) / (soc[above] - soc[cut_off]);
+        for s in 0..cut_off {
+            row[s] = row[cut_off] - slope_v * (soc[cut_off] - soc[s]);
+        }
+    }
 }
 
 fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<WeightedRecord<'a>> {
@@ -214,7 +241,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
         (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
-        (false, Some(_)) => (SLOW_TEST_SOC_NODES.to_vec(), PriorDeviations::SLOW_TEST),
+        (false, Some(_)) => (nodes::by_curvature(&SLOW_TEST_SOC_NODES, &prepared.ocv), PriorDeviations::SLOW_TEST),
         (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
     Ok(FitSettings {
@@ -223,7 +250,6 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
-        empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
         deviations,
     })
 }
@@ -285,6 +311,26 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
             let what =
                 format!("no data near {t} degrees C at soc {}: these nodes follow their neighbours", soc.join(", "));
             outcome.notes.push(what);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ident::grid::Grid;
+    use crate::ident::parameters::ParameterTables;
+
+    #[test]
+    fn below_the_cut_off_the_curve_keeps_its_slope() {
+        let ocv_v = AGEING_SOC_NODES.map(|soc| if soc < 0.045 { 2.0 + soc } else { 3.0 + 10.0 * soc }).to_vec();
+        let tables = ParameterTables { ocv_v, r0_ohm: vec![], r_ohm: vec![], tau_s: vec![] };
+        let grid = Grid { soc: AGEING_SOC_NODES.to_vec(), temperature_c: vec![25.0] };
+        let (total, visits_s) = (Residual::default(), vec![]);
+        let mut fitted = FittedTables { grid, tables, total, visits_s, passes: 1, converged: true };
+        continue_low_end(&mut fitted);
+        for (soc, found) in AGEING_SOC_NODES.iter().zip(&fitted.tables.ocv_v) {
+            assert!((found - (3.0 + 10.0 * soc)).abs() < 1e-9, "{soc}: {found}");
         }
     }
 }

@@ -17,7 +17,7 @@ pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
     bar.tick();
 }
 
-/// Prints residuals per file, notes, and the end of the fit.
+/// Prints residuals per file, notes, what the model is good for, and the end of the fit.
 pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Result<()> {
     let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
     let width = names.iter().map(String::len).max().unwrap_or(0).max(5);
@@ -35,6 +35,9 @@ pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Resu
     line("all", rows, all_s, &outcome.fit.total)?;
     for note in &outcome.notes {
         writeln!(out, "note: {note}")?;
+    }
+    for said in &outcome.verdict {
+        writeln!(out, "verdict: {said}")?;
     }
     let fit = &outcome.fit;
     let ended = if fit.converged { "converged" } else { "stopped" };
@@ -57,6 +60,7 @@ pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
         "passes": outcome.fit.passes,
         "converged": outcome.fit.converged,
         "notes": outcome.notes,
+        "verdict": outcome.verdict,
         "seconds": seconds,
     });
     writeln!(io::stdout().lock(), "{value}")

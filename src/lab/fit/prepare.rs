@@ -1,6 +1,7 @@
 //! From measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
 
 use super::FitRequest;
+use super::limits::{DISCONNECTED_V, voltage_limits};
 use crate::error::LabError;
 use crate::ident::ageing;
 use crate::ident::fit::{self, FittedTables, OcvCurve, Residual};
@@ -14,8 +15,6 @@ const DEFAULT_C: f64 = 25.0;
 const NODE_GAP_K: f64 = 5.0;
 /// Voltages further than this beyond the cell's limits are not credible, V.
 const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Voltages below this come from a disconnected sensor, V.
-const DISCONNECTED_V: f64 = 0.5;
 /// Weight of a charge relative to a discharge of an ageing cell: its voltage carries slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 /// Least share of the capacity that a slow test must discharge.
@@ -68,8 +67,7 @@ pub(super) fn prepare(
     if request.first_cycles.is_some() {
         need_cycles(files)?;
     }
-    let voltage_v = voltage_limits(request, files)?;
-    let mut notes = Vec::new();
+    let (voltage_v, mut notes) = voltage_limits(request, files, slow)?;
     let dropped: usize = files.iter().map(|f| f.rows() - f.parts.iter().map(|p| clean(p).len()).sum::<usize>()).sum();
     if dropped > 0 {
         notes.push(format!("{dropped} rows left out: without current or voltage, or back in time"));
@@ -133,53 +131,6 @@ fn key_text(part: &MeasuredPart) -> String {
 fn rough_capacity(part: &MeasuredPart) -> f64 {
     let out = crate::ident::charge_ah(&part.time_s, &part.current_a);
     out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
-}
-
-/// Returns the given limits, else the limits of the data without a few stray rows.
-fn voltage_limits(request: &FitRequest, files: &[MeasuredFile]) -> Result<(f64, f64), LabError> {
-    let (low, high) = match request.first_cycles {
-        Some(first) => cycle_limits(files, first),
-        None => seen_limits(files),
-    }
-    .ok_or_else(|| LabError("no voltage in the data".into()))?;
-    let (low, high) = (request.voltage_min_v.unwrap_or(low), request.voltage_max_v.unwrap_or(high));
-    if low >= high {
-        return Err(LabError(format!("lowest voltage {low} V, highest {high} V: must be below it")));
-    }
-    Ok((low, high))
-}
-
-fn seen_limits(files: &[MeasuredFile]) -> Option<(f64, f64)> {
-    let parts = files.iter().flat_map(|file| &file.parts);
-    let mut seen: Vec<f64> = parts.flat_map(|p| &p.voltage_v).copied().filter(|&v| v > DISCONNECTED_V).collect();
-    seen.sort_by(f64::total_cmp);
-    let stray = seen.len() / 10_000;
-    let (low, high) = (seen.get(stray)?, seen.get(seen.len().checked_sub(1 + stray)?)?);
-    Some(((low * 100.0).floor() / 100.0, (high * 100.0).ceil() / 100.0))
-}
-
-/// Returns the voltage limits of whole cycles. Every discharge ends with its first row below the cut-off, which comes in
-/// steps of 0.1 V, so the highest of these rows gives the lower limit. Charges hold their voltage: the median counts.
-fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(f64, f64)> {
-    let early =
-        || files.iter().flat_map(|f| &f.parts).filter(move |p| p.key.parse().is_ok_and(|cycle: usize| cycle <= first));
-    let extreme = |part: &MeasuredPart, sign: f64| {
-        let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
-        let rows = part.current_a.iter().zip(&part.voltage_v);
-        let loaded = rows.filter(|(i, _)| *i * sign > 0.02 * most_a).map(|(_, v)| -v * sign);
-        loaded.fold(f64::NEG_INFINITY, f64::max) * -sign
-    };
-    let sorted = |discharge: bool| {
-        let sign = if discharge { 1.0 } else { -1.0 };
-        let own = early().filter(|part| part.is_discharge() == discharge);
-        let mut all: Vec<f64> = own.map(|part| extreme(part, sign)).filter(|v| v.is_finite()).collect();
-        all.sort_by(f64::total_cmp);
-        all
-    };
-    let charges = sorted(false);
-    let low = (sorted(true).last()? * 10.0).ceil() / 10.0;
-    let high = charges.get(charges.len() / 2).copied().or_else(|| seen_limits(files).map(|(_, high)| high))?;
-    Some((low, (high * 20.0).round() / 20.0))
 }
 
 /// The discharge branch of a slow test.

@@ -8,7 +8,7 @@
 use super::{MeasuredPart, charge_ah};
 
 /// SOC left at the cut-off under load when new.
-const SOC_LEFT: f64 = 0.045;
+pub(crate) const SOC_LEFT: f64 = 0.045;
 /// The knee, as a share of the way from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
 /// Current that counts as discharge, as a share of the discharge's median.

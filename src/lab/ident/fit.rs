@@ -49,8 +49,6 @@ pub struct FitSettings {
     pub ocv: Vec<OcvCurve>,
     /// Least rise of the OCV, V per unit of SOC, from a SOC on: `(from, slope)`, the last that holds.
     pub min_slope_v: Vec<(f64, f64)>,
-    /// OCV at SOC 0 held here, where no data reach it.
-    pub empty_ocv_v: Option<f64>,
     /// Smoothness.
     pub deviations: PriorDeviations,
 }
@@ -235,7 +233,7 @@ fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
     let (least_v, most_v) = settings.voltage_v;
     for row in 0..grid.temperature_c.len() {
         let first = row * layout.columns;
-        (low[first], high[first]) = settings.empty_ocv_v.map_or((0.5 * least_v, most_v), |v| (v - 1e-6, v + 1e-6));
+        (low[first], high[first]) = (0.5 * least_v, most_v);
         for s in 1..layout.columns {
             let width = grid.soc[s] - grid.soc[s - 1];
             let slope = settings.min_slope_v.iter().filter(|(from, _)| grid.soc[s] > *from).map(|(_, slope)| *slope);

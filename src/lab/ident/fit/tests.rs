@@ -102,7 +102,6 @@ fn settings(grid: Grid) -> FitSettings {
         voltage_v: (2.5, 4.2),
         ocv: vec![],
         min_slope_v: vec![],
-        empty_ocv_v: None,
         deviations: PriorDeviations::FREE_OCV,
     }
 }

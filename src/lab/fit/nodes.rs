@@ -1,0 +1,82 @@
+//! SOC breakpoints where the open-circuit curve of the slow tests bends.
+//!
+//! In: slow tests (SOC, V). Out: breakpoints, fraction. Between breakpoints a model is linear; a node is added where that misreads
+//! the SOC most, until it misreads it by less than [`MOST_POINTS`] anywhere.
+
+use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
+use crate::ident::grid::interpolate;
+
+/// Error of the SOC that linear interpolation may cause, fraction.
+const MOST_POINTS: f64 = 0.005;
+/// Error of the voltage below which nothing is added, V: no model is better.
+const LEAST_V: f64 = 0.001;
+/// Width over which the slope counts, SOC: an estimate moves over a plateau's steps.
+const SLOPE_WIDTH: f64 = 0.04;
+/// Least distance of breakpoints. The points looked at are this far apart.
+const LEAST_DISTANCE: f64 = 0.01;
+/// Most breakpoints: the time of a fit grows with their square.
+const MOST_NODES: usize = 31;
+
+/// `first` with nodes where the curves bend.
+pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
+    let mut nodes = first.to_vec();
+    while nodes.len() < MOST_NODES {
+        let points = (1..100).map(|k| LEAST_DISTANCE * f64::from(k));
+        let free = points.filter(|at| nodes.iter().all(|node| (node - at).abs() > 0.99 * LEAST_DISTANCE));
+        let worst = free.map(|at| (at, misread(curves, &nodes, at))).max_by(|a, b| a.1.total_cmp(&b.1));
+        let Some((at, _)) = worst.filter(|(_, error)| *error > MOST_POINTS) else { break };
+        let place = nodes.partition_point(|&node| node < at);
+        nodes.insert(place, (at * 100.0).round() / 100.0);
+    }
+    nodes
+}
+
+/// Error of the SOC at `at` when the curves are linear between `nodes`: the largest of the curves, fraction.
+fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
+    let of_curve = |curve: &OcvCurve| {
+        let voltage_v = |soc: f64| interpolate(&curve.soc, &curve.voltage_v, soc);
+        let above = nodes.partition_point(|&node| node < at);
+        let (low, high) = (nodes[above - 1], nodes[above]);
+        // Below its end a cold test says nothing.
+        if low < curve.soc[0] {
+            return 0.0;
+        }
+        let along = (at - low) / (high - low);
+        let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
+        let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
+        let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
+        if error_v > LEAST_V { error_v / slope_v } else { 0.0 }
+    };
+    curves.iter().map(of_curve).fold(0.0, f64::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A straight curve with a step of 50 mV at 0.63.
+    fn stepped() -> OcvCurve {
+        let soc: Vec<f64> = (0..=1000).map(|k| f64::from(k) / 1000.0).collect();
+        let voltage_v = soc.iter().map(|z| 3.0 + z + 0.025 * ((z - 0.63) / 0.01).tanh()).collect();
+        OcvCurve { temperature_c: 25.0, soc, voltage_v }
+    }
+
+    #[test]
+    fn nodes_are_added_where_the_curve_bends_and_nowhere_else() {
+        let first = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0];
+        let nodes = by_curvature(&first, &[stepped()]);
+        assert!(nodes.len() > first.len() && nodes.len() < MOST_NODES, "{nodes:?}");
+        assert!(nodes.windows(2).all(|pair| pair[1] - pair[0] > 0.99 * LEAST_DISTANCE), "{nodes:?}");
+        let added = || nodes.iter().filter(|node| !first.contains(node));
+        assert!(added().all(|node| (0.55..0.75).contains(node)), "{nodes:?}");
+        let worst =
+            |nodes: &[f64]| (1..100).map(|k| misread(&[stepped()], nodes, f64::from(k) / 100.0)).fold(0.0, f64::max);
+        assert!(worst(&first) > 0.01 && worst(&nodes) <= MOST_POINTS, "{} {}", worst(&first), worst(&nodes));
+    }
+
+    #[test]
+    fn a_straight_curve_needs_no_more_nodes() {
+        let curve = OcvCurve { temperature_c: 25.0, soc: vec![0.0, 1.0], voltage_v: vec![3.0, 4.2] };
+        assert_eq!(by_curvature(&[0.0, 0.5, 1.0], &[curve]), [0.0, 0.5, 1.0]);
+    }
+}

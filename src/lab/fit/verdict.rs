@@ -1,0 +1,120 @@
+//! What a fitted model is good for, in plain words.
+//!
+//! In: the table of the model's own error (V, for data not fitted), the slopes of its open-circuit curve, the rows it was
+//! fitted on. Out: sentences. The SOC's error is the voltage's over the slope, as root mean square over [`MIDDLE`]: what
+//! voltage alone determines. The count of charge between readings makes it better, an error of the sensors worse.
+
+use super::FitOutcome;
+use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
+
+/// SOC over which errors are averaged: below, curves are so steep that any model is good, and few cells go there.
+const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
+/// Error of the SOC up to which a temperature counts as good, points.
+const GOOD_POINTS: f64 = 2.0;
+/// Error of the SOC at one breakpoint from which its voltage is of no use, points.
+const FLAT_POINTS: f64 = 5.0;
+
+/// The sentences, for the end of the output.
+pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
+    let FitOutcome { fit, voltage_error_v, .. } = outcome;
+    let columns = fit.grid.soc.len();
+    let points = soc_points(fit, voltage_error_v);
+    let measured = |t: usize| fit.visits_s[t * columns..(t + 1) * columns].iter().sum::<f64>() >= SUPPORTED_S;
+    let rows: Vec<(f64, f64)> = (0..fit.grid.temperature_c.len())
+        .filter(|&t| measured(t))
+        .map(|t| (fit.grid.temperature_c[t], mean_points(&fit.grid.soc, &points[t * columns..(t + 1) * columns])))
+        .collect();
+    let mut said = accuracy(&rows);
+    said.extend(flat(&fit.grid.soc, &points, columns));
+    said.extend(ranges(outcome));
+    said
+}
+
+/// Error of the SOC by the voltage at every node, points.
+fn soc_points(fit: &FittedTables, voltage_error_v: &[f64]) -> Vec<f64> {
+    let (soc, columns) = (&fit.grid.soc, fit.grid.soc.len());
+    let of_node = |node: usize| {
+        let (first, s) = (node - node % columns, node % columns);
+        let (low, high) = (s.saturating_sub(1), (s + 1).min(columns - 1));
+        let rise_v = fit.tables.ocv_v[first + high] - fit.tables.ocv_v[first + low];
+        100.0 * voltage_error_v[node] / (rise_v / (soc[high] - soc[low])).max(MIN_SLOPE_V)
+    };
+    (0..voltage_error_v.len()).map(of_node).collect()
+}
+
+fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
+    let middle: Vec<f64> =
+        soc.iter().zip(points).filter(|(soc, _)| MIDDLE.contains(*soc)).map(|(_, p)| p * p).collect();
+    (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
+}
+
+/// Points as they are said: halves, at least one half.
+fn rounded(points: f64) -> String {
+    let halves = ((2.0 * points).round() / 2.0).max(0.5);
+    format!("{halves} {}", if halves == 1.0 { "point" } else { "points" })
+}
+
+fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
+    let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= GOOD_POINTS);
+    let mut said = Vec::new();
+    if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
+        let worst = good.iter().map(|(_, points)| *points).fold(0.0, f64::max);
+        let place = if low_c == high_c { format!("at {low_c}") } else { format!("between {low_c} and {high_c}") };
+        said.push(format!("good for SOC to about {} {place} degrees C", rounded(worst)));
+    }
+    if !poor.is_empty() {
+        let each: Vec<String> = poor.iter().map(|(t, points)| format!("{} at {t}", rounded(*points))).collect();
+        said.push(format!("not good for SOC: about {} degrees C", each.join(", ")));
+    }
+    said
+}
+
+/// Where the curve of every temperature is too flat for the model's error.
+fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
+    let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > FLAT_POINTS);
+    let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
+    let list = flat.join(", ");
+    (!flat.is_empty())
+        .then(|| format!("the curve is too flat for the SOC by voltage near {list}: there the charge is counted"))
+}
+
+fn ranges(outcome: &FitOutcome) -> Option<String> {
+    let rows = || outcome.records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
+    rows().next()?;
+    let range = |value: &dyn Fn(&crate::ident::record::FitRow) -> f64| {
+        rows().map(value).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)))
+    };
+    let (cold_c, warm_c) = range(&|row| row.temperature_c);
+    let (charge_a, discharge_a) = range(&|row| row.mean_current_a);
+    let (empty, full) = range(&|row| row.soc);
+    let charges = if charge_a < 0.0 { format!("charges up to {:.1} A", -charge_a) } else { "no charge".to_owned() };
+    Some(format!(
+        "measured: {cold_c:.0} to {warm_c:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {empty:.2} to {full:.2}; \
+         beyond these it is a guess"
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn good_temperatures_are_joined_and_the_others_named() {
+        let rows = [(-20.0, 6.1), (-10.0, 2.9), (0.0, 1.6), (25.0, 0.6), (40.0, 0.3)];
+        let expected = [
+            "good for SOC to about 1.5 points between 0 and 40 degrees C",
+            "not good for SOC: about 6 points at -20, 3 points at -10 degrees C",
+        ];
+        assert_eq!(accuracy(&rows), expected);
+        assert_eq!(accuracy(&rows[3..4]), ["good for SOC to about 0.5 points at 25 degrees C"]);
+        assert!(accuracy(&[]).is_empty());
+    }
+
+    #[test]
+    fn breakpoints_flat_at_every_temperature_are_named() {
+        let points = [1.0, 9.0, 7.0, 1.0, 6.0, 2.0];
+        let found = flat(&[0.0, 0.5, 1.0], &points, 3).expect("one");
+        assert!(found.contains("near 0.5: "), "{found}");
+        assert_eq!(flat(&[0.0, 1.0], &[1.0, 2.0], 2), None);
+    }
+}
