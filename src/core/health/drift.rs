@@ -117,6 +117,11 @@ impl DriftFilter {
         self.p[C][C] = self.p[C][C].max(variance);
     }
 
+    /// Raises the capacity to a charge, Ah, that was moved in one half-cycle.
+    pub fn at_least(&mut self, charge_ah: f64) {
+        self.x[C] = self.x[C].max(charge_ah);
+    }
+
     /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the
     /// capacity's process noise.
     pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {

@@ -105,7 +105,7 @@ pub struct Learner {
     learned: Vec<bool>,
     /// Capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
-    /// Cells whose sample filter was restarted in this half-cycle: it teaches them nothing.
+    /// Cells whose sample filter was restarted in this half-cycle.
     #[serde(default)]
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
@@ -227,7 +227,7 @@ impl Learner {
     }
 
     /// After a restart of a cell's sample filter: voltages contradicted what it had learned, so its capacity is no more
-    /// certain than a new cell's. The half-cycle at hand teaches nothing.
+    /// certain than a new cell's. The half-cycle at hand teaches no more than that the cell holds what was moved.
     pub fn doubt(
         &mut self,
         config: &CapacityConfig,
@@ -280,6 +280,8 @@ impl Learner {
         let drift = &mut self.drift[cell];
         if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
+        } else if is_in_doubt {
+            drift.at_least(half_cycle.charge_ah);
         }
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
@@ -458,8 +460,13 @@ mod tests {
         // As stored and restored between the restart and the half-cycle's end.
         let text = serde_json::to_string(&learner).expect("writes");
         let mut learner: Learner = serde_json::from_str(&text).expect("reads");
-        assert_eq!(learn(&mut learner, &mut estimator).measurement, None);
+        let in_doubt = learn(&mut learner, &mut estimator);
+        assert_eq!((in_doubt.measurement, in_doubt.capacity.mean), (None, sure.mean));
         assert!(learn(&mut learner, &mut estimator).measurement.is_some());
+        // A cell holds at least what was moved at a time.
+        learner.doubt(&config, 0, new_variance, &mut estimator);
+        let much = HalfCycle { charge_ah: 2.5, ..moved };
+        assert_eq!(learner.learn(&small_model(), &config, 0, &mut estimator, &much).capacity.mean, 2.5);
     }
 
     /// The capacity after 1,000 half-cycles between 0.8 and 0.3 at 1 A, with 5 mV too much at the upper end of the curve and too

@@ -16,7 +16,7 @@ use crate::filter::ScalarGaussian;
 /// Steps over a full capacity.
 const STEPS: f64 = 400.0;
 
-/// Largest number of steps of a discharge that does not reach its cut-off: five capacities.
+/// Largest number of steps of a discharge.
 const MAX_STEPS: u32 = 2000;
 
 /// Steps of the numerical forward derivatives over ln rho and over ln capacity.
@@ -54,6 +54,10 @@ pub fn usable_ah(
             *v = branch.voltage_after(Discretisation::Exact, *v, config.current_a, step_s);
         }
         let after_v = voltage(next, &branch_v);
+        if next <= 0.0 {
+            // Empty above the cut-off: there is no more than the capacity.
+            return capacity_ah * full_soc;
+        }
         if after_v <= config.cutoff_v {
             let part = (before_v - config.cutoff_v) / (before_v - after_v);
             return step_ah * (f64::from(k) + part);
@@ -102,6 +106,12 @@ mod tests {
         let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, (1e-12, 1.0));
         assert!((usable - 1.5).abs() < 1e-6, "{usable}");
         assert!((usable_ah(&small_model(), &CONFIG, 0.9, 2.0, (1e-12, 1.0)) - 1.3).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_cell_delivers_no_more_than_it_holds() {
+        let config = UsableConfig { cutoff_v: 1.0, ..CONFIG };
+        assert_eq!(usable_ah(&small_model(), &config, 0.9, 2.0, (1.0, 1.0)), 0.9 * 2.0);
     }
 
     #[test]

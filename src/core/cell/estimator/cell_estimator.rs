@@ -208,9 +208,11 @@ impl CellEstimator {
         self.absorb(CURRENT_OFFSET, deviations, remains);
     }
 
-    /// Corrects the slowest branch's resistance by the voltages since the last correction.
+    /// Corrects the slowest of several branches by the voltages since the last correction.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
-        if let Some(correction) = self.memory.slow_branch.correct(config.sensor.slow_branch) {
+        if matches!(self.filter, None | Some(Filter::One(_))) {
+            (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
+        } else if let Some(correction) = self.memory.slow_branch.correct(config.sensor.slow_branch) {
             self.absorb(SLOW_BRANCH, correction.deviations, correction.remains);
             self.absorb(SLOW_BRANCH, 0.0, correction.widened);
         }

@@ -6,7 +6,7 @@
 //! charge.
 //!
 //! Source: Friedland (1969), separate estimation of a bias, as for the current's offset ([`crate::health::offset`]). The ratio is
-//! corrected at changes of mode.
+//! corrected at changes of mode. In a model with one branch, that branch stands for all of them, and its ratio stays 1.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +15,7 @@ use crate::filter::Update;
 use crate::quantity::InvalidState;
 
 /// Least standard deviation, part of the first one: the ratio changes with temperature and SOC, and no evidence is for good.
-const LEAST_PART: f64 = 1.0 / 3.0;
+const LEAST_PART: f64 = 0.5;
 
 /// Most information of the voltages between two corrections, in that of the ratio's own standard deviation: the model's errors in
 /// them are the same from voltage to voltage, so that many voltages are hardly more than one.
@@ -106,7 +106,7 @@ impl SlowBranch {
             (LEAST_PART..=1.0).contains(&self.part),
             "the deviation of a slow branch",
             self.part,
-            "1/3 to 1",
+            "0.5 to 1",
         )?;
         InvalidState::unless_natural("the information about a slow branch", self.information)?;
         InvalidState::unless_number("the evidence about a slow branch", self.score)
@@ -130,7 +130,7 @@ mod tests {
             slow = SlowBranch { information: 0.25, score: 0.0, ..slow };
             slow.correct(0.4).expect("evidence");
         }
-        assert!((slow.std(0.4) - 0.4 / 3.0).abs() < 1e-12 && (slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");
+        assert!((slow.std(0.4) - 0.2).abs() < 1e-12 && (slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");
         assert_eq!(slow.check(), Ok(()));
     }
 

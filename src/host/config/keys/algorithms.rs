@@ -60,8 +60,8 @@ section! {
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out.
         voltage_offset_std_v: f64, "V", DEVIATION, Default("0.004");
-        /// Standard deviation of the slowest branch's resistance in a cell, relative to the model's: diffusion varies between cells and ages apart from the other resistances. It is learned.
-        slow_branch_std: f64, "fraction", DEVIATION, Default("0.3");
+        /// Standard deviation of the slowest branch's resistance in a cell, relative to the model's: diffusion varies between cells and ages apart from the other resistances. In a model with several branches it is learned. Without it: 0.2, and 0.1 in a model with one branch.
+        slow_branch_std: Option<f64>, "fraction", DEVIATION, Optional;
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second add no information beyond this. A `voltage_error_v` of the cell model replaces it.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
         /// Slow error of the cell model, relative to the voltage dropped in the cell at the reading: standard deviation of its average over one second.
@@ -134,7 +134,7 @@ impl Estimator {
                     voltage_offset_v: self.voltage_offset_std_v,
                     current_offset_a: capacity.current_offset_std_a,
                     current_gain: capacity.current_gain_std,
-                    slow_branch: self.slow_branch_std,
+                    slow_branch: self.slow_branch_std.unwrap_or(if model.branches.len() > 1 { 0.2 } else { 0.1 }),
                 },
                 CapacityState::Held => SensorErrors::NONE,
             },
