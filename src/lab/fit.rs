@@ -8,6 +8,7 @@ mod limits;
 mod nodes;
 mod picture;
 mod prepare;
+mod range;
 mod toml;
 mod verdict;
 
@@ -16,6 +17,7 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 
 pub use picture::write as write_plot;
+pub use range::MeasuredRange;
 pub use toml::text;
 
 use super::measured::MeasuredFile;
@@ -127,6 +129,8 @@ pub struct FitOutcome {
     pub thermal: Option<Thermal>,
     /// Standard deviation of the model's error averaged over 100 s, V, in node order.
     pub voltage_error_v: Vec<f64>,
+    /// Where the cell was measured.
+    pub measured: MeasuredRange,
     /// Of an ageing cell: residuals of discharges and of charges.
     pub by_kind: Option<(Residual, Residual)>,
     /// Per file, slow tests last.
@@ -177,6 +181,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         voltage_v: prepared.voltage_v,
         thermal: thermal.clone().ok(),
         voltage_error_v,
+        measured: MeasuredRange::of(&records),
         by_kind,
         files,
         records,

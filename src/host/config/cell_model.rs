@@ -60,6 +60,18 @@ section! {
 }
 
 section! {
+    /// Where the cell was measured, as `packwatch fit` writes it. For people: beyond these temperatures the tables of a fit continue with larger `voltage_error_v`, so that estimates are less certain there.
+    Measured at "measured" {
+        /// Lowest and highest temperature. Without it: not known.
+        temperature_c: Option<Vec<f64>>, "degrees C", Between(-100.0, 200.0), Optional;
+        /// Lowest and highest current; positive = discharge. Without it: not known.
+        current_a: Option<Vec<f64>>, "A", Between(-1e6, 1e6), Optional;
+        /// Lowest and highest state of charge. Without it: not known.
+        soc: Option<Vec<f64>>, "fraction", Between(-1.0, 2.0), Optional;
+    }
+}
+
+section! {
     /// A branch of a resistor and a capacitor in parallel, 1 to 3 of them.
     BranchTables at "tables.branches" gives Branch, |keys| {
         /// Resistance of a new cell.
@@ -132,6 +144,7 @@ pub(super) const SECTIONS: &[SectionInfo] = &[
         "provenance",
         "Where the numbers come from: source, method, data, residuals. For people; any keys.",
     ),
+    SectionInfo::one::<Measured>(),
     SectionInfo::one::<Tables>(),
     SectionInfo::many::<BranchTables>(),
     SectionInfo::one::<ElectrodesKeys>(),
@@ -154,6 +167,7 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let document = Document::parse(&path.display().to_string(), &text, faults);
     let mut reader = SchemaReader::new(&document, SECTIONS, faults);
     let head = reader.one::<Head>();
+    let measured = reader.optional::<Measured>();
     let tables = reader.one::<Tables>();
     let branches = reader.many::<BranchTables>();
     let electrodes = reader.optional::<ElectrodesKeys>();
@@ -161,6 +175,9 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let written = reader.count(BranchTables::PATH);
     if let Some(head) = &head {
         check_head(head, faults);
+    }
+    if let Some(measured) = &measured {
+        check_measured(measured, faults);
     }
     let tables = tables?;
     check_tables(&tables, faults);
@@ -228,6 +245,15 @@ fn check_head(head: &Head, faults: &mut Faults) {
     if head.voltage_max_v <= head.voltage_min_v {
         let what = format!("must be above voltage_min_v = {}", head.voltage_min_v);
         head.place.fault(faults, "voltage_max_v", &what);
+    }
+}
+
+fn check_measured(measured: &Measured, faults: &mut Faults) {
+    let Measured { temperature_c, current_a, soc, place, .. } = measured;
+    for (key, range) in [("temperature_c", temperature_c), ("current_a", current_a), ("soc", soc)] {
+        if range.as_ref().is_some_and(|range| range.len() != 2 || range[0] > range[1]) {
+            place.fault(faults, key, "must be two numbers, the lower first");
+        }
     }
 }
 

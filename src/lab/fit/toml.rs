@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use super::range::ModelTables;
 use super::{AGEING_SHIFT, FitOutcome, FitRequest, FittedElectrodes};
 use crate::cell::Electrodes;
 
@@ -10,7 +11,8 @@ pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
     let mut out = String::new();
     head(&mut out, request, outcome);
     provenance(&mut out, request, outcome);
-    tables(&mut out, outcome);
+    measured(&mut out, outcome);
+    tables(&mut out, request, outcome);
     if let Some(found) = &outcome.electrodes {
         electrodes(&mut out, found);
     }
@@ -91,22 +93,35 @@ fn provenance(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     }
 }
 
+fn measured(out: &mut String, outcome: &FitOutcome) {
+    let range = &outcome.measured;
+    line(out, "\n[measured]");
+    line(out, &format!("temperature_c = [{:.1}, {:.1}]", range.temperature_c.0, range.temperature_c.1));
+    line(out, &format!("current_a = [{:.3}, {:.3}]", range.current_a.0, range.current_a.1));
+    line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
+}
+
 /// Returns a file's name with its folder: enough to identify it, nothing of the machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
-fn tables(out: &mut String, outcome: &FitOutcome) {
-    let grid = &outcome.fit.grid;
-    let (ocv_v, r0_ohm, branches) = outcome.fit.tables.model(grid.soc.len());
+fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
+    // An ageing cell's model is for that cell in its own conditions: its cycles cannot separate temperature from age.
+    let is_ageing = request.first_cycles.is_some();
+    let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
+    let ModelTables { grid, tables, voltage_error_v } =
+        if is_ageing { ModelTables::fitted(fit, errors) } else { ModelTables::beyond(fit, errors, &outcome.measured) };
+    let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
     let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    line(out, "\n# Rows: temperature. Columns: SOC.\n[tables]");
+    let beyond = if is_ageing { "" } else { ", the first and the last beyond those measured" };
+    line(out, &format!("\n# Rows: temperature{beyond}. Columns: SOC.\n[tables]"));
     line(out, &format!("soc = [{}]", list(&grid.soc)));
     line(out, &format!("temperature_c = [{}]", list(&grid.temperature_c)));
     table(out, "ocv_v", &ocv_v.values, 5);
     table(out, "r0_ohm", &r0_ohm.values, 6);
-    let errors: Vec<Vec<f64>> = outcome.voltage_error_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
+    let errors: Vec<Vec<f64>> = voltage_error_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
     line(out, "# Standard deviation of the model's error averaged over 100 s.");
     table(out, "voltage_error_v", &errors, 4);
     for branch in &branches {

@@ -4,7 +4,7 @@
 //! fitted on. Out: sentences. The SOC's error is the voltage's over the slope, as root mean square over [`MIDDLE`]: what
 //! voltage alone determines. The count of charge between readings makes it better, an error of the sensors worse.
 
-use super::FitOutcome;
+use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
 /// SOC over which errors are averaged: below, curves are so steep that any model is good, and few cells go there.
@@ -26,7 +26,7 @@ pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
         .collect();
     let mut said = accuracy(&rows);
     said.extend(flat(&fit.grid.soc, &points, columns));
-    said.extend(ranges(outcome));
+    said.push(ranges(&outcome.measured));
     said
 }
 
@@ -78,20 +78,20 @@ fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
         .then(|| format!("the curve is too flat for the SOC by voltage near {list}: there the charge is counted"))
 }
 
-fn ranges(outcome: &FitOutcome) -> Option<String> {
-    let rows = || outcome.records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
-    rows().next()?;
-    let range = |value: &dyn Fn(&crate::ident::record::FitRow) -> f64| {
-        rows().map(value).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)))
-    };
-    let (cold_c, warm_c) = range(&|row| row.temperature_c);
-    let (charge_a, discharge_a) = range(&|row| row.mean_current_a);
-    let (empty, full) = range(&|row| row.soc);
+fn ranges(range: &MeasuredRange) -> String {
+    let (cold_c, warm_c) = range.temperature_c;
+    let (charge_a, discharge_a) = range.current_a;
+    let (empty, full) = range.soc;
     let charges = if charge_a < 0.0 { format!("charges up to {:.1} A", -charge_a) } else { "no charge".to_owned() };
-    Some(format!(
-        "measured: {cold_c:.0} to {warm_c:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {empty:.2} to {full:.2}; \
-         beyond these it is a guess"
-    ))
+    // Adding 0 makes a zero of either sign positive.
+    format!(
+        "measured: {:.0} to {:.0} degrees C, discharges up to {discharge_a:.1} A, {charges}, SOC {:.2} to {:.2}; beyond these it is \
+         a guess",
+        cold_c.round() + 0.0,
+        warm_c.round() + 0.0,
+        empty + 0.0,
+        full + 0.0,
+    )
 }
 
 #[cfg(test)]
@@ -108,6 +108,17 @@ mod tests {
         assert_eq!(accuracy(&rows), expected);
         assert_eq!(accuracy(&rows[3..4]), ["good for SOC to about 0.5 points at 25 degrees C"]);
         assert!(accuracy(&[]).is_empty());
+    }
+
+    #[test]
+    fn ranges_have_no_negative_zero() {
+        let range =
+            MeasuredRange { temperature_c: (-0.4, 42.1), current_a: (-2.0, 12.1), soc: (-0.001, 1.0), rms_a: 1.0 };
+        let found = ranges(&range);
+        assert!(
+            found.starts_with("measured: 0 to 42 degrees C, discharges up to 12.1 A, charges up to 2.0 A"),
+            "{found}"
+        );
     }
 
     #[test]

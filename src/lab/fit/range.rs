@@ -1,0 +1,174 @@
+//! Where a model was measured, and its tables beyond the measured temperatures.
+//!
+//! In: the records of a fit, and the fitted tables. Out: the ranges of temperature (degrees C), current (A) and SOC, and the
+//! tables with one row [`REACH_K`] below and one above the measured temperatures. There the open-circuit curve and the time
+//! constants are those of the nearest row, the resistances follow Arrhenius' law, as between measured temperatures, and the
+//! error of the voltage grows with the distance: the law holds only roughly, and its error is not known.
+
+use crate::cell::arrhenius;
+use crate::ident::fit::FittedTables;
+use crate::ident::grid::Grid;
+use crate::ident::parameters::ParameterTables;
+use crate::ident::record::Record;
+
+/// Distance of the rows beyond the measured temperatures, K.
+const REACH_K: f64 = 40.0;
+/// Standard deviation of the activation energy of a cell's resistances, J/mol: that of 15 to 35 kJ/mol, all as likely.
+const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
+/// Gas constant, J/(mol K).
+const GAS_CONSTANT_J_PER_MOL_K: f64 = 8.314_462_618;
+/// 0 degrees C in K.
+const ZERO_CELSIUS_K: f64 = 273.15;
+/// Share of the time at either end of the temperatures that does not count: sensors settle, values stray.
+const STRAY: f64 = 0.005;
+/// Power of Arrhenius' factor by which the rest of the error grows with cold, as between measured temperatures.
+const COLD_POWER: f64 = 0.7;
+
+/// Errors are limited to this, V: an estimate hardly follows such a voltage.
+const MOST_V: f64 = 0.5;
+
+/// Ranges of the data of a fit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredRange {
+    /// Temperatures, degrees C.
+    pub temperature_c: (f64, f64),
+    /// Currents, A.
+    pub current_a: (f64, f64),
+    /// States of charge.
+    pub soc: (f64, f64),
+    /// Root mean square of the current, A.
+    pub rms_a: f64,
+}
+
+impl MeasuredRange {
+    /// The ranges of the judged rows.
+    pub(super) fn of(records: &[Record]) -> Self {
+        let rows = || records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
+        let ends = |(low, high): (f64, f64), x: f64| (low.min(x), high.max(x));
+        let none = (f64::INFINITY, f64::NEG_INFINITY);
+        let mut by_temperature: Vec<(f64, f64)> = rows().map(|row| (row.temperature_c, row.weight_s)).collect();
+        by_temperature.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let seconds: f64 = by_temperature.iter().map(|(_, weight_s)| weight_s).sum();
+        let mut passed_s = 0.0;
+        let inner = by_temperature.iter().filter(|(_, weight_s)| {
+            passed_s += weight_s;
+            (STRAY * seconds..=(1.0 - STRAY) * seconds).contains(&(passed_s - 0.5 * weight_s))
+        });
+        let square: f64 = rows().map(|row| row.weight_s * row.current_a * row.current_a).sum();
+        Self {
+            temperature_c: inner.map(|(temperature_c, _)| *temperature_c).fold(none, ends),
+            current_a: rows().map(|row| row.current_a).fold(none, ends),
+            soc: rows().map(|row| row.soc).fold(none, ends),
+            rms_a: (square / seconds).sqrt(),
+        }
+    }
+}
+
+/// A model's tables in node order.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ModelTables {
+    pub(super) grid: Grid,
+    pub(super) tables: ParameterTables,
+    /// Standard deviation of the error averaged over 100 s, V.
+    pub(super) voltage_error_v: Vec<f64>,
+}
+
+impl ModelTables {
+    /// The fitted tables as they are.
+    pub(super) fn fitted(fitted: &FittedTables, voltage_error_v: &[f64]) -> Self {
+        let (grid, tables) = (fitted.grid.clone(), fitted.tables.clone());
+        Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
+    }
+
+    /// The fitted tables with rows beyond the measured temperatures.
+    pub(super) fn beyond(fitted: &FittedTables, voltage_error_v: &[f64], range: &MeasuredRange) -> Self {
+        let grid = Grid { soc: fitted.grid.soc.clone(), temperature_c: vec![] };
+        let tables = ParameterTables {
+            ocv_v: vec![],
+            r0_ohm: vec![],
+            r_ohm: vec![vec![]; fitted.tables.r_ohm.len()],
+            tau_s: vec![vec![]; fitted.tables.tau_s.len()],
+        };
+        let mut all = Self { grid, tables, voltage_error_v: vec![] };
+        let nodes = &fitted.grid.temperature_c;
+        let last = nodes.len() - 1;
+        let low_c = range.temperature_c.0.min(nodes[0]).floor();
+        let high_c = range.temperature_c.1.max(nodes[last]).ceil();
+        let mut add = |row: usize, from_c: f64, to_c: f64| {
+            all.add_row((fitted, voltage_error_v), (row, from_c, to_c), range.rms_a);
+        };
+        add(0, low_c, low_c - REACH_K);
+        if low_c < nodes[0] {
+            add(0, low_c, low_c);
+        }
+        (0..=last).for_each(|row| add(row, nodes[row], nodes[row]));
+        if high_c > nodes[last] {
+            add(last, high_c, high_c);
+        }
+        add(last, high_c, high_c + REACH_K);
+        all
+    }
+
+    /// Adds the values of a fitted row, which hold at `from_c`, for `to_c`.
+    fn add_row(
+        &mut self,
+        (fitted, voltage_error_v): (&FittedTables, &[f64]),
+        (row, from_c, to_c): (usize, f64, f64),
+        rms_a: f64,
+    ) {
+        let columns = self.grid.soc.len();
+        let nodes = row * columns..(row + 1) * columns;
+        let factor = arrhenius(to_c) / arrhenius(from_c);
+        let per_kelvin = 1.0 / (to_c + ZERO_CELSIUS_K) - 1.0 / (from_c + ZERO_CELSIUS_K);
+        let log_std = (ENERGY_STD_J_PER_MOL / GAS_CONSTANT_J_PER_MOL_K * per_kelvin).abs();
+        self.grid.temperature_c.push(to_c);
+        let ParameterTables { ocv_v, r0_ohm, r_ohm, tau_s } = &fitted.tables;
+        self.tables.ocv_v.extend(&ocv_v[nodes.clone()]);
+        self.tables.r0_ohm.extend(r0_ohm[nodes.clone()].iter().map(|ohm| ohm * factor));
+        for ((to_r, to_tau), (r, tau)) in
+            self.tables.r_ohm.iter_mut().zip(&mut self.tables.tau_s).zip(r_ohm.iter().zip(tau_s))
+        {
+            to_r.extend(r[nodes.clone()].iter().map(|ohm| ohm * factor));
+            to_tau.extend(&tau[nodes.clone()]);
+        }
+        // The heat does not make a model better than it was measured.
+        let colder = factor.max(1.0);
+        self.voltage_error_v.extend(nodes.map(|node| {
+            let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
+            let arrhenius_v = log_std * rms_a * settled_ohm * colder;
+            libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(MOST_V)
+        }));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ident::fit::Residual;
+
+    fn fitted(temperature_c: Vec<f64>) -> FittedTables {
+        let nodes = 2 * temperature_c.len();
+        let tables = ParameterTables {
+            ocv_v: [3.0, 4.2].repeat(temperature_c.len()),
+            r0_ohm: vec![0.03; nodes],
+            r_ohm: vec![vec![0.02; nodes]],
+            tau_s: vec![vec![50.0; nodes]],
+        };
+        let grid = Grid { soc: vec![0.0, 1.0], temperature_c };
+        FittedTables { grid, tables, total: Residual::default(), visits_s: vec![], passes: 1, converged: true }
+    }
+
+    #[test]
+    fn resistances_follow_arrhenius_beyond_the_measured_temperatures_and_the_error_grows() {
+        let range = MeasuredRange { temperature_c: (22.4, 36.1), current_a: (-5.0, 15.0), soc: (0.0, 1.0), rms_a: 2.0 };
+        let all = ModelTables::beyond(&fitted(vec![25.0]), &[0.005; 2], &range);
+        assert_eq!(all.grid.temperature_c, [-18.0, 22.0, 25.0, 37.0, 77.0]);
+        let cold = arrhenius(-18.0) / arrhenius(22.0);
+        assert!((all.tables.r0_ohm[0] - 0.03 * cold).abs() < 1e-12);
+        assert!((all.tables.r_ohm[0][9] - 0.02 * arrhenius(77.0) / arrhenius(37.0)).abs() < 1e-12);
+        assert_eq!(all.tables.r0_ohm[2..8], [0.03; 6], "measured: as fitted");
+        assert_eq!(all.voltage_error_v[2..8], [0.005; 6]);
+        assert!(all.voltage_error_v[0] > 0.03 && all.voltage_error_v[9] > 0.02, "{:?}", all.voltage_error_v);
+        assert_eq!((all.tables.ocv_v.len(), all.tables.tau_s[0].len()), (10, 10));
+    }
+}
