@@ -5,7 +5,7 @@
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the curve at an end moves its SOC by e / slope, and
 //! the capacity by C / swing times that. The errors are those of the curve at some nodes of the SOC, independent of each
-//! other, and linear between nodes. How large they are the model's fit has found on the cell's own measurements.
+//! other, and linear between nodes. How large they are follows from the model's own error, which its fit has found.
 
 use super::CapacityConfig;
 use super::learner::HalfCycle;
@@ -20,6 +20,10 @@ const MIN_WEIGHED_SWING: f64 = 0.02;
 
 /// Model's error where neither model nor configuration states one, V.
 const UNKNOWN_ERROR_V: f64 = 0.005;
+
+/// Part of the model's own error that is the curve's and lasts: the rest, of the currents' history, differs from one half-cycle to
+/// the next.
+const LASTING: f64 = 0.5;
 
 /// Effect of one standard deviation of each error on the capacity by a half-cycle, Ah; zero when its ends are not known.
 pub(super) fn effects_ah(
@@ -37,7 +41,8 @@ pub(super) fn effects_ah(
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        let error_v = config.end_error_v.or_else(|| model.voltage_error_v(&position)).unwrap_or(UNKNOWN_ERROR_V);
+        let own_v = || LASTING * model.voltage_error_v(&position).unwrap_or(UNKNOWN_ERROR_V);
+        let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
         let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();
         let share = along - node as f64;
