@@ -5,7 +5,8 @@
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the curve at an end moves its SOC by e / slope, and
 //! the capacity by C / swing times that. The errors are those of the curve at some nodes of the SOC, independent of each
-//! other, and linear between nodes. How large they are follows from the model's own error, which its fit has found.
+//! other, and linear between nodes. How large they are follows from the model's own error, which its fit has found; for a
+//! model that states none, the considered offset of the voltage stands for its curve as well.
 
 use super::CapacityConfig;
 use super::learner::HalfCycle;
@@ -17,9 +18,6 @@ pub(super) const END_ERRORS: usize = 5;
 
 /// Smallest swing that a half-cycle counts with: below it the measurement has no use.
 const MIN_WEIGHED_SWING: f64 = 0.02;
-
-/// Model's error where neither model nor configuration states one, V.
-const UNKNOWN_ERROR_V: f64 = 0.005;
 
 /// Part of the model's own error that is the curve's and lasts: the rest, of the currents' history, differs from one half-cycle to
 /// the next.
@@ -41,7 +39,7 @@ pub(super) fn effects_ah(
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        let own_v = || LASTING * model.voltage_error_v(&position).unwrap_or(UNKNOWN_ERROR_V);
+        let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| LASTING * error_v);
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
         let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();

@@ -98,27 +98,8 @@ pub(super) fn predict<const N: usize>(
             + square(config.gap.self_discharge_per_s * step.unmeasured_s)
             + square(load_std) / 3.0;
         x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
-        load_branches(x, model, temperature_c, step);
     }
     Ok(())
-}
-
-/// Moves the branches for a load that is there after a gap: it began in the gap, or now. Both are as likely, and every time in
-/// the gap; the branches get the mean and the variance of that.
-fn load_branches<const N: usize>(x: &mut Gaussian<N>, model: &CellModel, temperature_c: f64, step: &CellStep) {
-    let current_a = step.current_a.unwrap_or(0.0);
-    let position = model.grid_position(x.mean[0], temperature_c);
-    let ratio = libm::exp(x.mean[LOG_RESISTANCE]);
-    for i in BRANCHES..N {
-        let branch = BranchAt::new(model, i - BRANCHES, &position, ratio);
-        let (settled_v, taus) = (branch.r_ohm * current_a, step.unmeasured_s / branch.tau_s);
-        // Means of 1 - e^-u and of its square over u = 0 to T / tau.
-        let decayed = -libm::expm1(-taus) / taus;
-        let squared = 1.0 - 2.0 * decayed - 0.5 * libm::expm1(-2.0 * taus) / taus;
-        let mean = 0.5 * settled_v * (1.0 - decayed);
-        x.mean[i] += mean;
-        x.covariance[(i, i)] += (0.5 * square(settled_v) * squared - square(mean)).max(0.0);
-    }
 }
 
 /// The circuit's equations over a time (s), the charge (A s) and the time with the current sensor's offset (s) in it, with

@@ -2,8 +2,7 @@
 
 mod robust;
 
-use super::filter::{Filter, each};
-use super::state_vector::{BRANCHES, UNKNOWN_SOC_VARIANCE};
+use super::state_vector::UNKNOWN_SOC_VARIANCE;
 use super::{CellEstimator, CellStep};
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
@@ -218,36 +217,6 @@ fn the_slowest_branch_is_learned_and_no_longer_mistaken_for_charge() {
     let (ratio, learned) = soc_error_points(&config);
     assert!((ratio.mean - 0.5).abs() < 1.96 * ratio.std(), "{ratio:?}");
     assert!(learned < 0.5 * unlearned, "{learned} {unlearned} points");
-}
-
-#[test]
-fn a_load_found_after_a_gap_began_in_it_or_now() {
-    let (model, config) = (small_model(), config());
-    let branch_after = |current_a: f64, unmeasured_s: f64| {
-        let mut estimator = CellEstimator::new(&config);
-        let mut truth = truth();
-        estimator.step(&model, &config, &truth.step(&model, 0.0, 600.0));
-        let filter = |estimator: &CellEstimator| {
-            let filter = estimator.filter.as_ref().expect("started");
-            each!(filter, x => (x.mean[BRANCHES], x.covariance[(BRANCHES, BRANCHES)]))
-        };
-        let before = filter(&estimator);
-        let step = CellStep { measured_s: 0.0, charge_as: 0.0, unmeasured_s, ..truth.step(&model, current_a, 1e-6) };
-        // A voltage that says nothing leaves what was predicted.
-        let mut deaf = config;
-        deaf.voltage.noise_v = 1e3;
-        estimator.step(&model, &deaf, &step);
-        (before, filter(&estimator))
-    };
-    let settled_v = BranchAt::new(&model, 0, &model.grid_position(0.9, 25.0), 1.0).r_ohm;
-    let ((_, _), (mean, variance)) = branch_after(1.0, 1e6);
-    // Long ago or now, both as likely: half the settled voltage, and as much deviation.
-    assert!((mean / settled_v - 0.5).abs() < 0.02, "{mean} {settled_v}");
-    assert!((variance.sqrt() / settled_v - 0.5).abs() < 0.1, "{variance} {settled_v}");
-    let ((before, _), (mean, _)) = branch_after(1.0, 1e-3);
-    assert!((mean - before).abs() < 1e-4, "too short a gap for a load to show: {mean} {before}");
-    let (_, (mean, _)) = branch_after(0.0, 1e6);
-    assert!(mean.abs() < 1e-6, "{mean}");
 }
 
 #[test]

@@ -186,7 +186,7 @@ section! {
         /// Standard deviation gained in a day of rest, in which some capacity recovers ("swing" only). Without it: 1 % of the rated capacity.
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional
             => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah);
-        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). It is the same in every half-cycle that ends there and never averages out. Without it: half of the model's own error, which its fit has found.
+        /// Error of the cell model's open-circuit curve at the ends of a half-cycle ("swing" only). It is the same in every half-cycle that ends there and never averages out. Without it: half of the model's own error, which its fit has found; 0 where it states none.
         end_error_v: Option<f64>, "V", DEVIATION, Optional;
         /// Standard deviation of the cell model's `ocv_ageing_shift` ("swing" only): uncertainty of how the curve changes with lost capacity. With `[electrodes]` the model states its own.
         ageing_shift_error: f64, "", DEVIATION, Default("0.3") =>;
