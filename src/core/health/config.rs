@@ -37,7 +37,7 @@ pub struct CapacityConfig {
     /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah; at
     /// most one day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = the model's own error there. Not used by
+    /// Lasting error of the open-circuit curve at the ends of a half-cycle, V; `None` = half of the model's own error there. Not used by
     /// `Nominal`.
     pub end_error_v: Option<f64>,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
