@@ -94,7 +94,8 @@ pub(crate) struct StatisticsArgs {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Cell lives")]
 pub(crate) struct LifeArgs {
-    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the files' order
+    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the files' order; charge taken
+    /// at a held voltage after the load counts off
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) cycles: Vec<PathBuf>,
     /// Load at which the table's capacities were measured, A, degrees C, V: 2,24,2.7; the configuration's [usable] when not given

@@ -18,6 +18,11 @@ pub mod record;
 pub mod solve;
 pub mod thermal;
 
+/// A tester holds the voltage where the current is below this part of the load's, and the voltage stands still.
+const HELD_CURRENT: f64 = 0.97;
+/// Largest change of a voltage that is held, V.
+const HELD_VOLTAGE_V: f64 = 0.05;
+
 /// A stretch of rows over which time runs on.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
@@ -59,6 +64,23 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
+    /// Charge, Ah, that a discharge took after the load: the tester held the voltage while the current fell. 0 without such
+    /// an end.
+    pub(crate) fn held_ah(&self) -> f64 {
+        let flowing: Vec<usize> = (0..self.len()).filter(|&row| self.current_a[row] > 0.0).collect();
+        let Some(&last) = flowing.last() else { return 0.0 };
+        let mut currents: Vec<f64> = flowing.iter().map(|&row| self.current_a[row]).collect();
+        currents.sort_by(f64::total_cmp);
+        let load_a = currents[currents.len() / 2];
+        let is_held = |row: usize| {
+            self.current_a[row] < HELD_CURRENT * load_a
+                && (self.voltage_v[row] - self.voltage_v[last]).abs() <= HELD_VOLTAGE_V
+        };
+        let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
+        let charge_ah = charge_ah(&self.time_s[first..=last], &self.current_a[first..=last]);
+        charge_ah.last().copied().unwrap_or(0.0)
+    }
+
     /// Whether it has no rows.
     pub fn is_empty(&self) -> bool {
         self.time_s.is_empty()
@@ -76,4 +98,30 @@ pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
         charges.push(sum);
     }
     charges
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn discharge(rows: &[(f64, f64, f64)]) -> MeasuredPart {
+        let mut part = MeasuredPart { kind: "discharge".into(), ..MeasuredPart::default() };
+        rows.iter().for_each(|&(time_s, current_a, voltage_v)| part.push(time_s, current_a, voltage_v, 25.0, f64::NAN));
+        part
+    }
+
+    #[test]
+    fn the_charge_of_a_held_voltage_is_that_after_the_load() {
+        let load = [(0.0, 3.0, 3.4), (600.0, 3.02, 3.0), (1200.0, 2.98, 2.6), (1800.0, 3.0, 2.5)];
+        assert_eq!(discharge(&load).held_ah(), 0.0);
+        let mut held = load.to_vec();
+        held.extend([(1900.0, 1.8, 2.502), (2260.0, 0.2, 2.498), (2300.0, 0.0, 2.6)]);
+        assert!((discharge(&held).held_ah() - 0.1).abs() < 1e-12, "360 s at 1 A");
+        // A load that varies is not held: its voltage moves.
+        assert_eq!(
+            discharge(&[(0.0, 3.0, 3.4), (600.0, 3.0, 3.2), (1200.0, 1.0, 3.3), (1800.0, 2.0, 3.1)]).held_ah(),
+            0.0
+        );
+        assert_eq!(discharge(&[(0.0, 0.0, 3.4), (600.0, -1.0, 3.5)]).held_ah(), 0.0);
+    }
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
+use super::cycles::CycleTable;
 use super::feed::Feeder;
 use super::life::{LifeRecorder, LifeScore};
 use super::soc::{self, SocSample, SocScore};
@@ -108,7 +109,8 @@ pub(super) fn run(
 ) -> Result<CaseScore, LabError> {
     let begin = CaseStart::find(job, file, case, settings)?;
     let config = configure(job, case, settings, begin.truth)?;
-    let mut run = CaseRun::new(job, settings, config, case.current_offset_a);
+    let cycles = job.cycles.as_ref().map(|table| table.at_load(&file.parts));
+    let mut run = CaseRun::new(job, settings, config, (case.current_offset_a, cycles));
     let (mut done, rows) = (0, file.rows().max(1));
     for (index, part) in file.parts.iter().enumerate().skip(begin.part) {
         let mut seen = case.seed.zip(settings.window).map_or(0..part.len(), |(s, w)| window::rows(part, index, s, w));
@@ -206,6 +208,7 @@ struct CaseRun<'a> {
     settings: &'a ScoreSettings,
     feeder: Feeder,
     current_offset_a: f64,
+    cycles: Option<CycleTable>,
     /// First and latest stamp fed.
     span: Option<(Timestamp, Timestamp)>,
     rows: usize,
@@ -217,12 +220,18 @@ struct CaseRun<'a> {
 }
 
 impl<'a> CaseRun<'a> {
-    fn new(job: &'a ScoreJob, settings: &'a ScoreSettings, config: MonitorConfig, current_offset_a: f64) -> Self {
+    fn new(
+        job: &'a ScoreJob,
+        settings: &'a ScoreSettings,
+        config: MonitorConfig,
+        (current_offset_a, cycles): (f64, Option<CycleTable>),
+    ) -> Self {
         Self {
             job,
             settings,
             feeder: Feeder::new(config, settings.sleep_gap_s),
             current_offset_a,
+            cycles,
             span: None,
             rows: 0,
             left_out: 0,
@@ -236,7 +245,7 @@ impl<'a> CaseRun<'a> {
     /// Feeds the rows `seen` of one part; `report` receives the number of rows fed.
     fn part(&mut self, part: &MeasuredPart, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
         let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
-        let known = self.job.cycles.as_ref().and_then(|table| table.start(&part.key));
+        let known = self.cycles.as_ref().and_then(|table| table.start(&part.key));
         let base = match (known, self.span) {
             (Some(start), _) => start,
             (None, None) => Timestamp::ZERO,
@@ -287,7 +296,7 @@ impl<'a> CaseRun<'a> {
     fn take_events(&mut self) {
         for event in self.feeder.out.events.drain(..) {
             self.resets += usize::from(matches!(event.kind, EventKind::FilterReset { .. }));
-            if let Some(table) = &self.job.cycles {
+            if let Some(table) = &self.cycles {
                 self.life.observe(&event, table);
             }
         }
@@ -300,7 +309,7 @@ impl<'a> CaseRun<'a> {
         }
         let (job, settings, last) = (self.job, self.settings, self.last);
         let soc = (!self.samples.is_empty()).then(|| soc::score(&self.samples, settings.settle_s, self.left_out));
-        let life = job.cycles.as_ref().map(|table| self.life.score(table, settings));
+        let life = self.cycles.as_ref().map(|table| self.life.score(table, settings));
         let plot = settings
             .plots
             .as_deref()

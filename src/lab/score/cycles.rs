@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use crate::io::table::{Table, TableError};
+use crate::measured::MeasuredPart;
 use crate::quantity::Timestamp;
 
 /// A discharge of the table.
@@ -47,6 +48,17 @@ impl CycleTable {
             return Err(file.header().file_fault("no discharge with a capacity_ah_source"));
         }
         Ok(table)
+    }
+
+    /// The table for what a load takes down to its cut-off: less the charge that the tester took afterwards at a held voltage.
+    pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
+        let mut table = self.clone();
+        for part in parts.iter().filter(|part| part.is_discharge()) {
+            let Some(start) = self.start(&part.key) else { continue };
+            let same = table.discharges.iter_mut().filter(|discharge| discharge.start == start);
+            same.for_each(|discharge| discharge.capacity_ah = discharge.capacity_ah.map(|ah| ah - part.held_ah()));
+        }
+        table
     }
 
     /// When the part with this key began; `None` = not in the table.

@@ -13,7 +13,7 @@ use crate::quantity::Mode;
 pub struct DischargeScore {
     /// Counted from 1.
     pub number: usize,
-    /// Published capacity, Ah; `None` = not stated.
+    /// Published capacity down to the load's cut-off, Ah; `None` = not stated.
     pub truth_ah: Option<f64>,
     /// Usable capacity at the configured load, Ah.
     pub usable_ah: f64,

@@ -56,8 +56,9 @@ impl CellEstimator {
         if self.filter.is_none() {
             self.start(model, config, step);
         } else if let Some(filter) = &mut self.filter {
-            let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-            each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
+            let capacity_ah = each!(&*filter, x => x.mean[CAPACITY]);
+            let gap_std = self.memory.note_gap(config, step, capacity_ah);
+            each!(filter, x => predict(x, model, config, step, temperature_c, gap_std))?;
         }
         self.memory.update_load(model, config, step);
         self.memory.information_s += self.memory.new_information_s(config, step);

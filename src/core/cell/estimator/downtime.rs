@@ -38,11 +38,20 @@ pub(super) fn update_after_downtime<const N: usize>(
 ) -> Result<Update, FilterError> {
     let before_soc = x.mean[0];
     let mut used = used_prior(x, config, downtime_std);
+    // The load of the reading may have begun at any time: its branches are anywhere between relaxed and settled.
+    let position = model.grid_position_at(&reading.temperature, before_soc);
+    let settled_v = reading.current_a * libm::exp(x.mean[LOG_RESISTANCE]);
+    for i in BRANCHES..N {
+        let most_v = settled_v * model.branch_r_ohm(i - BRANCHES, &position);
+        used.mean[i] = 0.5 * most_v;
+        used.covariance[(i, i)] += square(most_v) / 12.0;
+    }
     // Predicted variance of the voltage for a prior that wide; the copy is discarded.
     let predicted = update(&mut used.clone(), model, config, reading)?.0.innovation_variance;
     let drop_v = reading.current_a
         * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc))
-        * libm::exp(x.mean[LOG_RESISTANCE]);
+        * libm::exp(x.mean[LOG_RESISTANCE])
+        + used.mean.rows(BRANCHES, N - BRANCHES).sum();
     let reach = 3.0_f64.sqrt() * downtime_std;
     let soc = model.soc_of_aged_ocv(&reading.temperature, reading.curve.mean, reading.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.

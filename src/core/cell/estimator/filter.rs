@@ -13,9 +13,6 @@ use crate::cell::circuit::{self, BranchAt};
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::filter::{CONSTANT_ERRORS, FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
 
-/// Largest standard deviation that a load through a gap adds to the SOC, fraction.
-const MAX_GAP_LOAD_STD: f64 = 0.3;
-
 /// One filter per number of branches: N = branches + 3.
 #[derive(Debug, Clone)]
 pub(super) enum Filter {
@@ -72,7 +69,8 @@ fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
     SigmaPointWeights::new(N, config.points.alpha, config.points.beta, config.points.kappa)
 }
 
-/// Predicts over the measured and the unmeasured time of a step.
+/// Predicts over the measured and the unmeasured time of a step; `gap_std` is the deviation of the SOC that use in the
+/// unmeasured time adds, fraction.
 #[inline]
 pub(super) fn predict<const N: usize>(
     x: &mut Gaussian<N>,
@@ -80,7 +78,7 @@ pub(super) fn predict<const N: usize>(
     config: &EstimatorConfig,
     step: &CellStep,
     temperature_c: f64,
-    gap_load_a: f64,
+    gap_std: f64,
 ) -> Result<(), FilterError> {
     if step.measured_s > 0.0 || step.charge_as != 0.0 {
         let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[CAPACITY]);
@@ -90,13 +88,10 @@ pub(super) fn predict<const N: usize>(
         x.covariance[(0, 0)] += variance;
     }
     if step.unmeasured_s > 0.0 {
-        // The current of that time is unknown: 0 is assumed, but a load next to the gap may have continued through it.
         propagate(x, model, config, temperature_c, (step.unmeasured_s, 0.0, 0.0))?;
-        let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[CAPACITY]);
-        let load_std = if gap_load_a > config.gap.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
         let variance = square(config.gap.noise_per_sqrt_s) * step.unmeasured_s
             + square(config.gap.self_discharge_per_s * step.unmeasured_s)
-            + square(load_std) / 3.0;
+            + square(gap_std);
         x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
     }
     Ok(())

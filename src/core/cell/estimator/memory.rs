@@ -121,6 +121,23 @@ impl Memory {
         REST_REPEATS_S * libm::log((REST_REPEATS_S + self.rest_s) / (REST_REPEATS_S + before_s))
     }
 
+    /// Notes what may have been used in a step's unmeasured time, up to the charge that a load next to it, continued, or a
+    /// charger moves. So much that it counts as downtime is left to the next voltage; else returns the deviation of the SOC.
+    pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
+        if step.unmeasured_s <= 0.0 {
+            return 0.0;
+        }
+        let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+        let load_a = if adjacent_a > config.gap.rest_current_a { adjacent_a } else { 0.0 };
+        let most_per_s = (load_a / (3600.0 * capacity_ah)).max(config.gap.away_use_per_s);
+        let std = most_per_s * step.unmeasured_s / 3.0_f64.sqrt();
+        if std <= NEGLIGIBLE_STD {
+            return std;
+        }
+        self.downtime_std = (self.downtime_std + std).min(1.0);
+        0.0
+    }
+
     /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
     #[inline]
     pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
