@@ -7,7 +7,7 @@ use nalgebra::{SMatrix, SVector};
 
 use super::downtime::update_after_downtime;
 use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
-use super::memory::Memory;
+use super::memory::{Memory, USED_PRIOR};
 use super::noise::VoltageReading;
 use super::state_vector::{
     BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
@@ -84,10 +84,11 @@ impl CellEstimator {
         let (update, effects_v) = match downtime_std {
             None => each!(filter, x => update(x, model, config, &reading))?,
             Some(std) => {
-                (each!(filter, x => update_after_downtime(x, model, config, &reading, std))?, SVector::zeros())
+                let downtime = (std, self.memory.used_prior);
+                (each!(filter, x => update_after_downtime(x, model, config, &reading, downtime))?, SVector::zeros())
             }
         };
-        (self.memory.downtime_std, self.memory.is_unseen) = (0.0, false);
+        self.memory.end_downtime();
         if update.accepted {
             self.memory.note_offset(effects_v[CURRENT_OFFSET], &update);
             self.memory.slow_branch.note(effects_v[SLOW_BRANCH], &update);
@@ -125,7 +126,8 @@ impl CellEstimator {
         });
         // Trust returns through the window, not by a restart.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
-        (self.memory.information_s, self.memory.downtime_std) = (config.voltage.max_information_s, 0.0);
+        self.memory.information_s = config.voltage.max_information_s;
+        (self.memory.downtime_std, self.memory.used_prior) = (0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
     }
 
@@ -149,7 +151,8 @@ impl CellEstimator {
 
     /// Handles a gap of unknown length: the SOC becomes unknown, the branches may have relaxed.
     pub fn handle_unknown_gap(&mut self) {
-        (self.memory.rest_s, self.memory.downtime_std, self.memory.is_unseen) = (0.0, 0.0, true);
+        self.memory.end_downtime();
+        (self.memory.rest_s, self.memory.is_unseen) = (0.0, true);
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
@@ -311,8 +314,7 @@ impl CellEstimator {
 
     /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
-        let most = config.gap.away_use_per_s * downtime_s;
-        self.memory.downtime_std = (self.memory.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
+        self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);
     }
 }
 

@@ -25,16 +25,13 @@ use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::filter::{FilterError, Gaussian, Update};
 
-/// Prior probability that the cell was used during downtime.
-const USED_PRIOR: f64 = 0.2;
-
 /// Updates with the first reading after a downtime.
 pub(super) fn update_after_downtime<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
     config: &EstimatorConfig,
     reading: &VoltageReading,
-    downtime_std: f64,
+    (downtime_std, used_probability): (f64, f64),
 ) -> Result<Update, FilterError> {
     let before_soc = x.mean[0];
     let mut used = used_prior(x, config, downtime_std);
@@ -60,7 +57,7 @@ pub(super) fn update_after_downtime<const N: usize>(
     let (by_left_alone, _) = update(x, model, config, reading)?;
     let log_likelihood = |variance: f64| -0.5 * (libm::log(variance) + square(by_left_alone.innovation) / variance);
     let odds = libm::exp(log_likelihood(by_left_alone.innovation_variance) - log_likelihood(predicted));
-    let weight = USED_PRIOR / (USED_PRIOR + (1.0 - USED_PRIOR) * odds);
+    let weight = used_probability / (used_probability + (1.0 - used_probability) * odds);
     merge(x, &used, weight);
     Ok(if weight > 0.5 { by_used } else { by_left_alone })
 }

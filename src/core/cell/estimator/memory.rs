@@ -24,6 +24,13 @@ const MIN_REJECTED: u32 = 3;
 /// Consecutive readings beyond the gate before a restart when the first one follows a gap: the record is incomplete.
 const MIN_REJECTED_AFTER_GAP: u32 = 2;
 
+/// Prior probability that a cell was used while the program did not run, or in a gap with a load next to it.
+pub(super) const USED_PRIOR: f64 = 0.2;
+
+/// A gap with rest on both sides has that prior when it lasts half a day, and in proportion before, s: a bus in use wakes its
+/// listeners, but a charger need not.
+const USED_PRIOR_AFTER_S: f64 = 43_200.0;
+
 /// Deviation of the SOC below which downtime is ignored, fraction.
 const NEGLIGIBLE_STD: f64 = 0.002;
 
@@ -61,6 +68,9 @@ pub(super) struct Memory {
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
     #[serde(default, rename = "away_std")]
     pub(super) downtime_std: f64,
+    /// Probability that the cell was used in that time.
+    #[serde(default)]
+    pub(super) used_prior: f64,
     /// No voltage has been used since the last sleep or unknown gap.
     #[serde(default)]
     pub(super) is_unseen: bool,
@@ -90,6 +100,7 @@ impl Memory {
             offset_score: 0.0,
             slow_branch: SlowBranch::default(),
             downtime_std: 0.0,
+            used_prior: 0.0,
             is_unseen: false,
             rejected: 0,
             rejected_s: 0.0,
@@ -121,21 +132,34 @@ impl Memory {
         REST_REPEATS_S * libm::log((REST_REPEATS_S + self.rest_s) / (REST_REPEATS_S + before_s))
     }
 
-    /// Notes what may have been used in a step's unmeasured time, up to the charge that a load next to it, continued, or a
-    /// charger moves. So much that it counts as downtime is left to the next voltage; else returns the deviation of the SOC.
+    /// Notes a downtime in which the cell was used with probability `used`, by a charge of up to `most`, fraction of SOC.
+    pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
+        self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
+        self.used_prior = 1.0 - (1.0 - self.used_prior) * (1.0 - used);
+    }
+
+    /// Notes the unmeasured time of a step: a load next to it may have continued, or a charger come. What counts as downtime
+    /// is left to the next voltage; for a short load returns the deviation of the SOC, fraction.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         if step.unmeasured_s <= 0.0 {
             return 0.0;
         }
-        let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-        let load_a = if adjacent_a > config.gap.rest_current_a { adjacent_a } else { 0.0 };
-        let most_per_s = (load_a / (3600.0 * capacity_ah)).max(config.gap.away_use_per_s);
-        let std = most_per_s * step.unmeasured_s / 3.0_f64.sqrt();
-        if std <= NEGLIGIBLE_STD {
-            return std;
+        let adjacent_a = self.adjacent_a(step);
+        let is_loaded = adjacent_a > config.gap.rest_current_a;
+        let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
+        let most = load_per_s.max(config.gap.away_use_per_s) * step.unmeasured_s;
+        let std = most / 3.0_f64.sqrt();
+        if std > NEGLIGIBLE_STD {
+            let unused_at_rest = libm::pow(1.0 - USED_PRIOR, step.unmeasured_s / USED_PRIOR_AFTER_S);
+            self.note_downtime(most, if is_loaded { USED_PRIOR } else { 1.0 - unused_at_rest });
+            return 0.0;
         }
-        self.downtime_std = (self.downtime_std + std).min(1.0);
-        0.0
+        if is_loaded { std } else { 0.0 }
+    }
+
+    /// Largest current next to the unmeasured time of a step, A.
+    fn adjacent_a(&self, step: &CellStep) -> f64 {
+        self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
     /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
@@ -148,7 +172,7 @@ impl Memory {
         }
         if step.unmeasured_s > 0.0 {
             self.load_a *= keep(step.unmeasured_s);
-            let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            let adjacent_a = self.adjacent_a(step);
             if adjacent_a > config.gap.rest_current_a {
                 self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
             }
@@ -159,6 +183,12 @@ impl Memory {
     #[inline]
     pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
+    }
+
+    /// A voltage has been used: it has decided what happened.
+    #[inline]
+    pub(super) fn end_downtime(&mut self) {
+        (self.downtime_std, self.used_prior, self.is_unseen) = (0.0, 0.0, false);
     }
 
     /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
@@ -227,6 +257,12 @@ impl Memory {
         InvalidState::unless_numbers("a cell's last temperature or current, or its offset", signed)?;
         InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;
         self.slow_branch.check()?;
+        InvalidState::unless(
+            (0.0..=1.0).contains(&self.used_prior),
+            "the probability of use in a gap",
+            self.used_prior,
+            "0 to 1",
+        )?;
         let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
         InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }

@@ -104,7 +104,7 @@ impl StepInput<WIDTH> {
     ) {
         cell.memory.last_current_a = self.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
-        (cell.memory.downtime_std, cell.memory.is_unseen) = (0.0, false);
+        cell.memory.end_downtime();
         let update = Update {
             innovation: outcome.innovation_v.0[from],
             innovation_variance: outcome.innovation_variance.0[from],
