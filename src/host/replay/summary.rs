@@ -73,6 +73,7 @@ pub(super) fn note_event(
             usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
             "capacity"
         }
+        EventKind::LossModes { .. } => "loss_modes",
         EventKind::RemainingLife { .. } => "remaining_life",
         EventKind::RechargePeriod { .. } => "recharge_period",
         EventKind::Alarm { change, .. } => {

@@ -4,12 +4,13 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
-    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
+    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
+use crate::cell::LossModes;
 use crate::control::answer;
 use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
@@ -32,7 +33,8 @@ pub struct RecentEvents(VecDeque<Event>);
 impl RecentEvents {
     /// Notes an event.
     pub fn note(&mut self, event: &Event) {
-        if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. }) {
+        if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::LossModes { .. })
+        {
             return;
         }
         if self.0.len() == MAX_EVENTS {
@@ -196,6 +198,21 @@ fn remaining(life: Option<RemainingLife>) -> RemainingStatus {
     }
 }
 
+/// What a cell has lost, as far as it is known.
+fn losses(losses: Option<LossModes>) -> LossStatus {
+    let losses = losses.as_ref();
+    let [lithium, negative, positive] =
+        [losses.map(|it| &it.lithium), losses.map(|it| &it.negative), losses.map(|it| &it.positive)];
+    LossStatus {
+        lli: mean(lithium),
+        lli_std: std(lithium),
+        lam_ne: mean(negative),
+        lam_ne_std: std(negative),
+        lam_pe: mean(positive),
+        lam_pe_std: std(positive),
+    }
+}
+
 fn pack(monitor: &Monitor) -> PackStatus {
     let view = monitor.pack_view();
     let soc = view.soc.as_ref();
@@ -217,6 +234,7 @@ fn pack(monitor: &Monitor) -> PackStatus {
         capacity_ah: mean(weakest.map(|(_, capacity)| capacity)),
         capacity_std_ah: std(weakest.map(|(_, capacity)| capacity)),
         soh: view.soh.and_then(finite),
+        losses: losses(weakest.and_then(|&(cell, _)| monitor.loss_modes(cell))),
         shortest_lived_cell: view.remaining_life.map(|(cell, _)| cell.0),
         remaining: remaining(view.remaining_life.map(|(_, life)| life)),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
@@ -239,6 +257,7 @@ fn cell(view: CellView) -> CellStatus {
         soc_std: std(view.soc.as_ref()),
         capacity_ah: mean(view.capacity.as_ref()),
         capacity_std_ah: std(view.capacity.as_ref()),
+        losses: losses(view.losses),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
         remaining: remaining(view.remaining_life.ok()),

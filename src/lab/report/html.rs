@@ -36,9 +36,10 @@ const SECTIONS: [Section; 7] = [
     Section {
         id: "capacity",
         title: "Capacity",
-        pictures: &["capacity", "usable_capacity"],
+        pictures: &["capacity", "usable_capacity", "losses"],
         note: "Capacity is the charge between the full and the empty cell at rest; usable capacity is what can be taken out at \
-               a load, and also falls when resistance rises. A pack is as good as its weakest cell.",
+               a load, and also falls when resistance rises. A pack is as good as its weakest cell. How a loss of capacity divides \
+               into lithium and active material is mostly an assumption, which its interval includes.",
         none: |_| "unknown: no charge or discharge has measured the capacity yet",
     },
     Section {
