@@ -86,6 +86,27 @@ mod tests {
         }
     }
 
+    /// Lives of such a cell simulated with PyBaMM 26.10 (OKane2022): capacity left, LLI, LAM_NE, LAM_PE. The first five lose
+    /// lithium to the SEI and material by stress, the last one loses lithium alone.
+    const SIMULATED: [[f64; 4]; 6] = [
+        [0.9365, 0.0496, 0.0214, 0.0100],
+        [0.8723, 0.0985, 0.0440, 0.0233],
+        [0.8263, 0.1353, 0.0749, 0.0388],
+        [0.7850, 0.1687, 0.1060, 0.0536],
+        [0.7341, 0.2119, 0.1621, 0.0781],
+        [0.8768, 0.0880, 0.0, 0.0],
+    ];
+
+    #[test]
+    fn simulated_losses_lie_within_the_intervals() {
+        for [part, lithium, negative, positive] in SIMULATED {
+            let found = losses(ScalarGaussian::from_std(part * NEW_AH, 0.005 * NEW_AH)).expect("known");
+            for (mode, truth) in [(found.lithium, lithium), (found.negative, negative), (found.positive, positive)] {
+                assert!((mode.mean - truth).abs() < 1.96 * mode.std(), "{part}: {truth} {mode:?}");
+            }
+        }
+    }
+
     #[test]
     fn an_uncertain_capacity_widens_every_loss() {
         let [sure, vague] = [0.0, 0.2].map(|std_ah| losses(ScalarGaussian::from_std(4.0, std_ah)).expect("known"));

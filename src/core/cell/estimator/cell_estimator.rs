@@ -56,7 +56,7 @@ impl CellEstimator {
         if self.filter.is_none() {
             self.start(model, config, step);
         } else if let Some(filter) = &mut self.filter {
-            let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            let gap_load_a = self.memory.gap_load_a(config, step);
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
         }
         self.memory.update_load(model, config, step);

@@ -18,6 +18,9 @@ pub(super) const REST_REPEATS_S: f64 = 1000.0;
 /// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
+/// A step with more unmeasured time than this had neither a current nor a voltage: the bus was silent, s.
+const SILENCE_S: f64 = 5.0;
+
 /// Consecutive readings beyond the gate before the filter may restart: one or two can be glitches.
 const MIN_REJECTED: u32 = 3;
 
@@ -121,6 +124,15 @@ impl Memory {
         REST_REPEATS_S * libm::log((REST_REPEATS_S + self.rest_s) / (REST_REPEATS_S + before_s))
     }
 
+    /// The load next to a step's gap, A: it may have continued through the gap. 0 where a silent bus means rest.
+    #[inline]
+    pub(super) fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
+        if config.gap.silence_is_rest && step.unmeasured_s > SILENCE_S {
+            return 0.0;
+        }
+        self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
+    }
+
     /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
     #[inline]
     pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
@@ -131,7 +143,7 @@ impl Memory {
         }
         if step.unmeasured_s > 0.0 {
             self.load_a *= keep(step.unmeasured_s);
-            let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            let adjacent_a = self.gap_load_a(config, step);
             if adjacent_a > config.gap.rest_current_a {
                 self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
             }
