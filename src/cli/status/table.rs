@@ -64,6 +64,10 @@ fn pack(text: &mut String, document: &StatusDocument) {
         shown(pack.recharge_period_s, 0, " s"),
         with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
     );
+    if pack.current_offset_a.is_some() {
+        let offset = with_std(pack.current_offset_a, pack.current_offset_std_a, 3, " A");
+        let _ = writeln!(text, "offset     current sensor {offset} (reading less true current)");
+    }
     let _ = writeln!(text, "losses     {}", losses(&pack.losses));
     let _ = writeln!(text, "life       {}", remaining(pack));
 }

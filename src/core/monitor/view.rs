@@ -172,6 +172,15 @@ impl Monitor {
         has_learned.then(|| learning.capacity(cell.index())).and_then(|it| estimation.bank.model().loss_modes(it))
     }
 
+    /// Offset of the current sensor, A of the pack: what it reads less the true current, positive = discharge. `None` =
+    /// nothing learned yet.
+    pub fn current_offset(&self) -> Option<ScalarGaussian> {
+        let Stages { sampling, learning, .. } = &self.stages;
+        let strings = f64::from(sampling.sampler.config().strings);
+        let of_cell = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a)?;
+        Some(ScalarGaussian { mean: strings * of_cell.mean, variance: strings * strings * of_cell.variance })
+    }
+
     /// Remaining life of a cell until its capacity passes the configured end of life.
     ///
     /// # Errors

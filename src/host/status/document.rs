@@ -113,6 +113,12 @@ pub struct PackStatus {
     pub voltage_v: Option<f64>,
     /// Current, positive = discharge.
     pub current_a: Option<f64>,
+    /// Learned offset of the current sensor: what it reads less the true current, positive = discharge.
+    #[serde(default)]
+    pub current_offset_a: Option<f64>,
+    /// Its standard deviation.
+    #[serde(default)]
+    pub current_offset_std_a: Option<f64>,
     /// Highest temperature, while all sensors are fresh.
     pub temperature_max_c: Option<f64>,
     /// The cell with the least capacity, once the capacity of every cell was learned.

@@ -229,6 +229,18 @@ fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
         ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
         ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
+        (
+            "pack_current_offset",
+            "amperes",
+            "Learned offset of the current sensor, reading less true current",
+            pack.current_offset_a,
+        ),
+        (
+            "pack_current_offset_std",
+            "amperes",
+            "Standard deviation of the current sensor's offset",
+            pack.current_offset_std_a,
+        ),
         ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),

@@ -94,6 +94,8 @@ pub struct Data {
     /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
+    /// Offset of the current sensor, A: mean and standard deviation.
+    pub(super) current_offset: Option<(f64, f64)>,
     first_s: f64,
     last_s: f64,
 }
@@ -109,6 +111,7 @@ impl Data {
             alarms: Vec::new(),
             incidents: Vec::new(),
             trace: Trace::default(),
+            current_offset: None,
             first_s: f64::INFINITY,
             last_s: f64::NEG_INFINITY,
         }
@@ -130,6 +133,11 @@ impl Data {
     /// Sets why the data may be wrong: a sentence without its full stop.
     pub fn doubt(&mut self, why: String) {
         self.source.doubt = Some(why);
+    }
+
+    /// Sets the learned offset of the current sensor, A: what it reads less the true current, and the standard deviation.
+    pub fn set_current_offset(&mut self, offset: Option<(f64, f64)>) {
+        self.current_offset = offset;
     }
 
     /// Adds a row of a store.

@@ -305,6 +305,9 @@ fn estimator(data: &Data) -> Markup {
             ("Least covered cell".to_owned(), format!("cell {}: {:.1} %", cell + 1, 100.0 * share))
         }),
     );
+    rows.extend(data.current_offset.map(|(mean, std)| {
+        ("Offset of the current sensor: reading less true current".to_owned(), format!("{mean:+.3} \u{b1} {std:.3} A"))
+    }));
     pairs(&rows)
 }
 

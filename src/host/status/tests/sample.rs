@@ -99,6 +99,8 @@ fn pack(cells: u16) -> PackStatus {
         limiting_cell: Some(0),
         voltage_v: Some(3.65 * f64::from(cells)),
         current_a: Some(12.5),
+        current_offset_a: Some(-0.034),
+        current_offset_std_a: Some(0.011),
         temperature_max_c: Some(31.25),
         weakest_cell: Some(0),
         capacity_ah: Some(2.412),
