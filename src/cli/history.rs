@@ -40,7 +40,7 @@ pub(crate) struct Args {
 enum HistoryCommand {
     /// Write rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over capacities, remaining lives, alarms and resets; names the first row that was changed
+    /// Check the hash chain over capacities, loss modes, remaining lives, alarms and resets; names the first row that was changed
     Verify(VerifyArgs),
 }
 
@@ -78,9 +78,10 @@ struct RowArgs {
 }
 
 /// Kinds of rows by name.
-const KINDS: [NamedValue<HistoryTable>; 5] = [
+const KINDS: [NamedValue<HistoryTable>; 6] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
+    ("loss-modes", HistoryTable::LossModes, "Lithium and active material that cells have lost"),
     ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell whose life ends first"),
     ("alarm", HistoryTable::Alarm, "Alarms"),
     ("reset", HistoryTable::Reset, "Resets, other packs, damages"),
@@ -149,6 +150,10 @@ fn describe(entry: &HistoryEntry) -> String {
         HistoryTable::Capacity => {
             "{capacity_ah:3} +/- {capacity_std_ah:3} Ah, usable {usable_capacity_ah:3} +/- {usable_capacity_std_ah:3} Ah, \
              resistance {resistance_ratio:2} +/- {resistance_ratio_std:2}, measured {measured_ah:3} +/- {measured_std_ah:3} Ah"
+        }
+        HistoryTable::LossModes => {
+            "lithium {lli%1} +/- {lli_std%1} %, negative electrode {lam_ne%1} +/- {lam_ne_std%1} %, positive electrode \
+             {lam_pe%1} +/- {lam_pe_std%1} %"
         }
         HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known",
         HistoryTable::RemainingLife => {

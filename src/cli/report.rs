@@ -129,7 +129,8 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
     bar.clear();
     let (summary, _) = result.map_err(failure)?;
     // The replay has ended and with it the closure that shared the data.
-    let data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
+    let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
+    data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));
     Ok((data, provenance(args, &summary)))
 }
 

@@ -156,6 +156,8 @@ impl SensorIndex {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {
+    /// State of the pack's contactors: open ones mean no current.
+    Contactor,
     /// Pack current, A, positive = discharge after the configured sign.
     Current,
     /// A temperature sensor, degrees C.

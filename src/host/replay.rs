@@ -417,6 +417,9 @@ impl Replay {
         let (span, mut summary) = (self.span, self.summary);
         summary.log = counts.clone();
         summary.cells = cells::summaries(&self.monitor, &self.usable);
+        let offset = self.monitor.current_offset();
+        summary.current_offset_a = offset.map(|offset| offset.mean);
+        summary.current_offset_std_a = offset.map(|offset| offset.std());
         (summary.protected, summary.dropped) = intake::summaries(&self.monitor, &self.settings.interfaces);
         summary.first_s = span.first.map(Timestamp::secs);
         summary.last_s = span.latest.map(Timestamp::secs);

@@ -15,6 +15,7 @@ mod alarm_tradeoff;
 mod can_data;
 mod capacity_peers;
 mod check_cli;
+mod contactor;
 mod dbc_vectors;
 mod doctor;
 mod e2e_peer;

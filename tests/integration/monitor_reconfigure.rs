@@ -173,7 +173,7 @@ fn counters_of_the_frames_go_on_and_a_shorter_period_begins_now() {
     assert_eq!(status.len(), 40);
     assert!(status.windows(2).all(|pair| pair[1] == (pair[0] + 1) % 15), "{status:?}");
     let health = rig.frames_of(0x6B1);
-    assert!((12..=16).contains(&health.len()), "four pages at the start, and four a second: {health:?}");
+    assert!((15..=20).contains(&health.len()), "five pages at the start, and five a second: {health:?}");
     assert!(health.windows(2).all(|pair| pair[1] == (pair[0] + 1) % 15), "{health:?}");
     rig.frames.clear();
     rig.reload(|config| config.output = None).unwrap();

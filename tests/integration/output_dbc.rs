@@ -156,6 +156,7 @@ impl Maker {
         let (period, normalised) = (self.below(60_000.0), self.below(60_000.0));
         let (usable, usable_std, ratio) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(4.0));
         let (cycles, cycles_low, days) = (self.below(60_000.0), self.below(60_000.0), self.below(8_000.0));
+        let losses = [(); 3].map(|()| [self.below(1.0), self.below(0.3)]);
         let fields = HealthFields {
             capacity_ah: Some(capacity),
             capacity_std_ah: Some(std),
@@ -168,6 +169,9 @@ impl Maker {
             remaining_cycles: Some(cycles),
             remaining_cycles_low: Some(cycles_low),
             remaining_days: Some(days),
+            lli: losses[0].map(Some),
+            lam_ne: losses[1].map(Some),
+            lam_pe: losses[2].map(Some),
         };
         let mut wanted = match page {
             0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
@@ -175,6 +179,17 @@ impl Maker {
             2 => self.wanted(
                 "Health",
                 &[("UsableCapacity", usable), ("UsableCapacityStd", usable_std), ("ResistanceRatio", 100.0 * ratio)],
+            ),
+            4 => self.wanted(
+                "Health",
+                &[
+                    ("Lli", 100.0 * losses[0][0]),
+                    ("LliStd", 100.0 * losses[0][1]),
+                    ("LamNe", 100.0 * losses[1][0]),
+                    ("LamNeStd", 100.0 * losses[1][1]),
+                    ("LamPe", 100.0 * losses[2][0]),
+                    ("LamPeStd", 100.0 * losses[2][1]),
+                ],
             ),
             _ => self.wanted(
                 "Health",

@@ -24,6 +24,7 @@ fn config() -> SampleConfig {
         temperature: limits(-40.0, 85.0),
         reported_soc: None,
         reported_soh: None,
+        contactor: None,
         sensor_of_cell: vec![Some(SensorIndex(0))],
         ambient_c: 24.0,
     }

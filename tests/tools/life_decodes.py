@@ -20,6 +20,7 @@ MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
 MAX_TOLD = 20
+LOSS_SIGNALS = ("Lli", "LliStd", "LamNe", "LamNeStd", "LamPe", "LamPeStd")
 
 
 class Reader:
@@ -73,6 +74,7 @@ class Life:
         self.recharge = None  # the last reported
         self.normalised = None
         self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
+        self.losses = {}  # cell: signals of its loss modes
         self.moved = set()  # cells whose state a change of mode has moved since their last row
 
     def take_estimate(self, row):
@@ -106,6 +108,12 @@ class Life:
                 self.usable[cell] = event["usable_capacity_ah"], event["usable_capacity_std_ah"]
             if event["measured_ah"] is not None:
                 self.learned.add(cell)
+        elif kind == "loss_modes":
+            self.losses[event["cell"]] = {
+                signal + end: 100 * event[key + end_key]
+                for signal, key in (("Lli", "lli"), ("LamNe", "lam_ne"), ("LamPe", "lam_pe"))
+                for end, end_key in (("", ""), ("Std", "_std"))
+            }
         elif kind == "remaining_life":
             self.life = {"RemainingCycles": event["cycles"], "RemainingCyclesLow": event["cycles_low"],
                          "RemainingDays": event["days"]}
@@ -150,6 +158,8 @@ class Life:
             known = {"Capacity": ah, "CapacityStd": std, "Soh": 100 * ah / self.rated_ah, "UsableCapacity": usable,
                      "UsableCapacityStd": usable_std, "ResistanceRatio": 100 * ratio,
                      "NormalizedRechargePeriod": self.normalised}
+        weakest = min(self.capacity, key=self.capacity.get) if len(self.learned) >= self.cells else None
+        known |= self.losses.get(weakest, dict.fromkeys(LOSS_SIGNALS))
         known |= self.life if len(self.learned) >= self.cells else dict.fromkeys(self.life)
         return known | {"RechargePeriod": self.recharge}
 

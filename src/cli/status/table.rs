@@ -8,7 +8,7 @@ use crate::cli::alarms::{cell as cell_name, with_unit};
 use crate::cli::output;
 use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
-use crate::status::document::{CellStatus, PackStatus, StatusDocument};
+use crate::status::document::{CellStatus, LossStatus, PackStatus, StatusDocument};
 
 /// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;
@@ -64,7 +64,26 @@ fn pack(text: &mut String, document: &StatusDocument) {
         shown(pack.recharge_period_s, 0, " s"),
         with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
     );
+    if pack.current_offset_a.is_some() {
+        let offset = with_std(pack.current_offset_a, pack.current_offset_std_a, 3, " A");
+        let _ = writeln!(text, "offset     current sensor {offset} (reading less true current)");
+    }
+    let _ = writeln!(text, "losses     {}", losses(&pack.losses));
     let _ = writeln!(text, "life       {}", remaining(pack));
+}
+
+/// What the weakest cell has lost.
+fn losses(losses: &LossStatus) -> String {
+    if losses.lli.is_none() {
+        return "not known".to_owned();
+    }
+    let part = |mean: Option<f64>, std: Option<f64>| with_std(mean.map(|m| 100.0 * m), std.map(|s| 100.0 * s), 1, " %");
+    format!(
+        "lithium {}, negative electrode {}, positive electrode {}",
+        part(losses.lli, losses.lli_std),
+        part(losses.lam_ne, losses.lam_ne_std),
+        part(losses.lam_pe, losses.lam_pe_std),
+    )
 }
 
 /// The remaining life of the cell whose life ends first.

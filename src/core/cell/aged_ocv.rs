@@ -41,6 +41,9 @@ pub struct AgedOcv {
     offset_v: Vec<Vec<f64>>,
     /// Change of the offsets by one standard deviation of each mix, V, likewise; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
+    /// Lithium lost, part of the new cell's, and its change by one standard deviation of each mix, per capacity; empty = no
+    /// electrodes.
+    lithium: Vec<Vec<f64>>,
     is_shift: bool,
 }
 
@@ -69,6 +72,19 @@ pub struct OffsetLine {
     pub mixes_v: [SocLine; MIXES],
 }
 
+/// Lithium lost at one capacity, parts of the new cell's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LithiumLoss {
+    /// Lost.
+    pub lost: f64,
+    /// Its change with the capacity, per Ah.
+    pub per_ah: f64,
+    /// Its change by one standard deviation of each mix.
+    pub mixes: [f64; MIXES],
+    /// The changes of these with the capacity, per Ah.
+    pub mixes_per_ah: [f64; MIXES],
+}
+
 impl AgedOcv {
     /// By the electrodes of the new cell; `None` when they do not say how it ages down to [`LEAST_KNOWN`]. `rows` are the new
     /// cell's open-circuit voltages, V, by temperature.
@@ -78,10 +94,12 @@ impl AgedOcv {
         new_capacity_ah: f64,
         rows: &[Vec<f64>],
     ) -> Option<Self> {
+        // The offsets, and behind them the lithium lost.
         let curve = |negative: f64, positive: f64, part: f64| {
             let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
             let aged = electrodes.aged(lost, part)?;
-            Some(soc.iter().map(|&z| aged.voltage_v(z) - electrodes.voltage_v(z)).collect::<Vec<f64>>())
+            let offset_v = soc.iter().map(|&z| aged.voltage_v(z) - electrodes.voltage_v(z));
+            Some(offset_v.chain([aged.lithium_lost()]).collect::<Vec<f64>>())
         };
         let (low, high) = (MATERIAL_SHARE - MATERIAL_SHARE_STD, MATERIAL_SHARE + MATERIAL_SHARE_STD);
         let half_width = |a: Vec<f64>, b: Vec<f64>| a.iter().zip(b).map(|(a, b)| 0.5 * (b - a)).collect::<Vec<f64>>();
@@ -89,7 +107,7 @@ impl AgedOcv {
             let offset_v = curve(MATERIAL_SHARE, MATERIAL_SHARE, part)?;
             let negative = half_width(curve(low, MATERIAL_SHARE, part)?, curve(high, MATERIAL_SHARE, part)?);
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
-            Some((offset_v, [negative, positive]))
+            Some([offset_v, negative, positive])
         };
         // From the new cell down, as far as there are such cells.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
@@ -97,10 +115,14 @@ impl AgedOcv {
             return None;
         }
         let mut table = Self::default();
-        for (part, (offset_v, mixes_v)) in aged.into_iter().rev() {
+        for (part, mut row) in aged.into_iter().rev() {
+            table.lithium.push(row.iter_mut().filter_map(Vec::pop).collect());
+            let [offset_v, mixes_v @ ..] = row;
             table.push(part * new_capacity_ah, offset_v, rows);
             table.mixes_v.iter_mut().zip(mixes_v).for_each(|(table, row)| table.push(row));
         }
+        let first = table.lithium.last().map(|row| row.iter().map(|lost| -lost).collect());
+        table.lithium.extend([Some(vec![0.0; 1 + MIXES]), first].into_iter().flatten());
         table.mixes_v.iter_mut().for_each(|table| table.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]));
         table.finish(new_capacity_ah, rows);
         Some(table)
@@ -168,6 +190,20 @@ impl AgedOcv {
             per_ah_v: line(&self.offset_v, true),
             mixes_v: [0, 1].map(|mix| line(&self.mixes_v[mix], false)),
         }
+    }
+
+    /// Lithium lost at a capacity, above that of a new cell as there; `None` without electrodes, and below the least capacity
+    /// of which they say it.
+    pub fn lithium_loss(&self, capacity_ah: f64) -> Option<LithiumLoss> {
+        let [least_ah, .., new_ah, _] = self.capacity_ah[..] else { return None };
+        let found = self.between(&self.lithium, [0, 1, 2], capacity_ah.min(new_ah));
+        let [lost, negative, positive] = found.filter(|_| capacity_ah >= least_ah)?;
+        Some(LithiumLoss {
+            lost: lost.0,
+            per_ah: lost.1,
+            mixes: [negative.0, positive.0],
+            mixes_per_ah: [negative.1, positive.1],
+        })
     }
 
     /// Values of `rows`, one per capacity, at SOC breakpoints, and their change per Ah: linear between the capacities,

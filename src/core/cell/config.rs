@@ -99,6 +99,8 @@ pub struct GapSettings {
     pub away_use_per_s: f64,
     /// A current above this next to a gap may have continued through the gap; below it the cell rested. A per cell.
     pub rest_current_a: f64,
+    /// Whether the cell rested in every longer gap without any reading, whatever the current next to it.
+    pub silence_is_rest: bool,
 }
 
 /// Error of a voltage reading against the cell model.

@@ -9,6 +9,7 @@ pub mod circuit;
 pub mod config;
 pub mod electrodes;
 pub mod estimator;
+pub mod loss_modes;
 pub mod model;
 
 pub use aged_ocv::AgedOcv;
@@ -18,6 +19,7 @@ pub use config::{
 };
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
+pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
 };

@@ -12,7 +12,8 @@
 //! Effect: none where both are constant.
 
 use super::aged_ocv::{AgedOcv, MIXES, OffsetLine};
-use crate::filter::bisect;
+use super::loss_modes::LossModes;
+use crate::filter::{ScalarGaussian, bisect};
 
 /// Most RC branches a model may have.
 pub const MAX_BRANCHES: usize = 3;
@@ -202,6 +203,11 @@ impl CellModel {
 
     fn offset(&self, position: &GridPosition, capacity_ah: f64) -> OffsetLine {
         self.aged_ocv.line(&self.soc, position.s, capacity_ah)
+    }
+
+    /// What a cell of this capacity, Ah, has lost; `None` = not known of this cell type.
+    pub fn loss_modes(&self, capacity: ScalarGaussian) -> Option<LossModes> {
+        LossModes::of_capacity(&self.aged_ocv, self.capacity_ah, capacity)
     }
 
     /// Series resistance of a new cell, ohm.

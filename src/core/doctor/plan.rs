@@ -126,7 +126,7 @@ impl Kind {
             Channel::Current => Self::Current,
             Channel::PackVoltage | Channel::CellVoltage(_) => Self::Voltage,
             Channel::Temperature(_) => Self::Temperature,
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => Self::Reported,
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => Self::Reported,
         }
     }
 

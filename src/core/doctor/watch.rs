@@ -167,7 +167,11 @@ impl Doctor {
                     Channel::Current => response.handle_current(time, value),
                     Channel::PackVoltage => response.handle_voltage(time, 0, value / cells),
                     Channel::CellVoltage(cell) => response.handle_voltage(time, cell.index(), value),
-                    Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => {}
+                    Channel::Temperature(_)
+                    | Channel::ReportedSoc
+                    | Channel::ReportedSoh
+                    | Channel::PackIdentity
+                    | Channel::Contactor => {}
                 }
             }
         }

@@ -11,6 +11,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
 /// Drift of the offset in a day, part of its first standard deviation: sensors drift with temperature.
@@ -41,6 +42,12 @@ impl CurrentOffset {
     /// Standard deviation, A per cell, with `configured_a` before any evidence.
     pub fn std_a(&self, configured_a: f64) -> f64 {
         self.part() * configured_a
+    }
+
+    /// What was learned, A per cell; `None` = nothing yet, or the offset is not learned (`configured_a` is 0).
+    pub fn learned(&self, configured_a: f64) -> Option<ScalarGaussian> {
+        let part = self.part.filter(|_| configured_a > 0.0)?;
+        Some(ScalarGaussian::from_std(self.mean_a, part * configured_a))
     }
 
     fn part(&self) -> f64 {
@@ -90,11 +97,13 @@ mod tests {
     #[test]
     fn evidence_is_weighed_by_the_deviation_and_counts_once() {
         let mut offset = CurrentOffset::default();
-        assert_eq!((offset.mean_a(), offset.std_a(0.05)), (0.0, 0.05));
+        assert_eq!((offset.mean_a(), offset.std_a(0.05), offset.learned(0.05)), (0.0, 0.05, None));
         // Innovations that say one deviation, with three times the prior's information.
         let corrected = offset.update(0.05, (3.0, 3.0));
         assert!((corrected - 0.75).abs() < 1e-12 && (offset.mean_a() - 0.0375).abs() < 1e-12, "{offset:?}");
         assert!((offset.std_a(0.05) - 0.025).abs() < 1e-12);
+        assert_eq!(offset.learned(0.05), Some(ScalarGaussian::from_std(offset.mean_a(), offset.std_a(0.05))));
+        assert_eq!(offset.learned(0.0), None, "no longer configured");
         // The rest of the way: half a deviation of the present one.
         offset.update(0.05, (99.0, 50.0));
         assert!((offset.mean_a() - 0.05).abs() < 1e-12 && (offset.std_a(0.05) - 0.0025).abs() < 1e-12, "{offset:?}");

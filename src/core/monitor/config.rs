@@ -81,6 +81,7 @@ impl MonitorConfig {
             ("[input.cell_voltage] or [input.pack_voltage]", old_sample.voltage_source == new_sample.voltage_source),
             ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
             ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
+            ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
             ("[input]", self.input == new.input),
             ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
@@ -115,7 +116,10 @@ impl MonitorConfig {
         let capacity = |config: &Self| (config.health.capacity, config.health.end_of_life_ah);
         let same = [
             ("[pack]", self.model == new.model && old_sample.ambient_c == new_sample.ambient_c),
-            ("[input]", self.flood == new.flood && self.guards == new.guards),
+            (
+                "[input]",
+                self.flood == new.flood && self.guards == new.guards && old_sample.contactor == new_sample.contactor,
+            ),
             ("[limits]", limits(old_sample) == limits(new_sample)),
             ("[estimator]", self.estimator == new.estimator),
             ("[transition]", self.health.transition == new.health.transition),

@@ -61,6 +61,23 @@ pub enum EventKind {
         /// Its standard deviation.
         resistance_ratio_std: f64,
     },
+    /// What a cell has lost, after a half-cycle, once its capacity was measured; parts of the model's new cell.
+    LossModes {
+        /// Which cell.
+        cell: CellIndex,
+        /// Loss of lithium inventory.
+        lli: f64,
+        /// Its standard deviation.
+        lli_std: f64,
+        /// Loss of active material of the negative electrode.
+        lam_ne: f64,
+        /// Its standard deviation.
+        lam_ne_std: f64,
+        /// Loss of active material of the positive electrode.
+        lam_pe: f64,
+        /// Its standard deviation.
+        lam_pe_std: f64,
+    },
     /// Remaining life after a half-cycle, of the cell whose life ends first. Sent while it is known, and once, without any
     /// value, when it no longer is.
     RemainingLife {

@@ -12,7 +12,7 @@ use super::publisher::{Publisher, learned};
 use super::{EventKind, MonitorConfig};
 use crate::alarm::{Observation, Rule};
 use crate::can::encode::HealthFields;
-use crate::cell::{CellEstimator, CellModel, EstimatorBank};
+use crate::cell::{CellEstimator, CellModel, EstimatorBank, LossModes};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
@@ -204,6 +204,7 @@ impl Learning {
         to.event(half_cycle_event(cell, half_cycle));
         to.event(capacity_event(cell, usable, resistance, &update));
         if self.state.learner.has_learned(index) {
+            bank.model().loss_modes(update.capacity).iter().for_each(|losses| to.event(losses_event(cell, losses)));
             let capacity = Observation { is_new: update.measurement.is_some(), ..learned(update.capacity) };
             to.observe(Rule::CapacityLow, Some(cell), capacity);
         }
@@ -324,6 +325,11 @@ impl Learning {
         let log_resistance = (0..self.cells.len()).map(|cell| bank.log_resistance(cell).mean).max_by(f64::total_cmp);
         let life = self.lives.of_pack().map(|(_, life)| life);
         let cycles = life.and_then(|life| life.cycles);
+        let losses = capacity.and_then(|capacity| bank.model().loss_modes(capacity));
+        let part = |mode: fn(&LossModes) -> &ScalarGaussian| {
+            let lost = losses.as_ref().map(mode);
+            [lost.map(|lost| lost.mean), lost.map(ScalarGaussian::std)]
+        };
         HealthFields {
             capacity_ah: capacity.map(|c| c.mean),
             capacity_std_ah: capacity.map(|c| c.std()),
@@ -336,6 +342,9 @@ impl Learning {
             remaining_cycles: cycles.map(|cycles| cycles.median),
             remaining_cycles_low: cycles.map(|cycles| cycles.low),
             remaining_days: life.and_then(|life| life.days).map(|days| days.median),
+            lli: part(|losses| &losses.lithium),
+            lam_ne: part(|losses| &losses.negative),
+            lam_pe: part(|losses| &losses.positive),
         }
     }
 }
@@ -350,6 +359,18 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
         duration_s: half_cycle.duration_s,
         mean_current_a: half_cycle.mean_current_a,
         mean_temperature_c: half_cycle.mean_temperature_c,
+    }
+}
+
+fn losses_event(cell: CellIndex, losses: &LossModes) -> EventKind {
+    EventKind::LossModes {
+        cell,
+        lli: losses.lithium.mean,
+        lli_std: losses.lithium.std(),
+        lam_ne: losses.negative.mean,
+        lam_ne_std: losses.negative.std(),
+        lam_pe: losses.positive.mean,
+        lam_pe_std: losses.positive.std(),
     }
 }
 

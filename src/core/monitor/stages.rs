@@ -71,7 +71,7 @@ impl Stages {
             return self.handle_identity(now, bus, reading, out);
         }
         let sample = self.sampling.handle_reading(now, reading, out);
-        if reading.channel == Channel::Current {
+        if matches!(reading.channel, Channel::Current | Channel::Contactor) {
             self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
         }
         if let Some(sample) = sample {

@@ -5,6 +5,7 @@ use super::{Estimate, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
+use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
@@ -27,6 +28,8 @@ pub struct CellView {
     pub capacity: Option<ScalarGaussian>,
     /// Usable capacity, Ah, likewise.
     pub usable_capacity: Option<ScalarGaussian>,
+    /// Lithium and active material lost, likewise; `None` also without electrodes in the cell model.
+    pub losses: Option<LossModes>,
     /// Resistance relative to new, while its voltage is fresh.
     pub resistance_ratio: Option<ScalarGaussian>,
     /// Remaining life, or why it is not known.
@@ -161,6 +164,23 @@ impl Monitor {
         self.stages.learning.capacity(cell.index())
     }
 
+    /// Lithium and active material that a cell has lost; `None` = its capacity was not learned, or the cell model has no
+    /// electrodes down to that capacity.
+    pub fn loss_modes(&self, cell: CellIndex) -> Option<LossModes> {
+        let Stages { estimation, learning, .. } = &self.stages;
+        let has_learned = learning.state.learner.has_learned(cell.index());
+        has_learned.then(|| learning.capacity(cell.index())).and_then(|it| estimation.bank.model().loss_modes(it))
+    }
+
+    /// Offset of the current sensor, A of the pack: what it reads less the true current, positive = discharge. `None` =
+    /// nothing learned yet.
+    pub fn current_offset(&self) -> Option<ScalarGaussian> {
+        let Stages { sampling, learning, .. } = &self.stages;
+        let strings = f64::from(sampling.sampler.config().strings);
+        let of_cell = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a)?;
+        Some(ScalarGaussian { mean: strings * of_cell.mean, variance: strings * strings * of_cell.variance })
+    }
+
     /// Remaining life of a cell until its capacity passes the configured end of life.
     ///
     /// # Errors
@@ -203,6 +223,7 @@ impl Monitor {
             soc,
             capacity: has_learned.then(|| learning.capacity(cell.index())),
             usable_capacity: learning.cells[cell.index()].usable.filter(|_| has_learned),
+            losses: self.loss_modes(cell),
             resistance_ratio: soc.map(|_| estimation.resistance(cell.index())),
             remaining_life: learning.lives.of_cell(cell),
             trusted: soc.map(|_| estimation.is_trusted(cell.index())),

@@ -7,6 +7,7 @@
 //!   interval is unmeasured. No hole is interpolated, whatever its cause (bad readings, lost frames, sleep, a restart).
 //!
 //! Between readings the latest one holds in the same way; the next reading replaces that hold by the trapezoid.
+//! While the contactors are open the current is zero, measured or not, for as long as their reading holds.
 //! Unmeasured time never falls and never grows faster than time; before the first current all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
@@ -37,6 +38,9 @@ pub(super) struct ChargeCounter {
     counted_to: Option<Timestamp>,
     /// The reading at `counted_to`, A; `None` = unmeasured from there on.
     current_a: Option<f64>,
+    /// The contactors are open up to here; `None` = closed, or not known.
+    #[serde(default)]
+    open_until: Option<Timestamp>,
 }
 
 impl ChargeCounter {
@@ -49,7 +53,7 @@ impl ChargeCounter {
     pub(super) fn handle_current(&mut self, time: Timestamp, current_a: f64, max_age_s: f64, flow_a: f64) {
         let dt_s = self.passed_s(time);
         match self.current_a {
-            Some(last_a) if dt_s <= max_age_s => {
+            Some(last_a) if dt_s <= self.hold_s(max_age_s) => {
                 self.totals.add((last_a + current_a) / 2.0, dt_s, flow_a);
                 self.totals.offset_s += dt_s * (offset_part(last_a) + offset_part(current_a)) / 2.0;
             }
@@ -64,7 +68,7 @@ impl ChargeCounter {
     pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> ChargeTotals {
         let dt_s = self.passed_s(time);
         let mut totals = self.totals;
-        let held_s = self.current_a.map_or(0.0, |_| dt_s.min(max_age_s));
+        let held_s = self.current_a.map_or(0.0, |_| dt_s.min(self.hold_s(max_age_s)));
         totals.charge_as += self.current_a.unwrap_or(0.0) * held_s;
         totals.offset_s += offset_part(self.current_a.unwrap_or(0.0)) * held_s;
         totals.unmeasured_s += dt_s - held_s;
@@ -75,11 +79,49 @@ impl ChargeCounter {
     pub(super) fn handle_gap(&mut self, latest: Timestamp, time: Timestamp, max_age_s: f64) {
         self.totals = self.totals_at(latest, max_age_s);
         self.counted_to = Some(time);
-        self.current_a = None;
+        (self.current_a, self.open_until) = (None, None);
+    }
+
+    /// Whether open contactors keep the current at zero at `now`.
+    #[inline]
+    pub(super) fn is_open(&self, now: Timestamp) -> bool {
+        self.open_until.is_some_and(|until| now <= until)
+    }
+
+    /// Handles open contactors: no current from `time` to `until`, unless they close before.
+    pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
+        self.hold(time, Some(0.0), max_age_s);
+        self.open_until = Some(until);
+    }
+
+    /// Handles closed contactors: after open ones the current is `measured_a` from `time` on.
+    pub(super) fn close(&mut self, time: Timestamp, measured_a: Option<f64>, max_age_s: f64) {
+        if self.open_until.is_some() {
+            self.hold(time, measured_a, max_age_s);
+            self.open_until = None;
+        }
+    }
+
+    /// Ends the present hold at `time`, and holds another current from there on.
+    fn hold(&mut self, time: Timestamp, current_a: Option<f64>, max_age_s: f64) {
+        self.totals = self.totals_at(time, max_age_s);
+        self.counted_to = Some(self.counted_to.map_or(time, |last| last.max(time)));
+        self.current_a = current_a;
+    }
+
+    /// How long the latest current holds: `max_age_s`, and while the contactors are open, s.
+    #[inline]
+    fn hold_s(&self, max_age_s: f64) -> f64 {
+        match (self.open_until, self.counted_to) {
+            (Some(until), Some(from)) => until.since(from).max(max_age_s),
+            _ => max_age_s,
+        }
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {
-        self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
+        for stamp in [&mut self.counted_to, &mut self.open_until].into_iter().flatten() {
+            *stamp = stamp.plus_nanos(by_nanos);
+        }
     }
 
     /// Checks a stored counter; the error is its first impossible number.
@@ -170,6 +212,20 @@ mod tests {
         assert_eq!(charge_and_gap(&counter, 1000.0), (2.0, 0.0));
         counter.handle_current(at(1000.0), 1.0, 2.0, 0.1);
         assert_eq!(charge_and_gap(&counter, 1001.0), (3.0, 0.0));
+    }
+
+    #[test]
+    fn open_contactors_hold_zero_for_their_own_time_and_closed_ones_end_it() {
+        let mut counter = counter(&[(0.0, 3.0)]);
+        counter.open(at(1.0), at(11.0), 2.0);
+        assert!(counter.is_open(at(11.0)) && !counter.is_open(at(11.1)));
+        assert_eq!(charge_and_gap(&counter, 9.0), (3.0, 0.0), "held to the opening, nothing since, all of it known");
+        assert_eq!(charge_and_gap(&counter, 14.0), (3.0, 3.0), "unknown once their reading is too old");
+        counter.open(at(8.0), at(18.0), 2.0);
+        counter.close(at(9.0), Some(2.0), 2.0);
+        assert_eq!(charge_and_gap(&counter, 10.0), (5.0, 0.0));
+        counter.close(at(10.5), None, 2.0);
+        assert_eq!(charge_and_gap(&counter, 11.0), (7.0, 0.0), "closed already: the current goes on");
     }
 
     #[test]

@@ -29,6 +29,15 @@ pub enum VoltageSource {
     },
 }
 
+/// Settings of the contactors' signal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ContactorConfig {
+    /// Values that mean open.
+    pub open: Vec<f64>,
+    /// Limits of its readings; after the largest age the state is unknown.
+    pub limits: Limits,
+}
+
 /// Checked settings of the sample stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleConfig {
@@ -48,6 +57,8 @@ pub struct SampleConfig {
     pub reported_soc: Option<Limits>,
     /// Limits of the SOH the pack reports; `None` = it reports none.
     pub reported_soh: Option<Limits>,
+    /// The contactors; `None` = no signal, and the current is always as measured.
+    pub contactor: Option<ContactorConfig>,
     /// Temperature sensor of each cell; `None` = no sensor, the thermal model alone.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
     /// Ambient temperature without a sensor, degrees C.

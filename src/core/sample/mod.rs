@@ -12,6 +12,6 @@ pub mod counts;
 pub mod sampler;
 pub mod signal;
 
-pub use config::{Limits, SampleConfig, VoltageSource};
+pub use config::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
 pub use sampler::{CellSample, Sampler, SamplerState, SignalChange};

@@ -101,7 +101,7 @@ impl SamplerState {
 #[derive(Debug, Clone)]
 pub struct Sampler {
     config: SampleConfig,
-    /// Channels in the order of their signals: current, sensors, voltages, what the pack reports.
+    /// Channels in the order of their signals: current, sensors, voltages, what the pack reports, contactors.
     channels: Vec<Channel>,
     /// Number of temperature sensors in use.
     sensors: usize,
@@ -201,8 +201,13 @@ impl Sampler {
         match channel {
             Channel::Current => {
                 let max_age_s = self.config.current.max_age_s;
+                let value = if self.state.charge.is_open(time) { 0.0 } else { value };
                 self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
                 self.shared.is_known = false;
+                None
+            }
+            Channel::Contactor => {
+                self.handle_contactor(time, value);
                 None
             }
             Channel::Temperature(_) => {
@@ -213,6 +218,20 @@ impl Sampler {
             Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
             Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
         }
+    }
+
+    /// Handles the state of the contactors: with open ones no current flows, whatever its sensor reports.
+    fn handle_contactor(&mut self, time: Timestamp, value: f64) {
+        let Some(contactor) = &self.config.contactor else { return };
+        let max_age_s = self.config.current.max_age_s;
+        if contactor.open.contains(&value) {
+            let until = time.plus_secs(contactor.limits.max_age_s);
+            self.state.charge.open(time, until, max_age_s);
+        } else {
+            let measured_a = self.state.signals[0].fresh(time, &self.config.current);
+            self.state.charge.close(time, measured_a, max_age_s);
+        }
+        self.shared.is_known = false;
     }
 
     /// Handles the most frequent reading, a cell's good voltage after many others, as
@@ -272,9 +291,12 @@ impl Sampler {
         self.next_stale = None;
     }
 
-    /// Pack current, A, positive = discharge, when its last good reading is fresh.
+    /// Pack current, A, positive = discharge, when its last good reading is fresh; 0 while the contactors are open.
     #[inline]
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
+        if self.state.charge.is_open(now) {
+            return Some(0.0);
+        }
         self.state.signals[0].fresh(now, &self.config.current)
     }
 
@@ -502,7 +524,7 @@ impl Sampler {
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
             // Used by the monitor, not sampled.
             | (Channel::PackIdentity, _) => None,
-            (Channel::ReportedSoc | Channel::ReportedSoh, _) => {
+            (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
                 Some(first + found)
@@ -516,6 +538,7 @@ fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
         Channel::Current => &config.current,
         Channel::Temperature(_) => &config.temperature,
         Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => &config.voltage,
+        Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
         Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
         Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
     }
@@ -532,6 +555,7 @@ fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     }
     channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
     channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
+    channels.extend(config.contactor.as_ref().map(|_| Channel::Contactor));
     channels
 }
 
@@ -542,7 +566,7 @@ fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
         // No rule says when they should move.
-        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => 0.0,
+        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => 0.0,
     }
 }
 

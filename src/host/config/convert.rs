@@ -12,7 +12,7 @@ use crate::cell::CellModel;
 use crate::health::HealthConfig;
 use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig};
 use crate::quantity::SensorIndex;
-use crate::sample::{Limits, SampleConfig, VoltageSource};
+use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
 /// The frames of the buses, received and sent.
 #[derive(Debug)]
@@ -90,6 +90,10 @@ fn sample(raw: &RawTables, pack: &Pack, model: &CellModel, found: &DbcRanges) ->
         temperature: raw.temperature_limits.as_ref()?.config(found.temperature_c),
         reported_soc: raw.reported_soc.as_ref().map(|keys| reported_limits(keys.max_age_s)),
         reported_soh: raw.reported_soh.as_ref().map(|keys| reported_limits(keys.max_age_s)),
+        contactor: raw.contactor.as_ref().map(|keys| ContactorConfig {
+            open: keys.open.clone(),
+            limits: Limits { min: f64::NEG_INFINITY, max: f64::INFINITY, ..reported_limits(keys.max_age_s) },
+        }),
         sensor_of_cell: sensors(&raw.temperatures, cells),
         ambient_c: pack.ambient_c,
     })

@@ -214,7 +214,8 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
             | Channel::CellVoltage(_)
             | Channel::ReportedSoc
             | Channel::ReportedSoh
-            | Channel::PackIdentity => None,
+            | Channel::PackIdentity
+            | Channel::Contactor => None,
         },
     }
 }

@@ -23,8 +23,8 @@ use crate::quantity::MAX_CELLS;
 
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
 pub(crate) use input::{
-    CellVoltageInput, CurrentInput, Input, PackIdentityInput, PackVoltageInput, ProtectedInput, ReportedSocInput,
-    ReportedSohInput, SignalSource, TemperatureInput,
+    CellVoltageInput, ContactorInput, CurrentInput, Input, PackIdentityInput, PackVoltageInput, ProtectedInput,
+    ReportedSocInput, ReportedSohInput, SignalSource, TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
 pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus};

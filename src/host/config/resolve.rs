@@ -245,6 +245,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
+        Channel::Contactor => "contactors".to_owned(),
     }
 }
 

@@ -2,10 +2,10 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
-    Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, ProtectedInput,
-    Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, TemperatureInput, TemperatureLimits, Transition,
-    Usable, VoltageLimits,
+    Alarm, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits, Estimator, Input,
+    Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput,
+    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, TemperatureInput,
+    TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -17,6 +17,7 @@ tables! {
         interfaces: many Interface,
         input: one Input,
         current: one CurrentInput,
+        contactor: optional ContactorInput,
         cell_voltage: optional CellVoltageInput,
         pack_voltage: optional PackVoltageInput,
         temperatures: many TemperatureInput,
@@ -92,6 +93,7 @@ impl RawTables {
             Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.config()),
             Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
             Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.config()),
+            Channel::Contactor => self.contactor.as_ref().map(|keys| keys.config()),
         }
     }
 
@@ -103,6 +105,7 @@ impl RawTables {
             Channel::ReportedSoc,
             Channel::ReportedSoh,
             Channel::PackIdentity,
+            Channel::Contactor,
             Channel::CellVoltage(CellIndex(0)),
         ];
         let channels = [Channel::Current].into_iter().chain(sensors).chain(others);

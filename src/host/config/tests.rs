@@ -127,6 +127,24 @@ fn limits_come_from_the_dbc_in_our_sign_and_the_cell_model() {
 }
 
 #[test]
+fn contactors_have_values_that_mean_open() {
+    let table = "[input.contactor]\nsignal = \"Cells.Page\"\n";
+    let contactor = good(&format!("{PACK}{table}open = [0, 2.5]\n")).monitor.sample.contactor.unwrap();
+    assert_eq!((contactor.open, contactor.limits.max_age_s), (vec![0.0, 2.5], 5.0));
+    assert_eq!(good(PACK).monitor.sample.contactor, None);
+    let bad = [
+        ("", "pack.toml:15: input.contactor.open is missing, must be a list of numbers that is not empty"),
+        ("open = []\n", "pack.toml:17: input.contactor.open = [], must"),
+        ("open = [nan]\n", "pack.toml:17: input.contactor.open"),
+        ("open = [0]\nmax_age_s = 0\n", "pack.toml:18: input.contactor.max_age_s = 0, must be above 0"),
+    ];
+    for (keys, fault) in bad {
+        let found = faults(&format!("{PACK}{table}{keys}"));
+        assert!(found.len() == 1 && found[0].starts_with(fault), "{found:?}");
+    }
+}
+
+#[test]
 fn a_total_voltage_means_one_cell_of_a_series() {
     let pack = pack_with(
         "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"",

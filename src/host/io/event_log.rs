@@ -74,6 +74,7 @@ impl EventLog {
             EventKind::Alarm { .. } => log_alarm(&event.kind),
             EventKind::HalfCycle { .. }
             | EventKind::Capacity { .. }
+            | EventKind::LossModes { .. }
             | EventKind::RemainingLife { .. }
             | EventKind::RechargePeriod { .. } => {
                 log_learned(&event.kind);
@@ -222,6 +223,9 @@ fn log_learned(kind: &EventKind) {
                 resistance_ratio,
                 "capacity"
             );
+        }
+        EventKind::LossModes { cell, lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std } => {
+            tracing::info!(cell = number(cell), lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std, "loss modes");
         }
         EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, .. } => {
             tracing::info!(cell = cell.map(number), cycles, cycles_low, cycles_high, days, "remaining life");

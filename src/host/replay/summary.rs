@@ -40,6 +40,10 @@ pub struct ReplaySummary {
     pub alarms_raised: Vec<Event>,
     /// The cells at the end.
     pub cells: Vec<CellSummary>,
+    /// Learned offset of the current sensor at the end, A: what it reads less the true current, positive = discharge.
+    pub current_offset_a: Option<f64>,
+    /// Its standard deviation, A.
+    pub current_offset_std_a: Option<f64>,
     /// First stamp, s.
     pub first_s: Option<f64>,
     /// Last stamp, s.
@@ -73,6 +77,7 @@ pub(super) fn note_event(
             usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
             "capacity"
         }
+        EventKind::LossModes { .. } => "loss_modes",
         EventKind::RemainingLife { .. } => "remaining_life",
         EventKind::RechargePeriod { .. } => "recharge_period",
         EventKind::Alarm { change, .. } => {

@@ -4,12 +4,13 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
-    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
+    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
+use crate::cell::LossModes;
 use crate::control::answer;
 use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
@@ -32,7 +33,8 @@ pub struct RecentEvents(VecDeque<Event>);
 impl RecentEvents {
     /// Notes an event.
     pub fn note(&mut self, event: &Event) {
-        if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. }) {
+        if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::LossModes { .. })
+        {
             return;
         }
         if self.0.len() == MAX_EVENTS {
@@ -196,11 +198,26 @@ fn remaining(life: Option<RemainingLife>) -> RemainingStatus {
     }
 }
 
+/// What a cell has lost, as far as it is known.
+fn losses(losses: Option<LossModes>) -> LossStatus {
+    let losses = losses.as_ref();
+    let [lithium, negative, positive] =
+        [losses.map(|it| &it.lithium), losses.map(|it| &it.negative), losses.map(|it| &it.positive)];
+    LossStatus {
+        lli: mean(lithium),
+        lli_std: std(lithium),
+        lam_ne: mean(negative),
+        lam_ne_std: std(negative),
+        lam_pe: mean(positive),
+        lam_pe_std: std(positive),
+    }
+}
+
 fn pack(monitor: &Monitor) -> PackStatus {
     let view = monitor.pack_view();
     let soc = view.soc.as_ref();
     let edge = |sign: f64| soc.and_then(|soc| finite((soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0)));
-    let weakest = view.weakest.as_ref();
+    let (weakest, offset) = (view.weakest.as_ref(), monitor.current_offset());
     let normalised = view.normalised_recharge_period.as_ref();
     PackStatus {
         validity: view.validity,
@@ -212,11 +229,14 @@ fn pack(monitor: &Monitor) -> PackStatus {
         limiting_cell: view.limiting_cell.map(|cell| cell.0),
         voltage_v: view.voltage_v.and_then(finite),
         current_a: view.current_a.and_then(finite),
+        current_offset_a: mean(offset.as_ref()),
+        current_offset_std_a: std(offset.as_ref()),
         temperature_max_c: view.temperature_max_c.and_then(finite),
         weakest_cell: weakest.map(|(cell, _)| cell.0),
         capacity_ah: mean(weakest.map(|(_, capacity)| capacity)),
         capacity_std_ah: std(weakest.map(|(_, capacity)| capacity)),
         soh: view.soh.and_then(finite),
+        losses: losses(weakest.and_then(|&(cell, _)| monitor.loss_modes(cell))),
         shortest_lived_cell: view.remaining_life.map(|(cell, _)| cell.0),
         remaining: remaining(view.remaining_life.map(|(_, life)| life)),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
@@ -239,6 +259,7 @@ fn cell(view: CellView) -> CellStatus {
         soc_std: std(view.soc.as_ref()),
         capacity_ah: mean(view.capacity.as_ref()),
         capacity_std_ah: std(view.capacity.as_ref()),
+        losses: losses(view.losses),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
         remaining: remaining(view.remaining_life.ok()),

@@ -113,6 +113,12 @@ pub struct PackStatus {
     pub voltage_v: Option<f64>,
     /// Current, positive = discharge.
     pub current_a: Option<f64>,
+    /// Learned offset of the current sensor: what it reads less the true current, positive = discharge.
+    #[serde(default)]
+    pub current_offset_a: Option<f64>,
+    /// Its standard deviation.
+    #[serde(default)]
+    pub current_offset_std_a: Option<f64>,
     /// Highest temperature, while all sensors are fresh.
     pub temperature_max_c: Option<f64>,
     /// The cell with the least capacity, once the capacity of every cell was learned.
@@ -123,6 +129,9 @@ pub struct PackStatus {
     pub capacity_std_ah: Option<f64>,
     /// Capacity relative to rated.
     pub soh: Option<f64>,
+    /// What the cell with the least capacity has lost.
+    #[serde(flatten)]
+    pub losses: LossStatus,
     /// The cell whose life ends first, once the remaining life of every cell is known.
     #[serde(default)]
     pub shortest_lived_cell: Option<u16>,
@@ -159,6 +168,24 @@ pub struct RemainingStatus {
     pub remaining_days: Option<f64>,
 }
 
+/// What a cell has lost, parts of the model's new cell, as far as it is known.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LossStatus {
+    /// Loss of lithium inventory.
+    pub lli: Option<f64>,
+    /// Its standard deviation.
+    pub lli_std: Option<f64>,
+    /// Loss of active material of the negative electrode.
+    pub lam_ne: Option<f64>,
+    /// Its standard deviation.
+    pub lam_ne_std: Option<f64>,
+    /// Loss of active material of the positive electrode.
+    pub lam_pe: Option<f64>,
+    /// Its standard deviation.
+    pub lam_pe_std: Option<f64>,
+}
+
 /// One cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellStatus {
@@ -178,6 +205,9 @@ pub struct CellStatus {
     pub capacity_ah: Option<f64>,
     /// Its standard deviation.
     pub capacity_std_ah: Option<f64>,
+    /// What it has lost.
+    #[serde(flatten)]
+    pub losses: LossStatus,
     /// Usable capacity at the configured load.
     pub usable_capacity_ah: Option<f64>,
     /// Its standard deviation.

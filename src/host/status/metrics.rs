@@ -223,18 +223,36 @@ fn message(interface: &str, id: &str) -> Labels {
 
 fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
     let number = |cell: Option<u16>| cell.map(|cell| f64::from(cell) + 1.0);
-    let life = &pack.remaining;
+    let (life, losses) = (&pack.remaining, &pack.losses);
     let rows = [
         ("pack_soc", "ratio", "State of charge", pack.soc),
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
         ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
         ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
+        (
+            "pack_current_offset",
+            "amperes",
+            "Learned offset of the current sensor, reading less true current",
+            pack.current_offset_a,
+        ),
+        (
+            "pack_current_offset_std",
+            "amperes",
+            "Standard deviation of the current sensor's offset",
+            pack.current_offset_std_a,
+        ),
         ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),
         ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
+        ("pack_lli", "ratio", "Loss of lithium inventory of the weakest cell", losses.lli),
+        ("pack_lli_std", "ratio", "Standard deviation of the loss of lithium inventory", losses.lli_std),
+        ("pack_lam_ne", "ratio", "Loss of active material of its negative electrode", losses.lam_ne),
+        ("pack_lam_ne_std", "ratio", "Standard deviation of the negative electrode's loss", losses.lam_ne_std),
+        ("pack_lam_pe", "ratio", "Loss of active material of its positive electrode", losses.lam_pe),
+        ("pack_lam_pe_std", "ratio", "Standard deviation of the positive electrode's loss", losses.lam_pe_std),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
         ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", life.remaining_cycles),
         (
@@ -292,6 +310,12 @@ const CELL_ROWS: &[CellRow] = &[
     ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
     ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
+    ("cell_lli", "ratio", "Loss of lithium inventory", |cell| cell.losses.lli),
+    ("cell_lli_std", "ratio", "Standard deviation of the loss of lithium inventory", |cell| cell.losses.lli_std),
+    ("cell_lam_ne", "ratio", "Loss of active material of the negative electrode", |cell| cell.losses.lam_ne),
+    ("cell_lam_ne_std", "ratio", "Standard deviation of the negative electrode's loss", |cell| cell.losses.lam_ne_std),
+    ("cell_lam_pe", "ratio", "Loss of active material of the positive electrode", |cell| cell.losses.lam_pe),
+    ("cell_lam_pe_std", "ratio", "Standard deviation of the positive electrode's loss", |cell| cell.losses.lam_pe_std),
     ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| {
         cell.remaining.remaining_cycles
     }),

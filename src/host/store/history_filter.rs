@@ -77,8 +77,17 @@ impl HistoryFilter {
             return None;
         }
         let mut rows = self.for_checkpoint(now);
+        let mut writes_capacity = false;
         for kind in learned() {
-            if self.is_worth_writing(&kind, now) {
+            // What a cell has lost follows from its capacity, whose event comes before.
+            let is_worth_writing = match kind {
+                EventKind::LossModes { .. } => writes_capacity,
+                _ => self.is_worth_writing(&kind, now),
+            };
+            if matches!(kind, EventKind::Capacity { .. }) {
+                writes_capacity = is_worth_writing;
+            }
+            if is_worth_writing {
                 let row = HistoryRow::Event(kind);
                 // Waiting rows of the same alarm come before it.
                 rows.extend(self.deferred.extract_if(.., |waiting| waiting.repeats(&row)));
@@ -174,6 +183,7 @@ fn is_learned(kind: &EventKind) -> bool {
     match kind {
         EventKind::HalfCycle { .. }
         | EventKind::Capacity { .. }
+        | EventKind::LossModes { .. }
         | EventKind::RemainingLife { .. }
         | EventKind::RechargePeriod { .. }
         | EventKind::AlarmDropped { .. }
@@ -187,7 +197,7 @@ fn is_learned(kind: &EventKind) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
+    use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaining_life};
     use super::*;
     use crate::alarm::{Rule, Severity};
 
@@ -204,6 +214,14 @@ mod tests {
         assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, None, 2.3)]), Some(0));
         assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, None, 2.2)]), Some(1));
         assert_eq!(take(&mut history_filter, 0.0, &[half_cycle(0), capacity(0, Some(2.4), 2.2)]), Some(2));
+    }
+
+    #[test]
+    fn what_a_cell_has_lost_is_written_with_its_capacity() {
+        let mut history_filter = HistoryFilter::default();
+        let cells = [capacity(0, Some(2.4), 2.3), loss_modes(0, 0.1), capacity(1, None, 2.3), loss_modes(1, 0.1)];
+        assert_eq!(take(&mut history_filter, 0.0, &cells), Some(2));
+        assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, None, 2.3), loss_modes(0, 0.1)]), Some(0));
     }
 
     #[test]

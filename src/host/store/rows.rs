@@ -40,6 +40,8 @@ pub enum HistoryTable {
     HalfCycle,
     /// Learned capacities; chained, never thinned.
     Capacity,
+    /// Lithium and active material that cells have lost; chained, never thinned.
+    LossModes,
     /// Remaining life of the cell whose life ends first; chained, never thinned.
     RemainingLife,
     /// Alarms; chained, never thinned.
@@ -50,13 +52,20 @@ pub enum HistoryTable {
 
 impl HistoryTable {
     /// All tables, in the order in which they are shown.
-    pub const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub const ALL: [Self; 6] =
+        [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Alarm, Self::Reset];
     /// The tables whose rows are chained by hash.
-    pub(super) const CHAINED: [Self; 4] = [Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub(super) const CHAINED: [Self; 5] =
+        [Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Alarm, Self::Reset];
 
     /// Whether a database of this layout version has it.
     pub(super) const fn is_in(self, version: i32) -> bool {
-        version >= if matches!(self, Self::RemainingLife) { 2 } else { 1 }
+        version
+            >= match self {
+                Self::HalfCycle | Self::Capacity | Self::Alarm | Self::Reset => 1,
+                Self::RemainingLife => 2,
+                Self::LossModes => 3,
+            }
     }
 
     /// Its name in the database, in JSON and in CSV.
@@ -64,6 +73,7 @@ impl HistoryTable {
         match self {
             Self::HalfCycle => "half_cycle",
             Self::Capacity => "capacity",
+            Self::LossModes => "loss_modes",
             Self::RemainingLife => "remaining_life",
             Self::Alarm => "alarm",
             Self::Reset => "reset",
@@ -94,6 +104,7 @@ impl HistoryTable {
                 "resistance_ratio",
                 "resistance_ratio_std",
             ],
+            Self::LossModes => &["cell", "lli", "lli_std", "lam_ne", "lam_ne_std", "lam_pe", "lam_pe_std"],
             Self::RemainingLife => &["cell", "cycles", "cycles_low", "cycles_high", "days", "days_low", "days_high"],
             Self::Alarm => &[
                 "cell",
@@ -128,6 +139,7 @@ impl HistoryRow {
         let (table, own) = match kind {
             EventKind::HalfCycle { .. } => (HistoryTable::HalfCycle, vec![]),
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
+            EventKind::LossModes { .. } => (HistoryTable::LossModes, vec![]),
             EventKind::RemainingLife { .. } => (HistoryTable::RemainingLife, vec![]),
             EventKind::Alarm { .. } => (HistoryTable::Alarm, vec![]),
             // No threshold watches it any more: it has ended, without a value that decided.

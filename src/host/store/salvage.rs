@@ -33,6 +33,7 @@ const STEP_ROWS: usize = 2_000;
 #[derive(Debug, Default)]
 pub(super) struct SalvageReport {
     pub(super) capacities: usize,
+    pub(super) losses: usize,
     pub(super) lives: usize,
     pub(super) alarms: usize,
     pub(super) resets: usize,
@@ -44,12 +45,12 @@ pub(super) struct SalvageReport {
 
 impl fmt::Display for SalvageReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { capacities, lives, alarms, resets, half_cycles, refused, state } = self;
+        let Self { capacities, losses, lives, alarms, resets, half_cycles, refused, state } = self;
         let state = if state.is_some() { "with" } else { "without" };
         write!(
             f,
-            "copied: {capacities} capacities, {lives} remaining lives, {alarms} alarms, {resets} resets, {half_cycles} \
-             half-cycles, {state} its state; rejected: {refused}"
+            "copied: {capacities} capacities, {losses} loss modes, {lives} remaining lives, {alarms} alarms, {resets} \
+             resets, {half_cycles} half-cycles, {state} its state; rejected: {refused}"
         )
     }
 }
@@ -59,6 +60,7 @@ impl SalvageReport {
         *match table {
             HistoryTable::HalfCycle => &mut self.half_cycles,
             HistoryTable::Capacity => &mut self.capacities,
+            HistoryTable::LossModes => &mut self.losses,
             HistoryTable::RemainingLife => &mut self.lives,
             HistoryTable::Alarm => &mut self.alarms,
             HistoryTable::Reset => &mut self.resets,

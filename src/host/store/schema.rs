@@ -5,7 +5,7 @@
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | always |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
-//! | `capacity`, `remaining_life`, `alarm`, `reset` | a learned capacity, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
+//! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
 //! | `state` | the core's state: slot 0 in full, slot 1 the changes since | the latest |
 //! | `meta` | one row: the chain's end, counts | |
 //!
@@ -17,7 +17,7 @@ use rusqlite::{Connection, TransactionBehavior};
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// The statements that lead to each version from the one before; the first starts from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3];
 
 const VERSION_1: &str = "
 CREATE TABLE meta (
@@ -115,6 +115,21 @@ CREATE TABLE remaining_life (
     days REAL,
     days_low REAL,
     days_high REAL,
+    hash BLOB NOT NULL
+) STRICT;
+";
+
+const VERSION_3: &str = "
+CREATE TABLE loss_modes (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER,
+    lli REAL,
+    lli_std REAL,
+    lam_ne REAL,
+    lam_ne_std REAL,
+    lam_pe REAL,
+    lam_pe_std REAL,
     hash BLOB NOT NULL
 ) STRICT;
 ";

@@ -271,8 +271,9 @@ impl LogTables {
                 let half = self.half_cycle.take().filter(|half| half.0 == cell);
                 let (_, half) = half.ok_or("a capacity came without its half-cycle")?;
                 let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
-                let capacity = Fields::of_event(&event.kind);
-                self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, capacity, remaining })?;
+                let (capacity, losses) = (Fields::of_event(&event.kind), monitor.loss_modes(cell));
+                let row = HalfCycleRow { log, time, since_s, full_cycles, half, capacity, losses, remaining };
+                self.half_cycles.push(&row)?;
             }
             EventKind::PackReplaced { .. } => self.moved_ah.fill(0.0),
             EventKind::Alarm { rule, .. } => {

@@ -44,6 +44,8 @@ pub(super) struct CapacityRecord {
     /// Mean and standard deviation, Ah.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
+    /// Lithium, material of the negative and of the positive electrode lost, fractions.
+    pub(super) losses: Option<[(f64, f64); 3]>,
     /// Times new.
     pub(super) resistance: (f64, f64),
 }
@@ -92,6 +94,8 @@ pub struct Data {
     /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
+    /// Offset of the current sensor, A: mean and standard deviation.
+    pub(super) current_offset: Option<(f64, f64)>,
     first_s: f64,
     last_s: f64,
 }
@@ -107,6 +111,7 @@ impl Data {
             alarms: Vec::new(),
             incidents: Vec::new(),
             trace: Trace::default(),
+            current_offset: None,
             first_s: f64::INFINITY,
             last_s: f64::NEG_INFINITY,
         }
@@ -130,6 +135,11 @@ impl Data {
         self.source.doubt = Some(why);
     }
 
+    /// Sets the learned offset of the current sensor, A: what it reads less the true current, and the standard deviation.
+    pub fn set_current_offset(&mut self, offset: Option<(f64, f64)>) {
+        self.current_offset = offset;
+    }
+
     /// Adds a row of a store.
     fn take_entry(&mut self, entry: &HistoryEntry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
@@ -138,6 +148,7 @@ impl Data {
         match entry.kind {
             HistoryTable::HalfCycle => self.take_half_cycle(time_s, &fields),
             HistoryTable::Capacity => self.take_capacity(time_s, &fields),
+            HistoryTable::LossModes => self.take_losses(time_s, &fields),
             HistoryTable::Alarm => self.take_alarm(time_s, &fields),
             HistoryTable::Reset => {
                 let of = cell_of(&fields).map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
@@ -157,6 +168,7 @@ impl Data {
         match event.kind {
             EventKind::HalfCycle { .. } => self.take_half_cycle(time_s, &Fields::of_event(&event.kind)),
             EventKind::Capacity { .. } => self.take_capacity(time_s, &Fields::of_event(&event.kind)),
+            EventKind::LossModes { .. } => self.take_losses(time_s, &Fields::of_event(&event.kind)),
             EventKind::Alarm { .. } => self.take_alarm(time_s, &Fields::of_event(&event.kind)),
             EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
                 let normalised_s = normalised_s.zip(normalised_std_s);
@@ -190,8 +202,22 @@ impl Data {
             measured_std_ah: fields.number("measured_std_ah"),
             capacity_ah: fields.pair("capacity_ah", "capacity_std_ah").unwrap_or(UNKNOWN),
             usable_ah: fields.pair("usable_capacity_ah", "usable_capacity_std_ah"),
+            losses: None,
             resistance: fields.pair("resistance_ratio", "resistance_ratio_std").unwrap_or(UNKNOWN),
         });
+    }
+
+    /// Adds what a cell has lost to its capacity, which came before.
+    fn take_losses(&mut self, time_s: f64, fields: &Fields) {
+        let Some(cell) = cell_of(fields) else { return };
+        let [lithium, negative, positive] =
+            [("lli", "lli_std"), ("lam_ne", "lam_ne_std"), ("lam_pe", "lam_pe_std")].map(|(m, s)| fields.pair(m, s));
+        let losses =
+            lithium.zip(negative).zip(positive).map(|((lithium, negative), positive)| [lithium, negative, positive]);
+        let mut of_this_time = self.learned.iter_mut().rev().take_while(|row| row.time_s == time_s);
+        if let Some(row) = of_this_time.find(|row| row.cell == cell) {
+            row.losses = losses;
+        }
     }
 
     fn take_alarm(&mut self, time_s: f64, fields: &Fields) {

@@ -212,6 +212,7 @@ mod tests {
                     measured_std_ah: Some(0.01),
                     capacity_ah: (capacity_ah, 0.01),
                     usable_ah: None,
+                    losses: None,
                     resistance: (1.0, 0.1),
                 });
             }

@@ -36,9 +36,10 @@ const SECTIONS: [Section; 7] = [
     Section {
         id: "capacity",
         title: "Capacity",
-        pictures: &["capacity", "usable_capacity"],
+        pictures: &["capacity", "usable_capacity", "losses"],
         note: "Capacity is the charge between the full and the empty cell at rest; usable capacity is what can be taken out at \
-               a load, and also falls when resistance rises. A pack is as good as its weakest cell.",
+               a load, and also falls when resistance rises. A pack is as good as its weakest cell. How a loss of capacity divides \
+               into lithium and active material is mostly an assumption, which its interval includes.",
         none: |_| "unknown: no charge or discharge has measured the capacity yet",
     },
     Section {
@@ -304,6 +305,9 @@ fn estimator(data: &Data) -> Markup {
             ("Least covered cell".to_owned(), format!("cell {}: {:.1} %", cell + 1, 100.0 * share))
         }),
     );
+    rows.extend(data.current_offset.map(|(mean, std)| {
+        ("Offset of the current sensor: reading less true current".to_owned(), format!("{mean:+.3} \u{b1} {std:.3} A"))
+    }));
     pairs(&rows)
 }
 

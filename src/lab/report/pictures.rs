@@ -48,6 +48,7 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
         named("soc_recent", soc_recent(data, context)),
         named("capacity", capacity(data, context, outlook.as_ref().ok())),
         named("usable_capacity", usable(data, context)),
+        named("losses", losses(data)),
         named("recharge_period", recharge(data, context)),
         named("resistance", resistance(data, context)),
         named("temperature", temperature(data, context)),
@@ -319,6 +320,31 @@ fn usable(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let title = format!("Usable capacity{load}, over life");
     let description = "What the weakest cell gives under load, with its 95 % interval, Ah";
     chart(title, description, clock.axis, within_reason(&steps, &layers, "usable capacity, Ah"), layers)
+}
+
+fn losses(data: &Data) -> Option<Picture> {
+    let modes: [(&str, Ink, series::ValueSelector); 3] = [
+        ("lithium", Ink::Purple, series::lithium_lost),
+        ("negative electrode", Ink::Blue, series::negative_lost),
+        ("positive electrode", Ink::Orange, series::positive_lost),
+    ];
+    let clock = TimeAxis::of(data);
+    let mut layers = Vec::new();
+    for (name, ink, pick) in modes {
+        let steps = series::steps(data, pick, true);
+        let interval = |s: &CellStep| {
+            let half_width = OF_95 * s.worst.1;
+            (clock.x(s.time_s), (s.worst.0 - half_width).max(0.0), (s.worst.0 + half_width).min(100.0))
+        };
+        layers.push(Layer::band("", ink, steps.iter().map(interval)));
+        layers.push(Layer::line(name, ink, steps.iter().map(|s| (clock.x(s.time_s), s.worst.0))));
+        if steps.is_empty() {
+            return None;
+        }
+    }
+    let description =
+        "Lithium and active material lost by the cell that has lost most, with their 95 % intervals, per cent";
+    chart("Lithium and active material lost, over life", description, clock.axis, "lost, % of new", layers)
 }
 
 fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {

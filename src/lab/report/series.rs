@@ -27,6 +27,25 @@ pub(super) fn usable(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.usable_ah.filter(|value| value.0.is_finite())
 }
 
+/// Lithium lost, per cent.
+pub(super) fn lithium_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
+    row.losses.map(|losses| percent(losses[0]))
+}
+
+/// Active material of the negative electrode lost, per cent.
+pub(super) fn negative_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
+    row.losses.map(|losses| percent(losses[1]))
+}
+
+/// Active material of the positive electrode lost, per cent.
+pub(super) fn positive_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
+    row.losses.map(|losses| percent(losses[2]))
+}
+
+fn percent((mean, std): (f64, f64)) -> (f64, f64) {
+    (100.0 * mean, 100.0 * std)
+}
+
 pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.resistance).filter(|value| value.0.is_finite())
 }
@@ -109,6 +128,7 @@ mod tests {
                 measured_std_ah: None,
                 capacity_ah: (ah, 0.01),
                 usable_ah: None,
+                losses: None,
                 resistance: (1.0, 0.1),
             });
         }

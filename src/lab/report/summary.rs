@@ -304,6 +304,7 @@ fn tiles(
         tile("State of health", health, health_note),
         tile("Capacity", capacity.as_ref().map(figure), note(capacity, "no capacity learned yet")),
         tile("Usable capacity", usable.as_ref().map(figure), note(usable, "no load configured, or none learned yet")),
+        losses_tile(data),
         tile(
             "Resistance",
             resistance.map(|step| format!("{:.2} \u{d7} new", step.worst.0)),
@@ -322,6 +323,18 @@ fn tiles(
         ),
         tile("Alarms raised now", Some(raised.len().to_string()), format!("{} entries in all", data.alarms.len())),
     ]
+}
+
+/// Returns the tile of the cell that has lost most lithium.
+fn losses_tile(data: &Data) -> Tile {
+    let last = |pick| series::steps(data, pick, true).last().copied();
+    let figure = |step: series::CellStep| format!("{:.0} \u{b1} {:.0} %", step.worst.0, step.worst.1);
+    let material = last(series::negative_lost).zip(last(series::positive_lost));
+    let note = material.map_or_else(
+        || "not learned, or no electrodes in the cell model".to_owned(),
+        |(negative, positive)| format!("negative electrode {}, positive {}", figure(negative), figure(positive)),
+    );
+    tile("Lithium lost", last(series::lithium_lost).map(figure), note)
 }
 
 /// Returns the tile of the latest recharge period, normalised where it is known, with the first for comparison.
@@ -389,7 +402,16 @@ mod tests {
 
     fn learned(time_s: f64, cell: usize, measured_ah: Option<f64>) -> CapacityRecord {
         let (measured_std_ah, usable_ah, resistance) = (measured_ah.map(|_| 0.01), None, (1.0, 0.1));
-        CapacityRecord { time_s, cell, measured_ah, measured_std_ah, capacity_ah: (1.2, 0.01), usable_ah, resistance }
+        CapacityRecord {
+            time_s,
+            cell,
+            measured_ah,
+            measured_std_ah,
+            capacity_ah: (1.2, 0.01),
+            usable_ah,
+            losses: None,
+            resistance,
+        }
     }
 
     #[test]

@@ -23,6 +23,7 @@ BO_ 256 Status: 8 A
  SG_ Temperature1 : 16|8@1+ (1,-40) [-40|200] "degC" A
  SG_ Temperature2 : 24|8@1+ (1,-40) [-40|200] "degC" A
  SG_ Soc : 32|16@1+ (0.01,0) [0|120] "%" A
+ SG_ Contactor : 48|4@1+ (1,0) [0|14] "" A
 BO_ 272 Cells: 8 A
  SG_ Voltage1 : 0|16@1+ (0.0001,0) [0|5] "V" A
  SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] "V" A
@@ -99,6 +100,7 @@ pub(crate) struct Rig {
     pub(crate) temperatures_c: [Option<f64>; 2],
     pub(crate) reported_soc: Option<f64>,
     pub(crate) identity: Option<f64>,
+    pub(crate) contactor: Option<f64>,
 }
 
 impl Rig {
@@ -122,6 +124,7 @@ impl Rig {
             temperatures_c: [Some(25.0), Some(25.0)],
             reported_soc: Some(0.5),
             identity: None,
+            contactor: None,
         }
     }
 
@@ -168,6 +171,7 @@ impl Rig {
                 (Channel::Temperature(SensorIndex(1)), self.temperatures_c[1]),
                 (Channel::ReportedSoc, self.reported_soc),
                 (Channel::PackIdentity, self.identity),
+                (Channel::Contactor, self.contactor),
                 (Channel::CellVoltage(CellIndex(0)), self.voltages_v[0]),
                 (Channel::CellVoltage(CellIndex(1)), self.voltages_v[1]),
             ];

@@ -38,7 +38,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
 ];
 
 /// Signals of the health frame, whatever its pages; the first [`HEALTH_REQUIRED`] are required.
-const HEALTH: SignalTable<HealthFields, 11> = [
+const HEALTH: SignalTable<HealthFields, 17> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
     ("Soh", |f| f.soh),
@@ -50,6 +50,12 @@ const HEALTH: SignalTable<HealthFields, 11> = [
     ("RemainingCycles", |f| f.remaining_cycles),
     ("RemainingCyclesLow", |f| f.remaining_cycles_low),
     ("RemainingDays", |f| f.remaining_days),
+    ("Lli", |f| f.lli[0]),
+    ("LliStd", |f| f.lli[1]),
+    ("LamNe", |f| f.lam_ne[0]),
+    ("LamNeStd", |f| f.lam_ne[1]),
+    ("LamPe", |f| f.lam_pe[0]),
+    ("LamPeStd", |f| f.lam_pe[1]),
 ];
 const HEALTH_REQUIRED: usize = 8;
 
@@ -115,12 +121,18 @@ pub struct HealthFields {
     pub usable_capacity_std_ah: Option<f64>,
     /// Relative to new, 1 = as new.
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. As the next two, sent only if the DBC has its signal.
+    /// Equivalent full cycles until the end of life, median. As all that follows, sent only if the DBC has its signal.
     pub remaining_cycles: Option<f64>,
     /// Its 5 % quantile.
     pub remaining_cycles_low: Option<f64>,
     /// Days, median.
     pub remaining_days: Option<f64>,
+    /// Loss of lithium inventory of the cell with the least capacity and its standard deviation, fractions of new.
+    pub lli: [Option<f64>; 2],
+    /// Loss of active material of its negative electrode, likewise.
+    pub lam_ne: [Option<f64>; 2],
+    /// Of its positive electrode.
+    pub lam_pe: [Option<f64>; 2],
 }
 
 /// Contents of one alarm frame.

@@ -18,6 +18,9 @@ pub(super) const REST_REPEATS_S: f64 = 1000.0;
 /// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
+/// A step with more unmeasured time than this had neither a current nor a voltage: the bus was silent, s.
+const SILENCE_S: f64 = 5.0;
+
 /// Consecutive readings beyond the gate before the filter may restart: one or two can be glitches.
 const MIN_REJECTED: u32 = 3;
 
@@ -141,10 +144,10 @@ impl Memory {
     /// Notes the unmeasured time of a step: a load next to it may have continued, or a charger come. What counts as downtime
     /// is left to the next voltage; for a short load returns the deviation of the SOC, fraction.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
-        if step.unmeasured_s <= 0.0 {
+        if step.unmeasured_s <= 0.0 || is_silent_rest(config, step) {
             return 0.0;
         }
-        let adjacent_a = self.adjacent_a(step);
+        let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let most = load_per_s.max(config.gap.away_use_per_s) * step.unmeasured_s;
@@ -157,8 +160,11 @@ impl Memory {
         if is_loaded { std } else { 0.0 }
     }
 
-    /// Largest current next to the unmeasured time of a step, A.
-    fn adjacent_a(&self, step: &CellStep) -> f64 {
+    /// The load next to a step's gap, A: it may have continued through the gap. 0 where a silent bus means rest.
+    fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
+        if is_silent_rest(config, step) {
+            return 0.0;
+        }
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
@@ -172,7 +178,7 @@ impl Memory {
         }
         if step.unmeasured_s > 0.0 {
             self.load_a *= keep(step.unmeasured_s);
-            let adjacent_a = self.adjacent_a(step);
+            let adjacent_a = self.gap_load_a(config, step);
             if adjacent_a > config.gap.rest_current_a {
                 self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
             }
@@ -266,6 +272,11 @@ impl Memory {
         let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
         InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }
+}
+
+/// Whether the configuration says that the cells rested in the unmeasured time of a step.
+fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
+    config.gap.silence_is_rest && step.unmeasured_s > SILENCE_S
 }
 
 /// No cell has a thousand times the resistance of a new one, or a thousandth.

@@ -37,6 +37,7 @@ pub(crate) fn config() -> EstimatorConfig {
             self_discharge_per_s: 1e-8,
             away_use_per_s: 0.0,
             rest_current_a: 0.04,
+            silence_is_rest: false,
         },
         voltage: VoltageError {
             noise_v: 0.005,
@@ -231,6 +232,22 @@ fn an_unknown_soc_stays_at_its_largest_variance_through_any_gap() {
     assert!(soc(&estimator).variance < 0.1);
     estimator.handle_unknown_gap();
     assert!((soc(&estimator).variance - UNKNOWN_SOC_VARIANCE).abs() < 0.02);
+}
+
+#[test]
+fn a_load_may_continue_through_a_silent_gap_unless_silence_is_rest() {
+    let after = |silence_is_rest: bool, unmeasured_s: f64| {
+        let (mut config, mut truth, model) = (config(), truth(), small_model());
+        config.gap.silence_is_rest = silence_is_rest;
+        let mut estimator = CellEstimator::new(&config);
+        cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
+        // A voltage without a current: nothing is learned from it.
+        let step = CellStep { unmeasured_s, current_a: None, ..truth.step(&model, 1.0, 1.0) };
+        estimator.step(&model, &config, &step);
+        soc(&estimator).std()
+    };
+    assert!(after(false, 600.0) > 2.0 * after(true, 600.0), "{} {}", after(false, 600.0), after(true, 600.0));
+    assert_eq!(after(false, 4.0), after(true, 4.0), "the voltage came meanwhile: only the current is missing");
 }
 
 #[test]

@@ -77,6 +77,7 @@ pub(super) fn channel(channel: Channel) -> String {
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
+        Channel::Contactor => "contactors".to_owned(),
     }
 }
 

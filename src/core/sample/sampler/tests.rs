@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::sample::ContactorConfig;
 
 fn at(seconds: f64) -> Timestamp {
     Timestamp::from_secs(seconds)
@@ -22,6 +23,7 @@ fn config() -> SampleConfig {
         temperature: limits(-40.0, 85.0, 30.0),
         reported_soc: None,
         reported_soh: None,
+        contactor: None,
         sensor_of_cell: vec![Some(SensorIndex(0)), None],
         ambient_c: 20.0,
     }
@@ -68,6 +70,27 @@ fn a_sample_carries_what_is_fresh_at_the_time_of_its_voltage() {
     );
     let other = bench.ok(1.5, Channel::CellVoltage(CellIndex(1)), 3.6).expect("a sample");
     assert_eq!((other.cell, other.temperature_c), (CellIndex(1), None), "no sensor serves cell 1");
+}
+
+#[test]
+fn open_contactors_mean_no_current_and_no_charge_measured_or_not() {
+    let limits = limits(f64::NEG_INFINITY, f64::INFINITY, 10.0);
+    let contactor = Some(ContactorConfig { open: vec![0.0, 3.0], limits });
+    let mut bench = Bench::new(SampleConfig { contactor, ..config() });
+    bench.ok(0.0, Channel::Current, 2.0);
+    bench.ok(1.0, Channel::Contactor, 3.0);
+    bench.ok(2.0, Channel::Current, 5.0);
+    let open = bench.ok(9.0, CELL, 3.7).expect("a sample");
+    assert_eq!((open.current_a, open.charge_as, open.offset_s, open.unmeasured_s), (Some(0.0), 2.0, 1.0, 0.0));
+    // Bad readings do not close them, nor does time up to their largest age.
+    bench.give(9.5, Channel::Contactor, Err(Fault::NotAvailable));
+    let late = bench.ok(12.0, CELL, 3.7).expect("a sample");
+    assert_eq!((late.current_a, late.unmeasured_s), (None, 1.0), "not known, and the current's reading is too old");
+    bench.ok(13.0, Channel::Contactor, 0.0);
+    bench.ok(14.0, Channel::Current, 4.0);
+    bench.ok(15.0, Channel::Contactor, 1.0);
+    let closed = bench.ok(16.0, CELL, 3.7).expect("a sample");
+    assert_eq!((closed.current_a, closed.charge_as, closed.unmeasured_s), (Some(4.0), 6.0, 2.0));
 }
 
 #[test]

@@ -56,6 +56,8 @@ section! {
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// A current up to this is rest; a larger one next to a gap may have flowed during the gap. Without it: the rated capacity over 50 h (C/50), per cell.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
+        /// Whether a silent bus means zero current: in more than five seconds without any voltage and current the cells rested, whatever the current before and after. False: a load next to the gap may have continued through it.
+        silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out.
@@ -120,6 +122,7 @@ impl Estimator {
                 self_discharge_per_s: self.self_discharge_per_month / SECONDS_PER_MONTH,
                 away_use_per_s: self.away_use_per_h / 3600.0,
                 rest_current_a: self.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
+                silence_is_rest: self.silence_is_rest,
             },
             voltage: VoltageError {
                 noise_v: self.voltage_noise_v,

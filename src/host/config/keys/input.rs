@@ -85,6 +85,16 @@ signal_section! {
 }
 
 signal_section! {
+    /// The state of the pack's contactors. While it says that they are open, no current flows: 0 A is used in place of what the current sensor reports, also when it reports nothing. Without a state (no reading for `max_age_s`, or none yet) the current is as measured.
+    ContactorInput at "input.contactor", "any unit" {
+        /// Values of the signal (after the DBC's factor, `scale` and `offset`) that mean open; every other value means closed.
+        open: Vec<f64>, "", NotEmpty, Required =>;
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("5.0") =>;
+    }
+}
+
+signal_section! {
     /// One voltage per cell. `{n}` in `signal` stands for the cell's number, `{m}` for any number, in message and signal name:
     /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal; multiplexed signals are supported.
     CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {

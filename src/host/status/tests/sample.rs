@@ -8,8 +8,8 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
-    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
+    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
@@ -99,11 +99,14 @@ fn pack(cells: u16) -> PackStatus {
         limiting_cell: Some(0),
         voltage_v: Some(3.65 * f64::from(cells)),
         current_a: Some(12.5),
+        current_offset_a: Some(-0.034),
+        current_offset_std_a: Some(0.011),
         temperature_max_c: Some(31.25),
         weakest_cell: Some(0),
         capacity_ah: Some(2.412),
         capacity_std_ah: Some(0.021),
         soh: Some(0.928),
+        losses: losses(0.061),
         shortest_lived_cell: Some(0),
         remaining: remaining(412.3),
         usable_capacity_ah: Some(2.31),
@@ -113,6 +116,17 @@ fn pack(cells: u16) -> PackStatus {
         normalised_recharge_period_std_s: Some(61.0),
         reported_soc: None,
         reported_soh: None,
+    }
+}
+
+fn losses(lli: f64) -> LossStatus {
+    LossStatus {
+        lli: Some(lli),
+        lli_std: Some(0.012),
+        lam_ne: Some(0.022),
+        lam_ne_std: Some(0.023),
+        lam_pe: Some(0.021),
+        lam_pe_std: Some(0.024),
     }
 }
 
@@ -138,6 +152,7 @@ fn cell(index: u16, cells: u16) -> CellStatus {
         soc_std: known(0.012),
         capacity_ah: known(2.4 + 0.05 * wave),
         capacity_std_ah: known(0.02),
+        losses: if is_silent { LossStatus::default() } else { losses(0.06 + 0.01 * wave) },
         usable_capacity_ah: None,
         usable_capacity_std_ah: None,
         remaining: if is_silent { RemainingStatus::default() } else { remaining(412.3 + wave) },

@@ -4,7 +4,7 @@ use super::super::folder::{DATABASE, Folder};
 use super::super::parts::JsonParts;
 use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::rows::HistoryTable;
-use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
+use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaining_life};
 use super::super::verify;
 use super::*;
 use crate::alarm::Change;
@@ -172,15 +172,19 @@ fn an_older_layout_is_migrated_with_its_rows() {
     // Now it is a newer layout, which the present program must not touch.
     let before = std::fs::read(&path).unwrap();
     let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
-    assert_eq!(newer, OpenError::Newer { found: 3, known: 2 });
+    assert_eq!(newer, OpenError::Newer { found: 4, known: 3 });
     assert_eq!(std::fs::read(&path).unwrap(), before);
 }
 
 #[test]
-fn a_history_of_layout_version_1_is_read_and_continued() {
+fn a_history_of_an_older_layout_is_read_and_continued() {
+    (1..MIGRATIONS.len()).for_each(continues_from_version);
+}
+
+fn continues_from_version(version: usize) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
-    let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..1]).unwrap();
+    let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..version]).unwrap();
     let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(HistoryRow::Event).collect();
     old.commit(&[RowBatch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
     drop(old);
@@ -191,10 +195,11 @@ fn a_history_of_layout_version_1_is_read_and_continued() {
     };
     assert_eq!(kinds(), [HistoryTable::Capacity]);
     let mut database = open(folder.path());
-    let batch = RowBatch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
-    database.commit(&[batch], None).unwrap();
+    let learned = vec![capacity(0, Some(2.0), 1.8), loss_modes(0, 0.08), remaining_life(90.0)];
+    database.commit(&[RowBatch { stamp: stamp(3.0), rows: rows(learned) }], None).unwrap();
     drop(database);
-    assert_eq!(kinds(), [HistoryTable::Capacity, HistoryTable::Capacity, HistoryTable::RemainingLife]);
+    let [capacity, losses, life] = [HistoryTable::Capacity, HistoryTable::LossModes, HistoryTable::RemainingLife];
+    assert_eq!(kinds(), [capacity, capacity, losses, life]);
 }
 
 #[test]
@@ -206,7 +211,7 @@ fn a_failed_migration_changes_nothing() {
         MIGRATIONS.iter().copied().chain(["CREATE TABLE added (id); INSERT INTO nowhere VALUES (1);"]).collect();
     Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap_err();
     let database = open(folder.path());
-    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (2, 200));
+    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (3, 200));
 }
 
 #[test]

@@ -33,6 +33,19 @@ pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
     }
 }
 
+/// What a cell has lost.
+pub(in crate::store) fn loss_modes(cell: u16, lli: f64) -> EventKind {
+    EventKind::LossModes {
+        cell: CellIndex(cell),
+        lli,
+        lli_std: 0.03,
+        lam_ne: 0.05,
+        lam_ne_std: 0.05,
+        lam_pe: 0.05,
+        lam_pe_std: 0.05,
+    }
+}
+
 /// What remains of the pack's life, cycles.
 pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     EventKind::RemainingLife {
@@ -69,6 +82,7 @@ fn every_row_has_a_value_per_column() {
     let kinds = [
         half_cycle(3),
         capacity(3, None, 2.4),
+        loss_modes(3, 0.1),
         remaining_life(100.0),
         alarm(Change::Raised),
         EventKind::AlarmDropped {

@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 
+use crate::cell::LossModes;
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
 
@@ -131,6 +132,12 @@ pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("usable_capacity_std_ah"));
     "resistance_ratio" Real "", "resistance relative to new", |row| FieldValue::Real(row.capacity.number("resistance_ratio"));
     "resistance_ratio_std" Real "", "its standard deviation", |row| FieldValue::Real(row.capacity.number("resistance_ratio_std"));
+    "lli" Real "fraction" null, "loss of lithium inventory, part of the model's new cell; null = not learned, or a model without electrodes", |row| loss(row, |it| it.lithium.mean);
+    "lli_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.lithium.std());
+    "lam_ne" Real "fraction" null, "loss of active material of the negative electrode", |row| loss(row, |it| it.negative.mean);
+    "lam_ne_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.negative.std());
+    "lam_pe" Real "fraction" null, "loss of active material of the positive electrode", |row| loss(row, |it| it.positive.mean);
+    "lam_pe_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.positive.std());
     "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little is known", |row| cycles(row, |left| left.median);
     "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
     "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
@@ -176,6 +183,10 @@ fn text(value: &str) -> FieldValue<'_> {
 
 fn branch(row: &EstimateRow, index: usize) -> FieldValue<'_> {
     maybe(row.estimate.branch_v.get(index).copied())
+}
+
+fn loss(row: &HalfCycleRow, get: fn(&LossModes) -> f64) -> FieldValue<'_> {
+    maybe(row.losses.as_ref().map(get))
 }
 
 fn cycles(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use crate::alarm::Rule;
+use crate::cell::LossModes;
 use crate::fields::Fields;
 use crate::health::RemainingLife;
 use crate::monitor::Estimate;
@@ -25,6 +26,8 @@ pub(super) struct HalfCycleRow {
     pub(super) half: Fields,
     /// Values of the event `Capacity`.
     pub(super) capacity: Fields,
+    /// `None` = not known.
+    pub(super) losses: Option<LossModes>,
     /// `None` = too little is known.
     pub(super) remaining: Option<RemainingLife>,
 }

@@ -66,7 +66,7 @@ fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
     let plan = plan().0;
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
     assert_eq!(plan.cycle_times_ms(), [100, 1000, 1000]);
-    assert_eq!(plan.health_pages(), 4);
+    assert_eq!(plan.health_pages(), 5);
 }
 
 #[test]
@@ -101,7 +101,7 @@ fn status_reads_back_within_half_a_bit() {
 }
 
 /// Fields of the health frame with the page each is on, a value inside, and what it reads.
-const HEALTH_VALUES: [(usize, &str, f64, f64); 11] = [
+const HEALTH_VALUES: [(usize, &str, f64, f64); 17] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
     (0, "Soh", 0.871, 87.1),
@@ -113,6 +113,12 @@ const HEALTH_VALUES: [(usize, &str, f64, f64); 11] = [
     (3, "RemainingCycles", 412.3, 412.0),
     (3, "RemainingCyclesLow", 207.8, 208.0),
     (3, "RemainingDays", 533.0, 533.0),
+    (4, "Lli", 0.1127, 11.2),
+    (4, "LliStd", 0.0213, 2.0),
+    (4, "LamNe", 0.0402, 4.0),
+    (4, "LamNeStd", 0.0407, 4.0),
+    (4, "LamPe", 0.0391, 4.0),
+    (4, "LamPeStd", 0.0512, 5.0),
 ];
 
 fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
@@ -128,6 +134,9 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
         remaining_cycles: of(8),
         remaining_cycles_low: of(9),
         remaining_days: of(10),
+        lli: [of(11), of(12)],
+        lam_ne: [of(13), of(14)],
+        lam_pe: [of(15), of(16)],
     }
 }
 
@@ -139,7 +148,7 @@ fn every_page_of_the_health_frame_reads_back_within_half_a_bit() {
         says(&format!("Health.{name}"), &frame, wanted);
         assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
-        assert_eq!(plan().health(page + 4, &fields), frame, "after the last page comes the first");
+        assert_eq!(plan().health(page + 5, &fields), frame, "after the last page comes the first");
     }
 }
 
@@ -327,7 +336,8 @@ fn a_value_that_could_be_read_as_another_s_is_refused() {
             "signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14], must be for 1 alone"
         ]
     );
-    assert_eq!(faults("Page M : 16|4@1+", "Page M : 16|1@1+").len(), 6, "three signals are on page 2, three on page 3");
+    let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
+    assert_eq!(unreachable, 12, "three signals are on page 2, three on page 3, six on page 4");
 }
 
 #[test]
