@@ -10,6 +10,7 @@ pub mod config;
 pub mod electrodes;
 pub mod estimator;
 pub mod model;
+pub mod model_check;
 
 pub use aged_ocv::AgedOcv;
 pub use config::{
@@ -21,3 +22,4 @@ pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResul
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
 };
+pub use model_check::{ModelCheck, ModelEvidence};
