@@ -1,7 +1,7 @@
 //! Checks in a cell's first hour of use whether the configured model is that of the cell.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
-//! [`ModelCheck::mismatch`], above 1 when the model is another cell's. Readings without an update, after a gap or beyond the
+//! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after a gap or beyond the
 //! gate are no evidence.
 //!
 //! A filter hides a wrong model from its innovations: it corrects the resistance and then the SOC by them. Two witnesses remain:
@@ -20,9 +20,11 @@ use serde::{Deserialize, Serialize};
 use crate::filter::Update;
 use crate::quantity::InvalidState;
 
-/// Time of use that is judged, s. In half of it the resistance has settled on drives down to -10 degrees C; later, ageing and
-/// temperature count as well.
+/// Time of use that is judged, s. Half of it shows another cell on drives from -10 to 40 degrees C; later, ageing counts as well.
 const WINDOW_S: f64 = 3600.0;
+
+/// Time of use before a judgement, s: in the first minutes the filter still settles, and one wrong reading weighs much.
+const SETTLING_S: f64 = 600.0;
 
 /// Time between two pieces of evidence, s: short against the 100 s over which a model states its error.
 const PERIOD_S: f64 = 10.0;
@@ -86,7 +88,7 @@ impl ModelCheck {
         self.use_s < WINDOW_S
     }
 
-    /// Adds a step's time, s, and charge, A s; a step with unmeasured time begins anew.
+    /// Adds a step's time, s, and charge, A s; a step with unmeasured time discards them.
     #[inline]
     pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {
         if unmeasured_s > 0.0 {
@@ -123,6 +125,9 @@ impl ModelCheck {
         }
         for (sum, value) in self.score.iter_mut().zip([1.0, soc]) {
             *sum += weight * value * update.innovation;
+        }
+        if self.use_s < SETTLING_S {
+            return;
         }
         let resistance = if log_resistance_std > 0.0 { (log_resistance / log_resistance_std).powi(2) } else { 0.0 };
         let curve = self.curve();
