@@ -27,6 +27,7 @@
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |
+//! | how a model of another cell is found | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
 //! | a finding of the doctor | `doctor/judge/` |
 //! | a scenario of the simulator | `sim/scenario.rs` |

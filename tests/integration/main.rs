@@ -39,6 +39,7 @@ mod monitor_reconfigure;
 mod monitor_restart;
 mod monitor_scenarios;
 mod monitor_statistics;
+mod other_cell;
 mod output_dbc;
 mod paper_scenario;
 mod protected_input;

@@ -20,7 +20,8 @@ pub enum Rule {
     InputMissing = 4,
     /// A configured input keeps being implausible; the value is the share of bad readings, fraction.
     InputImplausible = 5,
-    /// The estimator's innovations contradict its own covariance; the value is the mean normalised innovation squared.
+    /// The estimator's innovations contradict its own covariance, or the model is another cell's; the value is the mean
+    /// normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) in the same scale.
     EstimateUntrusted = 6,
     /// Resistance relative to new above the threshold, as the last half-cycle left it.
     ResistanceHigh = 7,

@@ -11,6 +11,7 @@ pub mod electrodes;
 pub mod estimator;
 pub mod loss_modes;
 pub mod model;
+pub mod model_check;
 
 pub use aged_ocv::AgedOcv;
 pub use config::{
@@ -23,3 +24,4 @@ pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
 };
+pub use model_check::{ModelCheck, ModelEvidence};

@@ -1,13 +1,13 @@
 //! Estimation stage: from cell samples to the estimate of every cell.
 //!
 //! In: batches of samples, and what half-cycles have taught ([`Learner`]). Out: one filter step per sample, and whether
-//! each cell's innovations agree with their covariance. A sample whose filter fails resets that filter, no other.
+//! each cell's innovations agree with their covariance and its model is its own ([`ModelCheck`]). A sample whose filter fails resets that filter, no other.
 
 use serde::{Deserialize, Serialize};
 
 use super::batch::CellBatch;
 use super::{Estimate, MeasuredValues, MonitorConfig};
-use crate::cell::{CellStep, EstimatorBank};
+use crate::cell::{CellStep, EstimatorBank, ModelCheck, ModelEvidence};
 use crate::filter::ScalarGaussian;
 use crate::health::Learner;
 use crate::quantity::{CellIndex, Timestamp};
@@ -23,6 +23,10 @@ pub(super) struct Estimation {
     /// Per cell: whether its innovations agree with their covariance.
     trusted: Vec<bool>,
     pub(super) all_trusted: bool,
+    /// One per cell.
+    checks: Vec<ModelCheck>,
+    any_check_open: bool,
+    pub(super) any_mismatched: bool,
     ambient_c: f64,
     /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
     after_gap: Vec<usize>,
@@ -56,6 +60,9 @@ impl Estimation {
             progress: vec![CellProgress::default(); cells],
             trusted: vec![true; cells],
             all_trusted: true,
+            checks: vec![ModelCheck::default(); cells],
+            any_check_open: true,
+            any_mismatched: false,
             ambient_c: config.sample.ambient_c,
             after_gap: Vec::new(),
         }
@@ -76,6 +83,8 @@ impl Estimation {
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
+        self.checks.fill(ModelCheck::default());
+        self.note_checks();
     }
 
     /// Number of cells.
@@ -101,6 +110,7 @@ impl Estimation {
 
     /// Ends the work on stepped samples.
     pub(super) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
+        self.check_models(&samples);
         samples.clear();
         self.batch.waiting = samples;
         let bank = &self.bank;
@@ -122,6 +132,9 @@ impl Estimation {
             unmeasured_s = unmeasured - before.unmeasured_s;
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
             gap_s = unmeasured_s;
+        }
+        if self.any_check_open {
+            self.checks[index].add_step(measured_s, charge_as, unmeasured_s);
         }
         if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
             self.after_gap.push(index);
@@ -153,9 +166,56 @@ impl Estimation {
         self.trusted[index]
     }
 
+    /// Takes the evidence about the cells' models that is due.
+    fn check_models(&mut self, samples: &[CellSample]) {
+        if !self.any_check_open {
+            return;
+        }
+        let mut has_judged = false;
+        let Self { bank, checks, .. } = self;
+        for index in samples.iter().map(|sample| sample.cell.index()) {
+            if !checks[index].is_due() {
+                continue;
+            }
+            let update = bank.result(index).update.filter(|_| !bank.result(index).reset);
+            let evidence = update.zip(bank.filtered_soc(index)).map(|(update, soc)| ModelEvidence {
+                update,
+                soc: soc.mean,
+                log_resistance: bank.log_resistance(index).mean,
+                log_resistance_std: bank.config().initial.log_resistance_std,
+            });
+            checks[index].judge(evidence, bank.model().rated_capacity_ah);
+            has_judged = true;
+        }
+        if has_judged {
+            self.note_checks();
+        }
+    }
+
+    fn note_checks(&mut self) {
+        self.any_check_open = self.checks.iter().any(ModelCheck::is_open);
+        self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
+    }
+
+    /// The check of a cell's model, for the snapshot.
+    pub(super) fn model_check(&self, index: usize) -> ModelCheck {
+        self.checks[index]
+    }
+
+    /// How much a cell contradicts its estimate: the mean normalised innovation squared, or the mismatch of a model that is
+    /// another cell's, in the same scale: times the consistency limit.
+    pub(super) fn contradiction(&self, index: usize) -> f64 {
+        let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
+        if check.is_mismatched() {
+            mean_nis.max(check.mismatch() * self.bank.config().consistency.limit)
+        } else {
+            mean_nis
+        }
+    }
+
     /// Judges a cell's innovations; whether it is trusted, when that has changed.
     pub(super) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
-        let is_trusted = self.bank.mean_nis(cell.index()) <= self.bank.config().consistency.limit;
+        let is_trusted = self.contradiction(cell.index()) <= self.bank.config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
             return None;
         }
@@ -207,12 +267,19 @@ impl Estimation {
         self.progress[cell].consumed
     }
 
-    /// Continues from stored cells: what their steps have used, whether they are trusted, and the batch.
-    pub(super) fn restore(&mut self, cells: impl Iterator<Item = (Option<Consumed>, bool)>, batch: CellBatch) {
-        for (index, (consumed, trusted)) in cells.enumerate() {
+    /// Continues from stored cells: what their steps have used, whether they are trusted, the checks of their models, and the
+    /// batch.
+    pub(super) fn restore(
+        &mut self,
+        cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
+        batch: CellBatch,
+    ) {
+        for (index, (consumed, trusted, check)) in cells.enumerate() {
             self.progress[index].consumed = consumed;
             self.trusted[index] = trusted;
+            self.checks[index] = check;
         }
+        self.note_checks();
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
         self.batch = batch;
     }

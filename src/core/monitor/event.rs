@@ -242,9 +242,9 @@ pub enum EventKind {
     Trust {
         /// Which cell.
         cell: CellIndex,
-        /// Whether its innovations agree with its covariance.
+        /// Whether its innovations agree with its covariance, and its model is not another cell's.
         trusted: bool,
-        /// Mean normalised innovation squared over the window.
+        /// Mean normalised innovation squared over the window; for a model of another cell its mismatch in the same scale.
         mean_nis: f64,
     },
 }

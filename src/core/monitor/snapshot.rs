@@ -16,7 +16,7 @@ use super::sender::Schedule;
 use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
-use crate::cell::{CellEstimator, CellModel, CellState};
+use crate::cell::{CellEstimator, CellModel, CellState, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp};
@@ -62,6 +62,9 @@ struct StoredCell {
     estimator: CellState,
     consumed: Option<Consumed>,
     trusted: bool,
+    /// Ended in states of programs without one: an aged cell is not judged as a new one.
+    #[serde(default = "ModelCheck::ended")]
+    model_check: ModelCheck,
     #[serde(flatten)]
     health: CellHealth,
     /// `None` in states of programs without forecasts: it begins with the next reading.
@@ -197,6 +200,7 @@ impl Stages {
             estimator: estimation.bank.cell(cell).snapshot(),
             consumed: estimation.consumed(cell),
             trusted: estimation.is_trusted(cell),
+            model_check: estimation.model_check(cell),
             health: learning.cells[cell],
             forecast: Some(learning.lives.cells[cell].forecast.clone()),
             updated_in_round: estimation.batch.has_reported(cell),
@@ -215,7 +219,7 @@ impl Stages {
             }
         }
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
-        let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted));
+        let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
         estimation.restore(cells, CellBatch::restore(has_reported, snapshot.waiting));
         // Its shape is checked in `Monitor::restore`.
         sampling.sampler.restore(snapshot.sampler);
@@ -290,6 +294,7 @@ impl LearningState {
 impl StoredCell {
     fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
+        self.model_check.check()?;
         InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;
         check_positive("the usable capacity", self.health.usable)?;
         check_positive("the resistance of discharge", self.health.discharge_resistance)?;

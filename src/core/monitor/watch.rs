@@ -233,7 +233,8 @@ impl Stages {
 
     /// Whether no cell's innovations can change an alarm or its trust: then they are only shown.
     pub(super) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
-        self.estimation.all_trusted && !out.want_alarm_inputs && {
+        let is_known_good = self.estimation.all_trusted && !self.estimation.any_mismatched;
+        is_known_good && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
             worst <= bank.config().consistency.limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
@@ -247,8 +248,8 @@ impl Stages {
         }
         for cell in samples.iter().map(|sample| sample.cell) {
             if self.sampling.inputs_valid(cell, now) {
-                let mean_nis = self.estimation.bank.mean_nis(cell.index());
-                self.alarming.engine.show(Rule::EstimateUntrusted, Some(cell), mean_nis);
+                let contradiction = self.estimation.contradiction(cell.index());
+                self.alarming.engine.show(Rule::EstimateUntrusted, Some(cell), contradiction);
             }
         }
     }
@@ -256,7 +257,7 @@ impl Stages {
     /// Judges whether a cell's innovations agree with its covariance; an event on change. `is_current`: the rule takes
     /// them, too.
     pub(super) fn judge_trust(&mut self, now: Timestamp, cell: CellIndex, is_current: bool, out: &mut Outputs) {
-        let mean_nis = self.estimation.bank.mean_nis(cell.index());
+        let mean_nis = self.estimation.contradiction(cell.index());
         let change = self.estimation.judge_trust(cell);
         // Without a current the filter continues, but its innovations say nothing about its model.
         let is_observed = is_current && self.sampling.inputs_valid(cell, now);
@@ -277,7 +278,7 @@ impl Stages {
             let (cell, index) = (Some(index), index.index());
             let capacity = self.learning.state.learner.has_learned(index).then(|| self.learning.capacity(index));
             let is_estimated = was_brief && self.estimation.bank.soc(index).is_some();
-            let mean_nis = is_estimated.then(|| self.estimation.bank.mean_nis(index));
+            let mean_nis = is_estimated.then(|| self.estimation.contradiction(index));
             let health = &self.learning.cells[index];
             let known = [
                 (Rule::CapacityLow, capacity.map(old)),

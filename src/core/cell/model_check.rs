@@ -1,0 +1,240 @@
+//! Checks in a cell's first hour of use whether the configured model is that of the cell.
+//!
+//! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
+//! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after a gap or beyond the
+//! gate are no evidence.
+//!
+//! A filter hides a wrong model from its innovations: it corrects the resistance and then the SOC by them. Two witnesses remain:
+//! * r^2, the square of ln(resistance relative to new) over its configured standard deviation,
+//! * c^2, what a constant a and a slope b over SOC explain of the innovations v: with the sums A and g of `h h' / R` and `h v / R`,
+//!   h = (1, SOC - 0.5) and R the variance over the time that a reading stands for, c^2 = g' (A + P^-1)^-1 g (the score test;
+//!   Cox and Hinkley, Theoretical Statistics, 1974, section 9.3), P the variances of a and b in another chemistry.
+//!
+//! Each witness counts at most [`CORROBORATED`] times as much as the other: an aged cell has a higher resistance and fitting
+//! voltages, and a local error of a cell's own curve leaves its resistance as it is. Another cell differs in both.
+//!
+//! The check ends after [`WINDOW_S`]: a cell ages, but does not become another one. A mismatch stays until the cell is forgotten.
+
+use serde::{Deserialize, Serialize};
+
+use crate::filter::Update;
+use crate::quantity::InvalidState;
+
+/// Time of use that is judged, s. Half of it shows another cell on drives from -10 to 40 degrees C; later, ageing counts as well.
+const WINDOW_S: f64 = 3600.0;
+
+/// Time of use before a judgement, s: in the first minutes the filter still settles, and one wrong reading weighs much.
+const SETTLING_S: f64 = 600.0;
+
+/// Time between two pieces of evidence, s: short against the 100 s over which a model states its error.
+const PERIOD_S: f64 = 10.0;
+
+/// Longest time that one reading stands for, s.
+const MAX_PERIOD_S: f64 = 90.0;
+
+/// Least mean current that is use, per rated capacity: C/50. Below it the resistance shows nothing.
+const LEAST_USE_PER_H: f64 = 0.02;
+
+/// Standard deviations of what another cell's curve adds to the voltage: a constant, V, and a slope, V per unit of SOC.
+const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
+
+/// How many times as much as the other a witness counts at most.
+const CORROBORATED: f64 = 4.0;
+
+/// Sum of the witnesses that is a mismatch: three deviations (constant, slope, resistance) of 1.4 standard deviations each.
+const LIMIT: f64 = 6.0;
+
+/// Evidence about one cell's model.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelCheck {
+    /// Time of use judged so far, s.
+    use_s: f64,
+    /// Time, s, and charge, A s, since the last evidence.
+    since_s: f64,
+    since_as: f64,
+    /// Duration of the latest step, s.
+    step_s: f64,
+    /// Sums of 1 / R, (SOC - 0.5) / R and (SOC - 0.5)^2 / R.
+    information: [f64; 3],
+    /// Sums of v / R and (SOC - 0.5) v / R.
+    score: [f64; 2],
+    /// Largest sum of the witnesses over [`LIMIT`].
+    mismatch: f64,
+}
+
+/// What the filter says about a cell when evidence is due.
+#[derive(Debug, Clone, Copy)]
+pub struct ModelEvidence {
+    /// The latest update.
+    pub update: Update,
+    /// State of charge after it, fraction.
+    pub soc: f64,
+    /// ln(resistance relative to new).
+    pub log_resistance: f64,
+    /// Its configured standard deviation before the first voltage.
+    pub log_resistance_std: f64,
+}
+
+impl ModelCheck {
+    /// A check that has ended without a mismatch: for states stored by programs without one.
+    pub fn ended() -> Self {
+        Self { use_s: WINDOW_S, ..Self::default() }
+    }
+
+    /// Whether evidence still counts.
+    #[inline]
+    pub fn is_open(&self) -> bool {
+        self.use_s < WINDOW_S
+    }
+
+    /// Adds a step's time, s, and charge, A s; a step with unmeasured time discards them.
+    #[inline]
+    pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {
+        if unmeasured_s > 0.0 {
+            (self.since_s, self.since_as, self.step_s) = (0.0, 0.0, 0.0);
+            return;
+        }
+        self.since_s += measured_s;
+        self.since_as += charge_as;
+        self.step_s = measured_s;
+    }
+
+    /// Whether evidence is due.
+    #[inline]
+    pub fn is_due(&self) -> bool {
+        self.since_s >= PERIOD_S && self.is_open()
+    }
+
+    /// Takes due evidence of a cell of rated capacity `rated_ah`, Ah; `None` when the filter has none.
+    pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
+        let (elapsed_s, charge_as) = (self.since_s.min(MAX_PERIOD_S), self.since_as);
+        let is_used = charge_as.abs() >= LEAST_USE_PER_H * rated_ah * self.since_s;
+        (self.since_s, self.since_as) = (0.0, 0.0);
+        let Some(ModelEvidence { update, soc, log_resistance, log_resistance_std }) = evidence else { return };
+        // A reading's variance is that of the step before it.
+        let variance = update.innovation_variance * (self.step_s / elapsed_s).min(1.0);
+        let is_number = (update.innovation / variance).is_finite() && soc.is_finite() && log_resistance.is_finite();
+        if !is_used || !update.accepted || !is_number {
+            return;
+        }
+        self.use_s += elapsed_s;
+        let (weight, soc) = (1.0 / variance, soc - 0.5);
+        for (sum, value) in self.information.iter_mut().zip([1.0, soc, soc * soc]) {
+            *sum += weight * value;
+        }
+        for (sum, value) in self.score.iter_mut().zip([1.0, soc]) {
+            *sum += weight * value * update.innovation;
+        }
+        if self.use_s < SETTLING_S {
+            return;
+        }
+        let resistance = if log_resistance_std > 0.0 { (log_resistance / log_resistance_std).powi(2) } else { 0.0 };
+        let curve = self.curve();
+        let sum = resistance.min(CORROBORATED * curve) + curve.min(CORROBORATED * resistance);
+        self.mismatch = self.mismatch.max(sum / LIMIT);
+    }
+
+    /// What a constant and a slope over SOC explain of the innovations: c^2.
+    fn curve(&self) -> f64 {
+        let ([mut a, b, mut c], [g, h]) = (self.information, self.score);
+        (a, c) = (a + CURVE_STD_V[0].powi(-2), c + CURVE_STD_V[1].powi(-2));
+        (g * g * c - 2.0 * g * h * b + h * h * a) / (a * c - b * b)
+    }
+
+    /// Largest evidence so far that the model is another cell's, relative to the limit.
+    pub fn mismatch(&self) -> f64 {
+        self.mismatch
+    }
+
+    /// Whether the model is another cell's.
+    #[inline]
+    pub fn is_mismatched(&self) -> bool {
+        self.mismatch > 1.0
+    }
+
+    /// Checks stored numbers; the error is the first impossible one.
+    ///
+    /// # Errors
+    /// The first number that is out of range.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        let natural = [self.use_s, self.since_s, self.step_s, self.information[0], self.information[2], self.mismatch];
+        InvalidState::unless_naturals("a number of the check of a cell's model", natural)?;
+        let signed = [self.since_as, self.information[1], self.score[0], self.score[1]];
+        InvalidState::unless_numbers("a sum of the check of a cell's model", signed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The check after `use_s` of steps of 1 s at 1 C, the SOC falling from 0.9; `voltage` gives the innovation by SOC, V.
+    fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
+        let mut check = ModelCheck::default();
+        for second in 0..use_s {
+            let soc = 0.9 - f64::from(second) / 3600.0;
+            check.add_step(1.0, 2.0, 0.0);
+            if check.is_due() {
+                let innovation = voltage(soc);
+                let update = Update { innovation, innovation_variance: 0.09, test_ratio: 0.0, accepted: true };
+                let evidence = ModelEvidence { update, soc, log_resistance: f64::ln(ratio), log_resistance_std: 0.2 };
+                check.judge(Some(evidence), 2.0);
+            }
+        }
+        check
+    }
+
+    #[test]
+    fn resistance_and_voltages_of_another_cell_are_a_mismatch_within_half_an_hour() {
+        assert!(after(1800, 0.65, |_| 0.02).is_mismatched());
+        assert!(after(1800, 1.6, |soc| 0.15 * (soc - 0.65)).is_mismatched());
+    }
+
+    #[test]
+    fn one_witness_alone_is_no_mismatch() {
+        let aged = after(3600, 1.8, |_| 0.0);
+        assert!(!aged.is_mismatched() && !aged.is_open(), "{aged:?}");
+        let local = after(3600, 1.0, |_| 0.03);
+        assert!(!local.is_mismatched(), "{local:?}");
+    }
+
+    #[test]
+    fn a_mismatch_stays_and_a_cell_that_has_passed_does_not_become_another() {
+        let mut found = after(1800, 0.6, |_| 0.03);
+        let passed = after(3600, 1.0, |_| 0.0);
+        let evidence = |innovation| {
+            let update = Update { innovation, innovation_variance: 0.09, test_ratio: 0.0, accepted: true };
+            Some(ModelEvidence { update, soc: 0.5, log_resistance: 1.0, log_resistance_std: 0.2 })
+        };
+        for _ in 0..100 {
+            found.add_step(10.0, 20.0, 0.0);
+            found.judge(evidence(0.0), 2.0);
+        }
+        assert!(found.is_mismatched());
+        assert!(!passed.is_open() && !passed.is_mismatched() && !passed.is_due());
+    }
+
+    #[test]
+    fn rest_gaps_rejected_and_unusable_readings_are_no_evidence() {
+        let update = Update { innovation: 0.1, innovation_variance: 0.01, test_ratio: 0.0, accepted: true };
+        let good = ModelEvidence { update, soc: 0.5, log_resistance: 1.0, log_resistance_std: 0.2 };
+        let mut check = ModelCheck::default();
+        check.add_step(20.0, 0.0, 0.0);
+        check.judge(Some(good), 2.0);
+        check.add_step(20.0, 40.0, 0.0);
+        check.add_step(1.0, 0.0, 5.0);
+        assert!(!check.is_due());
+        for update in [
+            Update { accepted: false, ..update },
+            Update { innovation: f64::NAN, ..update },
+            Update { innovation_variance: 0.0, ..update },
+        ] {
+            check.add_step(20.0, 40.0, 0.0);
+            check.judge(Some(ModelEvidence { update, ..good }), 2.0);
+        }
+        assert_eq!(check, ModelCheck { step_s: 20.0, ..ModelCheck::default() });
+        assert_eq!(check.check(), Ok(()));
+        assert!(ModelCheck { mismatch: f64::NAN, ..check }.check().is_err());
+    }
+}

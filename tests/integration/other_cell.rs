@@ -1,0 +1,67 @@
+//! A model of another cell on a measured drive, through `packwatch replay`: the estimate is not trusted within half an hour.
+//!
+//! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah; each drives with the model of either.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde_json::Value;
+
+/// The measured data, or `None` where it is not.
+#[expect(clippy::print_stdout, reason = "a skipped test says so")]
+fn data() -> Option<PathBuf> {
+    let root = std::env::var_os("PACKWATCH_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    if root.join("panasonic_18650pf/25C/HWFTa.csv.gz").is_file() && root.join("lg_18650hg2/25C").is_dir() {
+        return Some(root);
+    }
+    println!("SKIPPED: no measured data in {}", root.display());
+    None
+}
+
+fn run(arguments: &[&str]) {
+    let output = Command::new(env!("CARGO_BIN_EXE_packwatch")).args(arguments).output().unwrap();
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Fits a model of the cell in `folder` on its slow discharge and some of its drives at 25 degrees C.
+fn fit(folder: &Path, capacity_ah: &str, slow: &str, drives: &[&str], model: &Path) {
+    let path = |name: &str| folder.join("25C").join(format!("{name}.csv.gz")).display().to_string();
+    let (model, slow) = (model.display().to_string(), path(slow));
+    let drives: Vec<String> = drives.iter().map(|name| path(name)).collect();
+    let mut arguments = vec!["fit", "-o", &model, "--name", "cell", "--capacity", capacity_ah, "--ocv", &slow];
+    arguments.extend(drives.iter().map(String::as_str));
+    run(&arguments);
+}
+
+/// When the estimate was first not trusted, s since the first row; `None` = never.
+fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    let text = std::fs::read_to_string(shipped.join("score.toml")).unwrap();
+    let text = text
+        .replace("\"cells/example_nmc_2600.toml\"", &format!("{model:?}"))
+        .replace("\"measured.dbc\"", &format!("{:?}", shipped.join("measured.dbc")));
+    let (config, events) = (folder.join("replay.toml"), folder.join("events.jsonl"));
+    std::fs::write(&config, text).unwrap();
+    let path = |path: &Path| path.display().to_string();
+    run(&["replay", "-c", &path(&config), &path(drive), "--sleep-gap", "90", "--events", &path(&events)]);
+    let text = std::fs::read_to_string(&events).unwrap();
+    let events = text.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let mut untrusted = events.filter(|event| event["event"] == "trust" && event["trusted"] == false);
+    untrusted.next().map(|event| event["time"].as_f64().unwrap() / 1e9)
+}
+
+#[test]
+fn a_drive_with_the_model_of_another_cell_is_untrusted_within_half_an_hour_and_with_its_own_never() {
+    let Some(root) = data() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (panasonic, lg) = (root.join("panasonic_18650pf"), root.join("lg_18650hg2"));
+    let models = ["panasonic.toml", "lg.toml"].map(|name| folder.path().join(name));
+    fit(&panasonic, "2.995", "ocv_c20", &["Cycle_1", "NN"], &models[0]);
+    fit(&lg, "2.781", "549_C20DisCh", &["551_Mixed1", "552_Mixed4"], &models[1]);
+    for (drive, own, other) in [(panasonic.join("25C/HWFTa.csv.gz"), 0, 1), (lg.join("25C/551_Mixed2.csv.gz"), 1, 0)] {
+        assert_eq!(first_untrusted_s(folder.path(), &models[own], &drive), None, "{drive:?}");
+        let found_s = first_untrusted_s(folder.path(), &models[other], &drive);
+        assert!(found_s.is_some_and(|found_s| found_s < 1800.0), "{drive:?}: {found_s:?}");
+    }
+}
