@@ -1,8 +1,8 @@
 //! Checks in a cell's first hour of use whether the configured model is that of the cell.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
-//! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after a gap or beyond the
-//! gate are no evidence.
+//! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after
+//! a gap or beyond the gate are no evidence.
 //!
 //! A filter hides a wrong model from its innovations: it corrects the resistance and then the SOC by them. Two witnesses remain:
 //! * r^2, the square of ln(resistance relative to new) over its configured standard deviation,
@@ -13,7 +13,8 @@
 //! Each witness counts at most [`CORROBORATED`] times as much as the other: an aged cell has a higher resistance and fitting
 //! voltages, and a local error of a cell's own curve leaves its resistance as it is. Another cell differs in both.
 //!
-//! The check ends after [`WINDOW_S`]: a cell ages, but does not become another one. A mismatch stays until the cell is forgotten.
+//! The check ends after [`WINDOW_S`] without a mismatch: a cell ages, but does not become another one. With one, the next window is
+//! judged by itself, and so on until one passes: an aged cell whose capacity and resistance have been learned is trusted again.
 
 use serde::{Deserialize, Serialize};
 
@@ -59,8 +60,11 @@ pub struct ModelCheck {
     information: [f64; 3],
     /// Sums of v / R and (SOC - 0.5) v / R.
     score: [f64; 2],
-    /// Largest sum of the witnesses over [`LIMIT`].
+    /// Largest sum of the witnesses over [`LIMIT`] in this window.
     mismatch: f64,
+    /// That of the window before, if it was a mismatch.
+    #[serde(default)]
+    before: f64,
 }
 
 /// What the filter says about a cell when evidence is due.
@@ -133,6 +137,10 @@ impl ModelCheck {
         let curve = self.curve();
         let sum = resistance.min(CORROBORATED * curve) + curve.min(CORROBORATED * resistance);
         self.mismatch = self.mismatch.max(sum / LIMIT);
+        if !self.is_open() {
+            let found = if self.mismatch > 1.0 { self.mismatch } else { 0.0 };
+            *self = Self { before: found, use_s: if found > 0.0 { 0.0 } else { WINDOW_S }, ..Self::default() };
+        }
     }
 
     /// What a constant and a slope over SOC explain of the innovations: c^2.
@@ -142,15 +150,16 @@ impl ModelCheck {
         (g * g * c - 2.0 * g * h * b + h * h * a) / (a * c - b * b)
     }
 
-    /// Largest evidence so far that the model is another cell's, relative to the limit.
+    /// Largest evidence of this window and the one before that the model is another cell's, relative to the limit.
+    #[inline]
     pub fn mismatch(&self) -> f64 {
-        self.mismatch
+        self.mismatch.max(self.before)
     }
 
     /// Whether the model is another cell's.
     #[inline]
     pub fn is_mismatched(&self) -> bool {
-        self.mismatch > 1.0
+        self.mismatch() > 1.0
     }
 
     /// Checks stored numbers; the error is the first impossible one.
@@ -158,7 +167,15 @@ impl ModelCheck {
     /// # Errors
     /// The first number that is out of range.
     pub fn check(&self) -> Result<(), InvalidState> {
-        let natural = [self.use_s, self.since_s, self.step_s, self.information[0], self.information[2], self.mismatch];
+        let natural = [
+            self.use_s,
+            self.since_s,
+            self.step_s,
+            self.information[0],
+            self.information[2],
+            self.mismatch,
+            self.before,
+        ];
         InvalidState::unless_naturals("a number of the check of a cell's model", natural)?;
         let signed = [self.since_as, self.information[1], self.score[0], self.score[1]];
         InvalidState::unless_numbers("a sum of the check of a cell's model", signed)
@@ -200,19 +217,22 @@ mod tests {
     }
 
     #[test]
-    fn a_mismatch_stays_and_a_cell_that_has_passed_does_not_become_another() {
-        let mut found = after(1800, 0.6, |_| 0.03);
-        let passed = after(3600, 1.0, |_| 0.0);
-        let evidence = |innovation| {
+    fn a_mismatch_lasts_until_a_window_passes_and_a_cell_that_has_passed_does_not_become_another() {
+        let mut check = after(1800, 0.6, |_| 0.03);
+        let mut judge_an_hour = |check: &mut ModelCheck, innovation, log_resistance| {
             let update = Update { innovation, innovation_variance: 0.09, test_ratio: 0.0, accepted: true };
-            Some(ModelEvidence { update, soc: 0.5, log_resistance: 1.0, log_resistance_std: 0.2 })
+            for _ in 0..360 {
+                check.add_step(10.0, 20.0, 0.0);
+                check.judge(Some(ModelEvidence { update, soc: 0.5, log_resistance, log_resistance_std: 0.2 }), 2.0);
+            }
         };
-        for _ in 0..100 {
-            found.add_step(10.0, 20.0, 0.0);
-            found.judge(evidence(0.0), 2.0);
-        }
-        assert!(found.is_mismatched());
-        assert!(!passed.is_open() && !passed.is_mismatched() && !passed.is_due());
+        judge_an_hour(&mut check, 0.2, -0.5);
+        assert!(check.is_mismatched() && check.is_open(), "the model is still another cell's");
+        judge_an_hour(&mut check, 0.0, 0.5);
+        judge_an_hour(&mut check, 0.0, 0.5);
+        assert!(!check.is_mismatched() && !check.is_open(), "{check:?}");
+        judge_an_hour(&mut check, 0.2, -0.5);
+        assert!(!check.is_mismatched() && !check.is_due());
     }
 
     #[test]
