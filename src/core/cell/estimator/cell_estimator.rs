@@ -315,6 +315,7 @@ impl CellEstimator {
     /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
         self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);
+        self.memory.noted_s += downtime_s;
     }
 }
 

@@ -1,4 +1,4 @@
-//! Use of a cell while the program does not run.
+//! Use of a cell while nothing is measured: the program does not run, the bus sleeps, the log has a hole.
 //!
 //! In: the downtime, s, and the first voltage reading after it, V. Out: the updated filter. A reading that cannot be used
 //! leaves the filter as it was, with its error.
@@ -6,7 +6,7 @@
 //! Deviation 6: two hypotheses cover downtime. Most likely the cell rested: its SOC is the one before, less
 //! self-discharge, and all correlations still hold. Or it was used or charged: then its SOC is anywhere within the charge
 //! that can be moved in that time, and its branches are as uncertain as at a start. The first voltage under a known
-//! current decides: both hypotheses are updated with it, weighted by their likelihoods (Bayes' rule, prior [`USED_PRIOR`])
+//! current decides: both hypotheses are updated with it, weighted by their likelihoods (Bayes' rule, prior of [`Memory`])
 //! and merged into one Gaussian with their common mean and covariance. Effect: a night without use keeps the accuracy of
 //! the counted charge, and the rested voltage of the morning keeps its information about the capacity; a day's unseen use
 //! is found at the first reading, not after the hours that a confident filter needs. A single wide Gaussian would lose
@@ -14,8 +14,12 @@
 //!
 //! Until that voltage arrives, the published deviation is that of the second hypothesis.
 //!
-//! Sleep is different: a bus in use wakes its listeners. The cells then rested (self-discharge and
-//! `gap_noise_per_sqrt_s`), and a load next to the gap may have continued through it.
+//! Sleep has the same hypotheses with another prior. A bus in use wakes its listeners, so that cells that rested before and
+//! after have mostly rested, but a charger need not use the bus; a load next to the gap may have continued through it. Without
+//! the second hypothesis, charge that nobody saw is learned as capacity: on the logs of a car whose charges are not on record
+//! 42 instead of 32 Ah.
+//!
+//! [`Memory`]: super::memory::Memory
 
 use nalgebra::SMatrix;
 

@@ -71,6 +71,9 @@ pub(super) struct Memory {
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
     #[serde(default, rename = "away_std")]
     pub(super) downtime_std: f64,
+    /// Part of the coming unmeasured time that has been noted as downtime, s.
+    #[serde(default)]
+    pub(super) noted_s: f64,
     /// Probability that the cell was used in that time.
     #[serde(default)]
     pub(super) used_prior: f64,
@@ -103,6 +106,7 @@ impl Memory {
             offset_score: 0.0,
             slow_branch: SlowBranch::default(),
             downtime_std: 0.0,
+            noted_s: 0.0,
             used_prior: 0.0,
             is_unseen: false,
             rejected: 0,
@@ -144,16 +148,17 @@ impl Memory {
     /// Notes the unmeasured time of a step: a load next to it may have continued, or a charger come. What counts as downtime
     /// is left to the next voltage; for a short load returns the deviation of the SOC, fraction.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
-        if step.unmeasured_s <= 0.0 || is_silent_rest(config, step) {
+        let unnoted_s = step.unmeasured_s - std::mem::take(&mut self.noted_s);
+        if unnoted_s <= 0.0 || is_silent_rest(config, step) {
             return 0.0;
         }
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
-        let most = load_per_s.max(config.gap.away_use_per_s) * step.unmeasured_s;
+        let most = load_per_s.max(config.gap.away_use_per_s) * unnoted_s;
         let std = most / 3.0_f64.sqrt();
         if std > NEGLIGIBLE_STD {
-            let unused_at_rest = libm::pow(1.0 - USED_PRIOR, step.unmeasured_s / USED_PRIOR_AFTER_S);
+            let unused_at_rest = libm::pow(1.0 - USED_PRIOR, unnoted_s / USED_PRIOR_AFTER_S);
             self.note_downtime(most, if is_loaded { USED_PRIOR } else { 1.0 - unused_at_rest });
             return 0.0;
         }
@@ -269,7 +274,15 @@ impl Memory {
             self.used_prior,
             "0 to 1",
         )?;
-        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
+        let natural = [
+            self.load_a,
+            self.mean_nis,
+            self.information_s,
+            self.rest_s,
+            self.downtime_std,
+            self.noted_s,
+            self.rejected_s,
+        ];
         InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }
 }

@@ -235,6 +235,28 @@ fn an_unknown_soc_stays_at_its_largest_variance_through_any_gap() {
 }
 
 #[test]
+fn charge_that_nobody_saw_moves_the_soc_and_not_the_capacity() {
+    let (mut config, model) = (config(), small_model());
+    config.gap.away_use_per_s = 0.5 / 3600.0;
+    // Discharges of a tenth on record, the charges between them not, and a load of C/20 next to the gaps.
+    let mut truth = Truth { soc: 0.8, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.0 };
+    let mut estimator = CellEstimator::new(&config);
+    for _ in 0..40 {
+        for _ in 0..720 {
+            estimator.step(&model, &config, &truth.step(&model, 1.0, 1.0));
+        }
+        estimator.step(&model, &config, &truth.step(&model, 0.1, 1.0));
+        (truth.soc, truth.branch_v) = (0.8, 0.0);
+        let step = CellStep { unmeasured_s: 43_200.0, ..truth.step(&model, 0.1, 1.0) };
+        assert!(!estimator.step(&model, &config, &step).reset);
+        let soc = soc(&estimator);
+        assert!((soc.mean - truth.soc).abs() < 0.03 && (soc.mean - truth.soc).abs() < 1.96 * soc.std(), "{soc:?}");
+    }
+    let capacity = estimator.capacity();
+    assert!((capacity.mean - 2.0).abs() < 0.05, "{capacity:?}");
+}
+
+#[test]
 fn a_load_may_continue_through_a_silent_gap_unless_silence_is_rest() {
     let after = |silence_is_rest: bool, unmeasured_s: f64| {
         let (mut config, mut truth, model) = (config(), truth(), small_model());

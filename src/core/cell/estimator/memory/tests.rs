@@ -73,3 +73,39 @@ fn a_gap_next_to_a_load_counts_as_the_heaviest_usual_load_and_a_gap_at_rest_as_r
     memory.update_load(&model, &config, &step(5.0, 0.0, 60.0));
     assert_eq!(memory.load_a, 5.0);
 }
+
+#[test]
+fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_length() {
+    let mut config = config();
+    config.gap.away_use_per_s = 0.5 / 3600.0;
+    let after = |config: &EstimatorConfig, current_a: f64, gap_s: f64| {
+        let mut memory = Memory::new(config);
+        let std = memory.note_gap(config, &step(current_a, 0.0, gap_s), 2.0);
+        (std, memory.downtime_std, memory.used_prior)
+    };
+    // 4 A of 2 Ah are more than a charger of C/2: 2 C for 900 s.
+    let (std, downtime_std, used) = after(&config, 4.0, 900.0);
+    assert!(std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, USED_PRIOR), "{downtime_std} {used}");
+    // At rest a charger may have come, in half a day as likely as use in a downtime.
+    let (_, downtime_std, used) = after(&config, 0.0, 900.0);
+    assert!(near(downtime_std, 0.125 / 3.0_f64.sqrt()) && used < 0.006, "{downtime_std} {used}");
+    assert!(near(after(&config, 0.0, 43_200.0).2, USED_PRIOR));
+    // A short load is noise, and a short rest nothing.
+    assert!(near(after(&config, 1.0, 1.0).0, 0.5 / 3600.0 / 3.0_f64.sqrt()));
+    assert_eq!((after(&config, 1.0, 1.0).1, after(&config, 0.0, 1.0)), (0.0, (0.0, 0.0, 0.0)));
+    config.gap.silence_is_rest = true;
+    assert_eq!(after(&config, 4.0, 900.0), (0.0, 0.0, 0.0));
+}
+
+#[test]
+fn a_downtime_that_has_been_noted_is_no_gap_as_well() {
+    let config = config();
+    let mut memory = Memory::new(&config);
+    memory.note_downtime(0.4, USED_PRIOR);
+    memory.noted_s = 600.0;
+    let noted = (memory.downtime_std, memory.used_prior);
+    assert_eq!(memory.note_gap(&config, &step(4.0, 0.0, 600.0), 2.0), 0.0);
+    assert_eq!((memory.downtime_std, memory.used_prior), noted);
+    memory.note_gap(&config, &step(4.0, 0.0, 600.0), 2.0);
+    assert!(memory.downtime_std > noted.0 && memory.used_prior > noted.1, "{memory:?}");
+}
