@@ -219,7 +219,7 @@ mod tests {
     #[test]
     fn a_mismatch_lasts_until_a_window_passes_and_a_cell_that_has_passed_does_not_become_another() {
         let mut check = after(1800, 0.6, |_| 0.03);
-        let mut judge_an_hour = |check: &mut ModelCheck, innovation, log_resistance| {
+        let judge_an_hour = |check: &mut ModelCheck, innovation, log_resistance| {
             let update = Update { innovation, innovation_variance: 0.09, test_ratio: 0.0, accepted: true };
             for _ in 0..360 {
                 check.add_step(10.0, 20.0, 0.0);
