@@ -1,4 +1,4 @@
-//! Checks in a cell's first hour of use whether the configured model is that of the cell.
+//! Checks, in windows of an hour of use, whether the configured model is that of the cell.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out:
 //! [`ModelCheck::mismatch`], above 1 when the model is another cell's, after 10 minutes of use. Readings without an update, after
@@ -18,6 +18,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::cell::CellModel;
 use crate::filter::Update;
 use crate::quantity::InvalidState;
 
@@ -45,10 +46,16 @@ const CORROBORATED: f64 = 4.0;
 /// Sum of the witnesses that is a mismatch: three deviations (constant, slope, resistance) of 1.4 standard deviations each.
 const LIMIT: f64 = 6.0;
 
+fn square(x: f64) -> f64 {
+    x * x
+}
+
 /// Evidence about one cell's model.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelCheck {
+    /// The model that is checked ([`model_id`]); 0 in a state stored by a program without a check.
+    model: u64,
     /// Time of use judged so far, s.
     use_s: f64,
     /// Time, s, and charge, A s, since the last evidence.
@@ -63,7 +70,6 @@ pub struct ModelCheck {
     /// Largest sum of the witnesses over [`LIMIT`] in this window.
     mismatch: f64,
     /// That of the window before, if it was a mismatch.
-    #[serde(default)]
     before: f64,
 }
 
@@ -80,10 +86,28 @@ pub struct ModelEvidence {
     pub log_resistance_std: f64,
 }
 
+/// Identifies a cell model, with the spread of resistances that is expected of its cells: FNV-1a of what the check depends on.
+pub fn model_id(model: &CellModel, log_resistance_std: f64) -> u64 {
+    let CellModel { soc, temperature_c, ocv_v, r0_ohm, branches, rated_capacity_ah, .. } = model;
+    let text =
+        format!("{rated_capacity_ah} {log_resistance_std} {soc:?} {temperature_c:?} {ocv_v:?} {r0_ohm:?} {branches:?}");
+    text.bytes().fold(0xCBF2_9CE4_8422_2325, |id, byte| (id ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3))
+}
+
 impl ModelCheck {
+    /// A check of a model, [`model_id`], that begins.
+    pub fn new(model: u64) -> Self {
+        Self { model, ..Self::default() }
+    }
+
     /// A check that has ended without a mismatch: for states stored by programs without one.
     pub fn ended() -> Self {
         Self { use_s: WINDOW_S, ..Self::default() }
+    }
+
+    /// This check when it is of the model, else a new one.
+    pub fn or_new(self, model: u64) -> Self {
+        if self.model == model || self.model == 0 { self } else { Self::new(model) }
     }
 
     /// Whether evidence still counts.
@@ -95,6 +119,9 @@ impl ModelCheck {
     /// Adds a step's time, s, and charge, A s; a step with unmeasured time discards them.
     #[inline]
     pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {
+        if !self.is_open() {
+            return;
+        }
         if unmeasured_s > 0.0 {
             (self.since_s, self.since_as, self.step_s) = (0.0, 0.0, 0.0);
             return;
@@ -133,21 +160,25 @@ impl ModelCheck {
         if self.use_s < SETTLING_S {
             return;
         }
-        let resistance = if log_resistance_std > 0.0 { (log_resistance / log_resistance_std).powi(2) } else { 0.0 };
+        let resistance = if log_resistance_std > 0.0 { square(log_resistance / log_resistance_std) } else { 0.0 };
         let curve = self.curve();
         let sum = resistance.min(CORROBORATED * curve) + curve.min(CORROBORATED * resistance);
         self.mismatch = self.mismatch.max(sum / LIMIT);
         if !self.is_open() {
             let found = if self.mismatch > 1.0 { self.mismatch } else { 0.0 };
-            *self = Self { before: found, use_s: if found > 0.0 { 0.0 } else { WINDOW_S }, ..Self::default() };
+            let use_s = if found > 0.0 { 0.0 } else { WINDOW_S };
+            *self = Self { before: found, use_s, ..Self::new(self.model) };
         }
     }
 
     /// What a constant and a slope over SOC explain of the innovations: c^2.
     fn curve(&self) -> f64 {
-        let ([mut a, b, mut c], [g, h]) = (self.information, self.score);
-        (a, c) = (a + CURVE_STD_V[0].powi(-2), c + CURVE_STD_V[1].powi(-2));
-        (g * g * c - 2.0 * g * h * b + h * h * a) / (a * c - b * b)
+        let ([constant, mixed, slope], [by_constant, by_slope]) = (self.information, self.score);
+        let constant = constant + 1.0 / square(CURVE_STD_V[0]);
+        let slope = slope + 1.0 / square(CURVE_STD_V[1]);
+        let explained =
+            square(by_constant) * slope - 2.0 * by_constant * by_slope * mixed + square(by_slope) * constant;
+        explained / (constant * slope - square(mixed))
     }
 
     /// Largest evidence of this window and the one before that the model is another cell's, relative to the limit.
@@ -178,13 +209,24 @@ impl ModelCheck {
         ];
         InvalidState::unless_naturals("a number of the check of a cell's model", natural)?;
         let signed = [self.since_as, self.information[1], self.score[0], self.score[1]];
-        InvalidState::unless_numbers("a sum of the check of a cell's model", signed)
+        InvalidState::unless_numbers("a sum of the check of a cell's model", signed)?;
+        let [constant, mixed, slope] = self.information;
+        // Cauchy-Schwarz, with room for rounding.
+        InvalidState::unless(
+            square(mixed) <= (1.0 + 1e-9) * constant * slope,
+            "a sum of the check of a cell's model",
+            mixed,
+            "within those of its squares",
+        )?;
+        let most_before = if self.is_open() { f64::MAX } else { 0.0 };
+        InvalidState::unless(self.before <= most_before, "a mismatch of a check that has ended", self.before, "0")
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cell::model::tests::small_model;
 
     /// The check after `use_s` of steps of 1 s at 1 C, the SOC falling from 0.9; `voltage` gives the innovation by SOC, V.
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
@@ -230,9 +272,28 @@ mod tests {
         assert!(check.is_mismatched() && check.is_open(), "the model is still another cell's");
         judge_an_hour(&mut check, 0.0, 0.5);
         judge_an_hour(&mut check, 0.0, 0.5);
-        assert!(!check.is_mismatched() && !check.is_open(), "{check:?}");
+        assert_eq!(check, ModelCheck::ended());
         judge_an_hour(&mut check, 0.2, -0.5);
-        assert!(!check.is_mismatched() && !check.is_due());
+        assert_eq!(check, ModelCheck::ended());
+    }
+
+    #[test]
+    fn another_model_is_checked_anew_and_a_state_without_a_check_is_not() {
+        let found = ModelCheck { model: 1, ..after(1800, 0.6, |_| 0.03) };
+        assert_eq!((found.or_new(1), found.or_new(2)), (found, ModelCheck::new(2)));
+        assert_eq!(ModelCheck::ended().or_new(2), ModelCheck::ended());
+        let model = small_model();
+        let other = CellModel { rated_capacity_ah: 3.0, ..model.clone() };
+        assert_eq!(model_id(&model, 0.2), model_id(&CellModel { name: "another name".into(), ..model.clone() }, 0.2));
+        assert!(model_id(&model, 0.2) != model_id(&other, 0.2) && model_id(&model, 0.2) != model_id(&model, 0.4));
+    }
+
+    #[test]
+    fn stored_sums_that_cannot_be_are_refused() {
+        let check = after(1800, 1.0, |soc| soc);
+        assert_eq!(check.check(), Ok(()));
+        assert!(ModelCheck { information: [1.0, 2.0, 3.0], ..check }.check().is_err());
+        assert!(ModelCheck { before: 2.0, ..ModelCheck::ended() }.check().is_err());
     }
 
     #[test]

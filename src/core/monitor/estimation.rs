@@ -1,12 +1,14 @@
 //! Estimation stage: from cell samples to the estimate of every cell.
 //!
 //! In: batches of samples, and what half-cycles have taught ([`Learner`]). Out: one filter step per sample, and whether
-//! each cell's innovations agree with their covariance and its model is its own ([`ModelCheck`]). A sample whose filter fails resets that filter, no other.
+//! each cell's innovations agree with their covariance and its model is its own ([`ModelCheck`]). A sample whose filter fails
+//! resets that filter, no other.
 
 use serde::{Deserialize, Serialize};
 
 use super::batch::CellBatch;
 use super::{Estimate, MeasuredValues, MonitorConfig};
+use crate::cell::model_check::model_id;
 use crate::cell::{CellStep, EstimatorBank, ModelCheck, ModelEvidence};
 use crate::filter::ScalarGaussian;
 use crate::health::Learner;
@@ -60,7 +62,7 @@ impl Estimation {
             progress: vec![CellProgress::default(); cells],
             trusted: vec![true; cells],
             all_trusted: true,
-            checks: vec![ModelCheck::default(); cells],
+            checks: vec![ModelCheck::new(model_id(&config.model, config.estimator.initial.log_resistance_std)); cells],
             any_check_open: true,
             any_mismatched: false,
             ambient_c: config.sample.ambient_c,
@@ -73,6 +75,9 @@ impl Estimation {
         let mut estimator = config.estimator;
         estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
         self.bank.reconfigure(&config.model, &estimator);
+        let model = self.model_id();
+        self.checks.iter_mut().for_each(|check| *check = check.or_new(model));
+        self.note_checks();
         self.ambient_c = config.sample.ambient_c;
     }
 
@@ -83,8 +88,13 @@ impl Estimation {
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
-        self.checks.fill(ModelCheck::default());
+        let model = self.model_id();
+        self.checks.fill(ModelCheck::new(model));
         self.note_checks();
+    }
+
+    fn model_id(&self) -> u64 {
+        model_id(self.bank.model(), self.bank.config().initial.log_resistance_std)
     }
 
     /// Number of cells.
@@ -105,12 +115,12 @@ impl Estimation {
             self.bank.add(sample.cell.index(), &step);
         }
         self.bank.step();
+        self.check_models(&samples);
         samples
     }
 
     /// Ends the work on stepped samples.
     pub(super) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
-        self.check_models(&samples);
         samples.clear();
         self.batch.waiting = samples;
         let bank = &self.bank;
@@ -274,10 +284,11 @@ impl Estimation {
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
         batch: CellBatch,
     ) {
+        let model = self.model_id();
         for (index, (consumed, trusted, check)) in cells.enumerate() {
             self.progress[index].consumed = consumed;
             self.trusted[index] = trusted;
-            self.checks[index] = check;
+            self.checks[index] = check.or_new(model);
         }
         self.note_checks();
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);

@@ -18,9 +18,9 @@ pub mod record;
 pub mod solve;
 pub mod thermal;
 
-/// A tester holds the voltage where the current is below this part of the load's, and the voltage stands still.
+/// A tester holds the voltage where the current is below this part of the load's, and the voltage at its lowest.
 const HELD_CURRENT: f64 = 0.97;
-/// Largest change of a voltage that is held, V.
+/// Largest distance of a held voltage from the lowest, V.
 const HELD_VOLTAGE_V: f64 = 0.05;
 
 /// A stretch of rows over which time runs on.
@@ -64,21 +64,21 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
-    /// Charge, Ah, that a discharge took after the load: the tester held the voltage while the current fell. 0 without such
-    /// an end.
+    /// Charge, Ah, that a discharge took after the load: the tester held the voltage, at its lowest, while the current fell. 0
+    /// without such an end.
     pub(crate) fn held_ah(&self) -> f64 {
-        let flowing: Vec<usize> = (0..self.len()).filter(|&row| self.current_a[row] > 0.0).collect();
-        let Some(&last) = flowing.last() else { return 0.0 };
-        let mut currents: Vec<f64> = flowing.iter().map(|&row| self.current_a[row]).collect();
-        currents.sort_by(f64::total_cmp);
-        let load_a = currents[currents.len() / 2];
+        let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
+        let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
+        let half_ah = 0.5 * charge_ah[last];
+        // The current at half of the charge.
+        let load_a = self.current_a[charge_ah.partition_point(|&ah| ah < half_ah).min(last)];
+        let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
-            self.current_a[row] < HELD_CURRENT * load_a
-                && (self.voltage_v[row] - self.voltage_v[last]).abs() <= HELD_VOLTAGE_V
+            let current_a = self.current_a[row];
+            current_a > 0.0 && current_a < HELD_CURRENT * load_a && self.voltage_v[row] <= lowest_v + HELD_VOLTAGE_V
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
-        let charge_ah = charge_ah(&self.time_s[first..=last], &self.current_a[first..=last]);
-        charge_ah.last().copied().unwrap_or(0.0)
+        charge_ah[last] - charge_ah[first]
     }
 
     /// Whether it has no rows.

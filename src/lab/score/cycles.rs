@@ -55,8 +55,10 @@ impl CycleTable {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {
             let Some(start) = self.start(&part.key) else { continue };
-            let same = table.discharges.iter_mut().filter(|discharge| discharge.start == start);
-            same.for_each(|discharge| discharge.capacity_ah = discharge.capacity_ah.map(|ah| ah - part.held_ah()));
+            let held_ah = part.held_ah();
+            if let Some(discharge) = table.discharges.iter_mut().find(|discharge| discharge.start == start) {
+                discharge.capacity_ah = discharge.capacity_ah.map(|ah| ah - held_ah).filter(|ah| *ah > 0.0);
+            }
         }
         table
     }
@@ -93,6 +95,24 @@ mod tests {
         assert_eq!([at(99.0), at(100.0), at(299.0), at(1e9)], [0, 1, 1, 2]);
         assert_eq!(table.discharges[1].capacity_ah, None);
         assert_eq!((table.start("2"), table.start("9")), (Some(Timestamp::from_secs(200.0)), None));
+    }
+
+    #[test]
+    fn charge_at_a_held_voltage_counts_off_and_a_part_beside_the_table_changes_nothing() {
+        let table =
+            read("cycle,type,start,capacity_ah_source\n1,discharge,100,1.9\n3,discharge,300,0.05\n").expect("reads");
+        let part = |key: &str| {
+            let mut part = MeasuredPart { key: key.into(), kind: "discharge".into(), ..MeasuredPart::default() };
+            for (time_s, current_a, voltage_v) in
+                [(0.0, 3.0, 3.4), (1800.0, 3.0, 2.5), (1801.0, 1.0, 2.5), (2161.0, 1.0, 2.5)]
+            {
+                part.push(time_s, current_a, voltage_v, 25.0, f64::NAN);
+            }
+            part
+        };
+        let at_load = table.at_load(&[part("1"), part("3"), part("9")]);
+        assert!((at_load.discharges[0].capacity_ah.expect("known") - 1.8).abs() < 1e-9, "360 s at 1 A");
+        assert_eq!(at_load.discharges[1].capacity_ah, None, "less than nothing is not stated");
     }
 
     #[test]

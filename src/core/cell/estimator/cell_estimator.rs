@@ -127,7 +127,7 @@ impl CellEstimator {
         // Trust returns through the window, not by a restart.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
-        (self.memory.downtime_std, self.memory.used_prior) = (0.0, 0.0);
+        (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
     }
 

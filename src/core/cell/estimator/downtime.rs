@@ -14,10 +14,9 @@
 //!
 //! Until that voltage arrives, the published deviation is that of the second hypothesis.
 //!
-//! Sleep has the same hypotheses with another prior. A bus in use wakes its listeners, so that cells that rested before and
-//! after have mostly rested, but a charger need not use the bus; a load next to the gap may have continued through it. Without
-//! the second hypothesis, charge that nobody saw is learned as capacity: on the logs of a car whose charges are not on record
-//! 42 instead of 32 Ah.
+//! A gap (sleep, a hole in a log) has the same hypotheses. A load next to it may have continued, with the same prior. At rest
+//! on both sides only a charger may have come; its prior grows with the time, for a bus in use wakes its listeners. Without
+//! the second hypothesis, charge that is not on record is learned as capacity.
 //!
 //! [`Memory`]: super::memory::Memory
 
@@ -47,20 +46,19 @@ pub(super) fn update_after_downtime<const N: usize>(
         used.mean[i] = 0.5 * most_v;
         used.covariance[(i, i)] += square(most_v) / 12.0;
     }
-    // Predicted variance of the voltage for a prior that wide; the copy is discarded.
-    let predicted = update(&mut used.clone(), model, config, reading)?.0.innovation_variance;
-    let drop_v = reading.current_a
-        * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc))
-        * libm::exp(x.mean[LOG_RESISTANCE])
-        + used.mean.rows(BRANCHES, N - BRANCHES).sum();
+    // The odds are those of a prior that wide; the copy is discarded.
+    let (wide, _) = update(&mut used.clone(), model, config, reading)?;
+    let drop_v = reading.current_a * model.r0_ohm(&position) * libm::exp(x.mean[LOG_RESISTANCE])
+        + reading.branches_v(&used.mean);
     let reach = 3.0_f64.sqrt() * downtime_std;
     let soc = model.soc_of_aged_ocv(&reading.temperature, reading.curve.mean, reading.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.
     used.mean[0] = soc.clamp(before_soc - reach, before_soc + reach);
     let (by_used, _) = update(&mut used, model, config, reading)?;
     let (by_left_alone, _) = update(x, model, config, reading)?;
-    let log_likelihood = |variance: f64| -0.5 * (libm::log(variance) + square(by_left_alone.innovation) / variance);
-    let odds = libm::exp(log_likelihood(by_left_alone.innovation_variance) - log_likelihood(predicted));
+    let log_likelihood =
+        |u: &Update| -0.5 * (libm::log(u.innovation_variance) + square(u.innovation) / u.innovation_variance);
+    let odds = libm::exp(log_likelihood(&by_left_alone) - log_likelihood(&wide)).max(f64::MIN_POSITIVE);
     let weight = used_probability / (used_probability + (1.0 - used_probability) * odds);
     merge(x, &used, weight);
     Ok(if weight > 0.5 { by_used } else { by_left_alone })

@@ -30,9 +30,12 @@ const MIN_REJECTED_AFTER_GAP: u32 = 2;
 /// Prior probability that a cell was used while the program did not run, or in a gap with a load next to it.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// A gap with rest on both sides has that prior when it lasts half a day, and in proportion before, s: a bus in use wakes its
+/// A gap with rest on both sides has that prior from half a day on, and in proportion before, s: a bus in use wakes its
 /// listeners, but a charger need not.
 const USED_PRIOR_AFTER_S: f64 = 43_200.0;
+
+/// Shortest gap with rest on both sides in which a charger may have come, s: in a shorter one slow relaxation would be taken for it.
+const LEAST_CHARGER_S: f64 = 3600.0;
 
 /// Deviation of the SOC below which downtime is ignored, fraction.
 const NEGLIGIBLE_STD: f64 = 0.002;
@@ -148,21 +151,24 @@ impl Memory {
     /// Notes the unmeasured time of a step: a load next to it may have continued, or a charger come. What counts as downtime
     /// is left to the next voltage; for a short load returns the deviation of the SOC, fraction.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
-        let unnoted_s = step.unmeasured_s - std::mem::take(&mut self.noted_s);
-        if unnoted_s <= 0.0 || is_silent_rest(config, step) {
-            return 0.0;
-        }
+        let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
-        let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
-        let most = load_per_s.max(config.gap.away_use_per_s) * unnoted_s;
-        let std = most / 3.0_f64.sqrt();
-        if std > NEGLIGIBLE_STD {
-            let unused_at_rest = libm::pow(1.0 - USED_PRIOR, unnoted_s / USED_PRIOR_AFTER_S);
-            self.note_downtime(most, if is_loaded { USED_PRIOR } else { 1.0 - unused_at_rest });
+        let unnoted_s = step.unmeasured_s - noted_s;
+        if is_silent_rest(config, step) || (!is_loaded && unnoted_s < LEAST_CHARGER_S) {
             return 0.0;
         }
-        if is_loaded { std } else { 0.0 }
+        let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
+        let away_per_s = config.gap.away_use_per_s;
+        let most = load_per_s.max(away_per_s) * step.unmeasured_s - away_per_s * noted_s;
+        let std = most / 3.0_f64.sqrt();
+        if std <= NEGLIGIBLE_STD {
+            return std;
+        }
+        let used_at_rest = USED_PRIOR * (unnoted_s / USED_PRIOR_AFTER_S).min(1.0);
+        let used = if is_loaded { USED_PRIOR } else { used_at_rest };
+        self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
+        0.0
     }
 
     /// The load next to a step's gap, A: it may have continued through the gap. 0 where a silent bus means rest.
@@ -199,7 +205,7 @@ impl Memory {
     /// A voltage has been used: it has decided what happened.
     #[inline]
     pub(super) fn end_downtime(&mut self) {
-        (self.downtime_std, self.used_prior, self.is_unseen) = (0.0, 0.0, false);
+        (self.downtime_std, self.used_prior, self.noted_s, self.is_unseen) = (0.0, 0.0, 0.0, false);
     }
 
     /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.

@@ -54,9 +54,9 @@ section! {
         self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03");
         /// Charge or discharge that is possible in an hour while the program does not run. The first voltage after that time shows whether it happened; until then the deviation of the SOC covers it. 0: the cells are certainly not used.
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
-        /// A current up to this is rest; a larger one next to a gap may have flowed during the gap, up to the charge of `away_use_per_h`. Without it: the rated capacity over 50 h (C/50), per cell.
+        /// A current up to this is rest; a larger one next to a gap may have flowed through all of it. Without it: the rated capacity over 50 h (C/50), per cell.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
-        /// Whether a silent bus means zero current: in more than five seconds without any voltage and current the cells rested, whatever the current before and after. False: a load next to the gap may have continued through it, and a charger may have come.
+        /// Whether a silent bus means zero current: in more than five seconds between two voltages of a cell without any current it rested, whatever the current before and after; its voltage must come more often. False: a load next to the gap may have continued through it, and a charger may have come.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");

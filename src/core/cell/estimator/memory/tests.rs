@@ -86,10 +86,11 @@ fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_len
     // 4 A of 2 Ah are more than a charger of C/2: 2 C for 900 s.
     let (std, downtime_std, used) = after(&config, 4.0, 900.0);
     assert!(std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, USED_PRIOR), "{downtime_std} {used}");
-    // At rest a charger may have come, in half a day as likely as use in a downtime.
-    let (_, downtime_std, used) = after(&config, 0.0, 900.0);
-    assert!(near(downtime_std, 0.125 / 3.0_f64.sqrt()) && used < 0.006, "{downtime_std} {used}");
-    assert!(near(after(&config, 0.0, 43_200.0).2, USED_PRIOR));
+    // At rest a charger may have come, from half a day on as likely as use in a downtime; in less than an hour none.
+    let (_, downtime_std, used) = after(&config, 0.0, 4320.0);
+    assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * USED_PRIOR), "{downtime_std} {used}");
+    assert!([43_200.0, 604_800.0].iter().all(|&gap_s| near(after(&config, 0.0, gap_s).2, USED_PRIOR)));
+    assert_eq!(after(&config, 0.0, 3599.0), (0.0, 0.0, 0.0));
     // A short load is noise, and a short rest nothing.
     assert!(near(after(&config, 1.0, 1.0).0, 0.5 / 3600.0 / 3.0_f64.sqrt()));
     assert_eq!((after(&config, 1.0, 1.0).1, after(&config, 0.0, 1.0)), (0.0, (0.0, 0.0, 0.0)));
@@ -98,14 +99,25 @@ fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_len
 }
 
 #[test]
-fn a_downtime_that_has_been_noted_is_no_gap_as_well() {
-    let config = config();
-    let mut memory = Memory::new(&config);
-    memory.note_downtime(0.4, USED_PRIOR);
-    memory.noted_s = 600.0;
-    let noted = (memory.downtime_std, memory.used_prior);
-    assert_eq!(memory.note_gap(&config, &step(4.0, 0.0, 600.0), 2.0), 0.0);
-    assert_eq!((memory.downtime_std, memory.used_prior), noted);
-    memory.note_gap(&config, &step(4.0, 0.0, 600.0), 2.0);
-    assert!(memory.downtime_std > noted.0 && memory.used_prior > noted.1, "{memory:?}");
+fn a_noted_downtime_counts_once_but_its_load_may_be_more_than_was_noted() {
+    let mut config = config();
+    config.gap.away_use_per_s = 0.5 / 3600.0;
+    let noted = || {
+        let mut memory = Memory::new(&config);
+        memory.note_downtime(0.5 * 60.0 / 3600.0, USED_PRIOR);
+        memory.noted_s = 60.0;
+        memory
+    };
+    let mut at_rest = noted();
+    at_rest.note_gap(&config, &step(0.0, 0.0, 60.0), 2.0);
+    assert_eq!(at_rest, Memory { noted_s: 0.0, ..noted() });
+    // 3 C before it may have continued: 0.05 of SOC.
+    let mut loaded = noted();
+    loaded.note_gap(&config, &step(6.0, 0.0, 60.0), 2.0);
+    assert!(near(loaded.downtime_std, 0.05 / 3.0_f64.sqrt()), "{loaded:?}");
+    assert!(near(loaded.used_prior, USED_PRIOR), "{loaded:?}");
+    // What was noted ends with the next voltage.
+    let mut used = noted();
+    used.end_downtime();
+    assert_eq!((used.noted_s, used.downtime_std, used.used_prior), (0.0, 0.0, 0.0));
 }
