@@ -118,6 +118,11 @@ impl ChargeCounter {
         }
     }
 
+    /// Forgets the state of contactors that are no longer an input.
+    pub(super) fn forget_contactors(&mut self) {
+        self.open_until = None;
+    }
+
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         for stamp in [&mut self.counted_to, &mut self.open_until].into_iter().flatten() {
             *stamp = stamp.plus_nanos(by_nanos);

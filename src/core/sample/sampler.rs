@@ -418,9 +418,10 @@ impl Sampler {
         self.bad_signals > 0
     }
 
-    /// Whether a stored state has this sampler's number of signals.
+    /// Whether a stored state has this sampler's number of signals; that of the contactors, the last, may be new.
     pub fn fits(&self, state: &SamplerState) -> bool {
-        state.signals.len() == self.state.signals.len()
+        let (own, stored) = (self.state.signals.len(), state.signals.len());
+        stored == own || (self.config.contactor.is_some() && stored + 1 == own)
     }
 
     /// Readings by outcome.
@@ -437,7 +438,12 @@ impl Sampler {
     /// The caller checks that it [`fits`](Self::fits).
     pub fn restore(&mut self, state: SamplerState) {
         assert!(self.fits(&state), "a state of other signals");
+        let signals = self.state.signals.len();
         self.state = state;
+        self.state.signals.resize_with(signals, Signal::default);
+        if self.config.contactor.is_none() {
+            self.state.charge.forget_contactors();
+        }
         self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
         (self.next_stale, self.shared.is_known) = (None, false);
     }

@@ -120,7 +120,7 @@ section! {
     /// `capacity_low`, `usable_capacity_low` Ah per cell; `recharge_period_low` s; `resistance_high` times that of a new cell;
     /// `soc_low` (of the emptiest cell), `cell_imbalance` (SOC of the fullest less that of the emptiest cell), `bms_disagrees` (SOC or SOH as the pack reports it less the estimate), `input_implausible` (share of bad readings) fractions;
     /// `temperature_high` (the hottest sensor) degrees C; `remaining_life_low` equivalent full cycles;
-    /// `input_missing`, `store_failed` and `bus_fault` (how long it has lasted) s; `estimate_untrusted` the mean normalised innovation squared.
+    /// `input_missing`, `store_failed` and `bus_fault` (how long it has lasted) s; `estimate_untrusted` the mean normalised innovation squared, or the mismatch of the cell model in that scale.
     Alarm at "alarm" {
         /// What the alarm compares.
         rule: Rule, "", Any, Required;

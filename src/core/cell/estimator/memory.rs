@@ -27,10 +27,13 @@ const MIN_REJECTED: u32 = 3;
 /// Consecutive readings beyond the gate before a restart when the first one follows a gap: the record is incomplete.
 const MIN_REJECTED_AFTER_GAP: u32 = 2;
 
-/// Prior probability that a cell was used while the program did not run, or in a gap with a load next to it.
+/// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// A gap with rest on both sides has that prior from half a day on, and in proportion before, s: a bus in use wakes its
+/// The same in a gap with a load next to it: it continued or ended, neither is more likely.
+const LOADED_PRIOR: f64 = 0.5;
+
+/// A gap with rest on both sides has the prior of a downtime from half a day on, and in proportion before, s: a bus in use wakes its
 /// listeners, but a charger need not.
 const USED_PRIOR_AFTER_S: f64 = 43_200.0;
 
@@ -166,7 +169,7 @@ impl Memory {
             return std;
         }
         let used_at_rest = USED_PRIOR * (unnoted_s / USED_PRIOR_AFTER_S).min(1.0);
-        let used = if is_loaded { USED_PRIOR } else { used_at_rest };
+        let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
         self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
         0.0
     }

@@ -305,6 +305,26 @@ fn a_restored_sampler_counts_the_downtime_as_unmeasured() {
 }
 
 #[test]
+fn a_state_without_contactors_fits_a_configuration_that_has_them_and_open_ones_are_forgotten_with_them() {
+    let limits = config().voltage;
+    let with = || SampleConfig { contactor: Some(ContactorConfig { open: vec![0.0], limits }), ..config() };
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, Channel::Current, 1.0);
+    let mut restored = Bench::new(with());
+    assert!(restored.sampler.fits(&bench.sampler.snapshot()));
+    restored.sampler.restore(bench.sampler.snapshot());
+    restored.ok(1.0, Channel::Contactor, 0.0);
+    assert!(!Sampler::new(config()).fits(&restored.sampler.snapshot()));
+    let mut state = restored.sampler.snapshot();
+    state.signals.pop();
+    let mut without = Bench::new(config());
+    without.sampler.restore(state);
+    without.ok(1.5, Channel::Current, 1.0);
+    let sample = without.ok(2.0, CELL, 3.7).expect("a sample");
+    assert_eq!(sample.current_a, Some(1.0));
+}
+
+#[test]
 fn every_channel_leads_to_its_own_slot() {
     let mut config = config();
     config.cells = 1024;

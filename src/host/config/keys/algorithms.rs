@@ -84,7 +84,7 @@ section! {
         lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
         /// Window over which the filter's consistency is judged.
         consistency_window_s: f64, "s", Above(0.0, 1e9), Default("600.0");
-        /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected).
+        /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected). The mismatch of a cell model is stated in parts of it.
         consistency_limit: f64, "", Above(0.0, 1e9), Default("4.0");
     }
 }

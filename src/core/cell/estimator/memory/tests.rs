@@ -85,7 +85,10 @@ fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_len
     };
     // 4 A of 2 Ah are more than a charger of C/2: 2 C for 900 s.
     let (std, downtime_std, used) = after(&config, 4.0, 900.0);
-    assert!(std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, USED_PRIOR), "{downtime_std} {used}");
+    assert!(
+        std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, LOADED_PRIOR),
+        "{downtime_std} {used}"
+    );
     // At rest a charger may have come, from half a day on as likely as use in a downtime; in less than an hour none.
     let (_, downtime_std, used) = after(&config, 0.0, 4320.0);
     assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * USED_PRIOR), "{downtime_std} {used}");
