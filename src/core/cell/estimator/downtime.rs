@@ -15,8 +15,8 @@
 //! Until that voltage arrives, the published deviation is that of the second hypothesis.
 //!
 //! A gap (sleep, a hole in a log) has the same hypotheses. A load next to it may have continued or ended, neither more
-//! likely. At rest on both sides only a charger may have come; its prior grows with the time, for a bus in use wakes its listeners. Without
-//! the second hypothesis, charge that is not on record is learned as capacity.
+//! likely. At rest on both sides only a charger may have come: rarely, since a bus in use wakes its listeners, and the more
+//! likely the longer the gap. Without the second hypothesis, charge that is not on record is learned as capacity.
 //!
 //! [`Memory`]: super::memory::Memory
 

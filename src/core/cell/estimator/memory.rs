@@ -18,7 +18,8 @@ pub(super) const REST_REPEATS_S: f64 = 1000.0;
 /// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
-/// A step with more unmeasured time than this had neither a current nor a voltage: the bus was silent, s.
+/// A step of a cell with more unmeasured time than this had no current since the cell's voltage before: the bus counts as
+/// silent, s.
 const SILENCE_S: f64 = 5.0;
 
 /// Consecutive readings beyond the gate before the filter may restart: one or two can be glitches.
@@ -81,7 +82,7 @@ pub(super) struct Memory {
     /// Part of the coming unmeasured time that has been noted as downtime, s.
     #[serde(default)]
     pub(super) noted_s: f64,
-    /// Probability that the cell was used in that time.
+    /// Probability that the cell was used during the downtime.
     #[serde(default)]
     pub(super) used_prior: f64,
     /// No voltage has been used since the last sleep or unknown gap.
