@@ -153,7 +153,12 @@ impl Codes {
             (true, false) => Some(spaced(self.known_changed_at)),
             (false, true) => Some(Timestamp::from_nanos(i64::MIN)),
         };
-        self.followed.iter().filter_map(FollowedCode::due).chain(known).min()
+        self.changes().chain(known).min()
+    }
+
+    /// When each code that waits changes in the message.
+    pub(super) fn changes(&self) -> impl Iterator<Item = Timestamp> {
+        self.followed.iter().filter_map(FollowedCode::due)
     }
 
     /// Number of codes of a message at this time.

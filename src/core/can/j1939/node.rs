@@ -313,7 +313,14 @@ impl Node {
 
     /// When a message that is due at `wanted` can be sent.
     fn startable_from(&self, pgn: u32, wanted: Timestamp) -> Option<Timestamp> {
-        self.start_at(wanted.max(self.polled_at), pgn).map(|start| start.max(wanted))
+        let from = wanted.max(self.polled_at);
+        let start = self.start_at(from, pgn).map(|start| start.max(wanted));
+        if pgn != PGN_DM1 || start.is_some_and(|start| start <= from) {
+            return start;
+        }
+        // Codes that leave the message may make it short enough to go out beside a transfer or before its spacing ends.
+        let shorter = self.codes.changes().filter(|&change| change > from);
+        shorter.filter_map(|change| self.start_at(change, pgn).map(|start| start.max(change))).chain(start).min()
     }
 
     /// Whether only address claims may be sent: the node does not have its address.

@@ -82,26 +82,45 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
+/// The same acts on a node that is polled only when something is due, and on one that is polled every millisecond.
+fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
+    let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
+    for act in acts {
+        perform(&mut sleeper, act);
+        match act {
+            Act::Wait(ms) => {
+                busy.node.poll(at(busy.now_ms), &mut busy.out);
+                busy.run_to(busy.now_ms + i64::from(*ms));
+            }
+            Act::Poll | Act::Set { .. } | Act::Frame { .. } | Act::Start | Act::Gap => perform(&mut busy, act),
+        }
+        if busy.node.is_silent() {
+            busy.transfer = None;
+        }
+    }
+    (sleeper, busy)
+}
+
+/// Found by the property below: during the transfer of a DM2 the second code leaves the DM1, which then fits into one frame.
+#[test]
+fn a_dm1_that_becomes_short_during_a_transfer_is_due() {
+    let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };
+    let dm2 = Act::Frame { id: 0x18EA_FF21, data: pgn_bytes(PGN_DM2).to_vec() };
+    let waits = |ms: &[u16]| ms.iter().map(|&ms| Act::Wait(ms)).collect::<Vec<_>>();
+    let acts =
+        [vec![set(&[(0, 0), (1, 0)], 0), Act::Start], waits(&[130, 471]), vec![set(&[], 25), dm2], waits(&[487, 312])];
+    let (sleeper, busy) = sleeping_and_polled(&acts.concat());
+    assert_eq!(sleeper.frames, busy.frames);
+    assert_eq!(busy.received(PGN_DM1).last().unwrap(), &(1400, vec![0]));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, ..ProptestConfig::default() })]
 
     /// A driver may leave out every poll before the due time: replay does, a live daemon may not.
     #[test]
     fn polls_before_the_due_time_change_nothing(acts in proptest::collection::vec(act(), 1..60)) {
-        let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
-        for act in &acts {
-            perform(&mut sleeper, act);
-            match act {
-                Act::Wait(ms) => {
-                    busy.node.poll(at(busy.now_ms), &mut busy.out);
-                    busy.run_to(busy.now_ms + i64::from(*ms));
-                }
-                Act::Poll | Act::Set { .. } | Act::Frame { .. } | Act::Start | Act::Gap => perform(&mut busy, act),
-            }
-            if busy.node.is_silent() {
-                busy.transfer = None;
-            }
-        }
+        let (sleeper, busy) = sleeping_and_polled(&acts);
         prop_assert_eq!(sleeper.frames, busy.frames);
         prop_assert_eq!(sleeper.events, busy.events);
     }
