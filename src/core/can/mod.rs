@@ -1,17 +1,19 @@
 //! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames, end-to-end
-//! protection, J1939.
+//! protection, diagnostic answers over ISO-TP, J1939.
 //!
 //! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are accepted:
 //! bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
 
 pub mod dbc;
 pub mod decode;
+pub mod diagnostic;
 pub mod e2e;
 pub mod encode;
 pub mod flood;
 pub mod frame;
 pub mod guard;
 mod id_table;
+pub mod isotp;
 pub mod j1939;
 pub mod signal;
 

@@ -6,6 +6,7 @@ use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
 use crate::alarm::RuleConfig;
 use crate::can::CanId;
 use crate::can::decode::InputMap;
+use crate::can::diagnostic::{self, Answer};
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
@@ -21,6 +22,8 @@ pub struct MonitorConfig {
     pub interfaces: usize,
     /// Meaning of the input frames.
     pub input: InputMap,
+    /// Diagnostic answers that are read.
+    pub answers: Vec<Answer>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
     /// Readings in a row that must give another pack identity, where such a signal is among `input`.
@@ -49,8 +52,10 @@ impl MonitorConfig {
     /// Identifiers to be received on an interface, ascending.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
+        ids.extend(diagnostic::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
         ids.sort_unstable();
+        ids.dedup();
         ids
     }
 
@@ -82,7 +87,7 @@ impl MonitorConfig {
             ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
             ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
             ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
-            ("[input]", self.input == new.input),
+            ("[input]", self.input == new.input && self.answers == new.answers),
             ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
             ("pack.cell_model", self.model == same_model),

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::input::{BusEvent, Command, Source};
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::decode::Channel;
+use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
@@ -211,6 +212,8 @@ pub enum EventKind {
     Protection(GuardChange),
     /// More frames of one identifier come than the limit allows; or no more.
     Flood(FloodChange),
+    /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
+    MessageLoss(MessageLoss),
     /// An interface event.
     Bus {
         /// Which interface.

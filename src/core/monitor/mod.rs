@@ -43,12 +43,13 @@ use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
 
 use crate::can::Frame;
+use crate::can::diagnostic::Heard;
 use crate::quantity::{BusIndex, Reading, Timestamp};
 
 pub use config::MonitorConfig;
 pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
-pub use intake::CommandConfig;
+pub use intake::{CommandConfig, ControllerCount};
 pub use j1939::{AlarmCode, J1939Config};
 pub use outputs::{Estimate, MeasuredValues, Outputs, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
@@ -131,6 +132,28 @@ impl Monitor {
         config.input.decode(bus, frame, |Reading { channel, value }| {
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
+        if !intake.listener.is_empty() {
+            self.handle_diagnostic(bus, frame, out);
+        }
+    }
+
+    /// Takes a frame of diagnostic requests and answers. The values of an answer are of the moment at which its first frame
+    /// came: the controller has put it together by then, and sends the rest as fast as the tester lets it.
+    fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        let Self { clock, intake, stages, .. } = self;
+        let now = clock.now;
+        match intake.listener.handle(now, bus, frame) {
+            Heard::Nothing => {}
+            Heard::Begun { controller } => intake.moments[controller] = Some(stages.sampling.sampler.moment(now)),
+            Heard::Whole { controller, answer, data, is_single } => {
+                let began = intake.moments[controller].take().filter(|_| !is_single);
+                let moment = began.unwrap_or_else(|| stages.sampling.sampler.moment(now));
+                for reading in answer.readings(data) {
+                    stages.handle_answer_reading(now, bus, &moment, reading, out);
+                }
+            }
+        }
+        intake.report(now, out);
     }
 
     /// Takes an input that is neither a frame nor a gap, at its time.

@@ -15,7 +15,7 @@ use crate::can::encode::StatusFields;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
-use crate::sample::CellSample;
+use crate::sample::{CellSample, Moment};
 
 /// All stages behind the intake.
 #[derive(Debug)]
@@ -76,6 +76,25 @@ impl Stages {
         }
         if let Some(sample) = sample {
             self.handle_sample(now, sample, out);
+        }
+    }
+
+    /// Takes a reading of a diagnostic answer, whose values are of an earlier moment.
+    pub(super) fn handle_answer_reading(
+        &mut self,
+        now: Timestamp,
+        bus: BusIndex,
+        moment: &Moment,
+        reading: Reading,
+        out: &mut Outputs,
+    ) {
+        match reading.channel {
+            Channel::CellVoltage(_) | Channel::PackVoltage => {
+                if let Some(sample) = self.sampling.handle_reading(now, reading, out) {
+                    self.handle_sample(now, sample.measured_at(moment), out);
+                }
+            }
+            _ => self.handle_other_reading(now, bus, reading, out),
         }
     }
 

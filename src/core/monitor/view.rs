@@ -1,7 +1,7 @@
 //! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
 
 use super::stages::Stages;
-use super::{Estimate, Monitor, Statistics, Validity};
+use super::{ControllerCount, Estimate, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
@@ -99,6 +99,11 @@ impl Monitor {
     /// Input messages with dropped frames, because more came than the limit allows.
     pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.intake.dropped()
+    }
+
+    /// What came from each controller that answers diagnostic requests.
+    pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
+        self.intake.controllers()
     }
 
     /// Readings by outcome.

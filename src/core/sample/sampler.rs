@@ -119,6 +119,26 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
+/// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
+/// answer to a diagnostic request does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    time: Timestamp,
+    current_a: Option<f64>,
+    charge_as: f64,
+    offset_s: f64,
+    unmeasured_s: f64,
+}
+
+impl CellSample {
+    /// The same voltage, measured at this moment.
+    #[must_use]
+    pub fn measured_at(self, moment: &Moment) -> Self {
+        let Moment { time, current_a, charge_as, offset_s, unmeasured_s } = *moment;
+        Self { time, current_a, charge_as, offset_s, unmeasured_s, ..self }
+    }
+}
+
 /// Inputs shared by all readings of one time, until a current arrives (for the sensor's value, until a temperature does).
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
@@ -446,6 +466,14 @@ impl Sampler {
         }
         self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
         (self.next_stale, self.shared.is_known) = (None, false);
+    }
+
+    /// The present moment, for voltages of now that arrive later.
+    pub fn moment(&mut self, now: Timestamp) -> Moment {
+        let time = self.advance(now);
+        self.refresh_shared_inputs(time);
+        let SharedInputs { totals, cell_current_a: current_a, cell_charge_as: charge_as, .. } = self.shared;
+        Moment { time, current_a, charge_as, offset_s: totals.offset_s, unmeasured_s: totals.unmeasured_s }
     }
 
     #[inline]

@@ -6,6 +6,7 @@ use super::alarm::RatedCell;
 use super::keys::{Pack, TemperatureInput};
 use super::tables::RawTables;
 use crate::can::decode::InputMap;
+use crate::can::diagnostic::Answer;
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::cell::CellModel;
@@ -18,6 +19,7 @@ use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 #[derive(Debug)]
 pub(super) struct Traffic {
     pub input: InputMap,
+    pub answers: Vec<Answer>,
     pub guards: Vec<GuardConfig>,
     pub output: Option<OutputConfig>,
     pub commands: Option<CommandConfig>,
@@ -41,6 +43,7 @@ pub(super) fn monitor(
     Some(MonitorConfig {
         interfaces: raw.interfaces.len(),
         input: traffic.input,
+        answers: traffic.answers,
         guards: traffic.guards,
         identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },

@@ -64,10 +64,10 @@ pub struct SignalUse {
     pub message: String,
     /// Signal name.
     pub signal: String,
-    /// Condition under which the signal is in the frame: `Page = 3`; empty = always.
+    /// Where the signal is: `Page = 3` of a multiplexed frame, `answer of 7EC to 22 01 01`; empty = in every frame.
     pub multiplex: String,
-    /// DBC start bit.
-    pub start_bit: u16,
+    /// DBC start bit; in an answer its first bit, counted behind the echoed service and identifier.
+    pub start_bit: usize,
     /// Length, bits.
     pub length_bits: u16,
     /// `little-endian` or `big-endian`.
@@ -187,8 +187,8 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
         dbc: resolved.file.to_owned(),
         message: resolved.message.name.clone(),
         signal: resolved.signal.name.clone(),
-        multiplex: multiplex(resolved),
-        start_bit: layout.start_bit,
+        multiplex: resolved.answer.map_or_else(|| multiplex(resolved), |answer| answer.words()),
+        start_bit: resolved.answer.map_or(usize::from(layout.start_bit), |answer| answer.bit(layout)),
         length_bits: layout.length_bits,
         byte_order: match layout.byte_order {
             ByteOrder::LittleEndian => "little-endian",

@@ -39,6 +39,7 @@ mod commands;
 mod convert;
 mod cross;
 mod describe;
+mod diagnostic;
 mod document;
 mod j1939;
 mod keys;
@@ -55,6 +56,7 @@ mod tables;
 mod threshold;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
+pub(crate) use diagnostic::answers;
 pub(crate) use document::TablePlace;
 use document::{Document, Faults};
 pub(crate) use keys::SignalSource;
@@ -63,7 +65,7 @@ pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;
 pub use reference::reference;
 use resolve::Checks;
-pub(crate) use resolve::{Databases, ResolvedSignal, channel_words, input_map};
+pub(crate) use resolve::{Databases, NamedSignal, ResolvedSignal, channel_words, input_map};
 pub(crate) use tables::RawTables;
 
 /// A configuration that cannot be wrong.
@@ -156,8 +158,7 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let raw = RawTables::read(&document, faults);
     let model = read_model(path, &document, read, faults);
     cross::check(&raw, model.as_ref(), faults);
-    let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
-    let databases = Databases::load(path, names, read, faults);
+    let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
@@ -171,7 +172,8 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let traffic = convert::Traffic { input: input_map(&found)?, guards, output, commands, j1939 };
+    let traffic =
+        convert::Traffic { input: input_map(&found)?, answers: answers(&found).ok()?, guards, output, commands, j1939 };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };

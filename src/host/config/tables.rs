@@ -2,10 +2,10 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits, Estimator, Input,
-    Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput,
-    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, TemperatureInput,
-    TemperatureLimits, Transition, Usable, VoltageLimits,
+    Alarm, AnswerSignalKeys, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
+    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack,
+    PackIdentityInput, PackVoltageInput, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource,
+    Store, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -16,6 +16,7 @@ tables! {
         pack: one Pack,
         interfaces: many Interface,
         input: one Input,
+        diagnostics: many DiagnosticInput with AnswerSignalKeys,
         current: one CurrentInput,
         contactor: optional ContactorInput,
         cell_voltage: optional CellVoltageInput,

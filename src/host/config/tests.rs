@@ -9,6 +9,7 @@ use proptest::prelude::*;
 
 mod alarms;
 mod cell_model;
+mod diagnostic;
 mod j1939;
 mod protect;
 
@@ -284,7 +285,11 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without blank or /",
         ),
         ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
-        ("dbc = [\"pack.dbc\"]", "dbc = []", "pack.toml:7: input.dbc = [], must be a list of texts that is not empty"),
+        (
+            "dbc = [\"pack.dbc\"]",
+            "dbc = []",
+            "pack.toml:7: input.dbc = [], must be a list of DBC files where there is no [[input.diagnostic]]",
+        ),
         (
             "dbc = [\"pack.dbc\"]",
             "dbc = [\"pack.dbc\", 7]",
@@ -476,7 +481,7 @@ fn a_signal_in_two_dbc_files_is_ambiguous() {
     let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
     assert_eq!(
         all[0],
-        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one DBC file, is in pack.dbc and twin.dbc"
+        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one place, is in pack.dbc and twin.dbc"
     );
     let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give each cell one signal, \
                 1 is Cells.CellVoltage1 and Cells.CellVoltage1";

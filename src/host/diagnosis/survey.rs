@@ -8,10 +8,11 @@ use std::path::Path;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
+use crate::can::diagnostic::Answer;
 use crate::cell::CellModel;
 use crate::config::{
-    Config, ConfigFaults, Databases, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource, TablePlace,
-    input_map,
+    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
+    TablePlace, answers, input_map,
 };
 use crate::doctor::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
@@ -26,6 +27,8 @@ pub struct Survey {
     pub plan: Plan,
     /// The signals that were found.
     pub input: InputMap,
+    /// The diagnostic answers that were found.
+    pub answers: Vec<Answer>,
     /// The whole, when it is good.
     pub config: Option<Config>,
     /// Every fault; empty when it is good.
@@ -49,11 +52,12 @@ impl Survey {
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
     let partial = PartialConfig::read(path)?;
     let found = partial.signals();
+    let answers = answers(&found).unwrap_or_default();
     let input = input_map(&found).filter(|_| !partial.raw.interfaces.is_empty() && !found.is_empty());
     let Some(input) = input else { return Err(ConfigFaults(partial.faults)) };
     let plan = plan(&partial, &found);
     let places = partial.raw.places().map(|place| (place.path.clone(), place.clone())).collect();
-    Ok(Survey { plan, input, places, config: partial.config, faults: partial.faults })
+    Ok(Survey { plan, input, answers, places, config: partial.config, faults: partial.faults })
 }
 
 fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
@@ -123,7 +127,7 @@ fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     };
     let end = u32::from(keys.first) + u32::from(pack.cells);
     let mut numbered: BTreeMap<u32, SignalPlan> = BTreeMap::new();
-    for (_, message, signal) in databases.signals() {
+    for NamedSignal { message, signal, .. } in databases.signals().filter(|signal| signal.answer.is_none()) {
         let name = format!("{}.{}", message.name, signal.name);
         let Some(Some(number)) = pattern.fits(&name).filter(|number| number.is_some_and(|n| n >= end)) else {
             continue;

@@ -4,6 +4,7 @@
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
+use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::monitor::{BusEvent, Event, EventKind};
@@ -87,6 +88,9 @@ impl EventLog {
             }
             EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
+            EventKind::MessageLoss(MessageLoss { bus, id, fault, lost }) => {
+                tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());
             }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),

@@ -1,6 +1,7 @@
 //! A sample document for tests: every value is present, except a few that are unknown.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
+use crate::can::diagnostic::ControllerCounts;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
@@ -8,8 +9,8 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
-    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
+    MessageProtection, PackStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
@@ -54,6 +55,17 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
             interface: "can0".to_owned(),
             id: "3E9".to_owned(),
             checks: vec![StatusCount { status: "ok".to_owned(), count: 99 }],
+        }],
+        controllers: vec![ControllerStatus {
+            interface: "can0".to_owned(),
+            id: "7EC".to_owned(),
+            counts: ControllerCounts {
+                read: 120,
+                refused: 3,
+                latest_refusal: Some(0x31),
+                lost: [2, 0, 0, 0, 0, 0, 0, 0],
+                ..ControllerCounts::default()
+            },
         }],
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
