@@ -10,7 +10,7 @@ use super::decode::Binding;
 use super::id_table::IdTable;
 use super::isotp::{IsoTpFault, Progress, Receiver};
 use super::{CanId, Frame, FrameKind};
-use crate::quantity::{BusIndex, Fault, Reading, Timestamp};
+use crate::quantity::{BusIndex, Channel, Fault, Reading, Timestamp};
 
 /// First byte of a refusal (ISO 14229-1, table A.1).
 const NEGATIVE: u8 = 0x7F;
@@ -112,6 +112,11 @@ pub struct Answer {
 }
 
 impl Answer {
+    /// Whether it has a reading of this kind.
+    pub fn has(&self, is_wanted: impl Fn(Channel) -> bool) -> bool {
+        self.signals.iter().any(|signal| is_wanted(signal.binding.channel))
+    }
+
     /// The readings of an answer's data, which begin behind the echoed service and identifier. A signal behind the end of a
     /// cut answer is a short frame.
     pub fn readings<'a>(&'a self, data: &'a [u8]) -> impl Iterator<Item = Reading> + 'a {
@@ -181,6 +186,15 @@ pub struct MessageLoss {
     pub lost: u64,
 }
 
+/// A refusal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Refusal {
+    /// The service that was asked for.
+    pub service: u8,
+    /// Why (ISO 14229-1, table A.1); [`PENDING`] only says "wait".
+    pub code: u8,
+}
+
 /// What a frame brought.
 #[derive(Debug, PartialEq)]
 pub enum Heard<'a> {
@@ -190,6 +204,18 @@ pub enum Heard<'a> {
     Begun {
         /// Index in [`Listener::counts`].
         controller: usize,
+    },
+    /// An answer goes on.
+    Continued {
+        /// Index in [`Listener::counts`].
+        controller: usize,
+    },
+    /// A refusal.
+    Refused {
+        /// Index in [`Listener::counts`].
+        controller: usize,
+        /// The refusal.
+        refusal: Refusal,
     },
     /// A whole answer.
     Whole {
@@ -239,6 +265,10 @@ impl Listener {
             }
         }
         sorted.sort_by_key(|answer| answer.question);
+        for answer in &mut sorted {
+            // The current before the voltages that its sample is made with.
+            answer.signals.sort_by_key(|signal| signal.binding.channel);
+        }
         let mut controllers: Vec<Controller> = sorted.iter().map(|answer| answer.question.controller).collect();
         controllers.dedup();
         let ids = wanted(&sorted);
@@ -321,14 +351,16 @@ impl Listener {
                     Progress::Complete => {
                         heard = Some((index, Progress::Complete, !was_receiving || received.fault.is_some()))
                     }
-                    Progress::Continued | Progress::None => {}
+                    Progress::Continued => heard = Some((index, Progress::Continued, false)),
+                    Progress::None => {}
                 }
             }
         }
         match heard {
             Some((controller, Progress::Begun, _)) => Heard::Begun { controller },
+            Some((controller, Progress::Continued, _)) => Heard::Continued { controller },
             Some((controller, Progress::Complete, is_single)) => self.whole(now, controller, is_single),
-            Some(_) | None => Heard::Nothing,
+            Some((_, Progress::None, _)) | None => Heard::Nothing,
         }
     }
 
@@ -337,7 +369,7 @@ impl Listener {
         let Self { answers, links, .. } = self;
         let Some(link) = links.get_mut(controller) else { return Heard::Nothing };
         let message = link.receiver.message();
-        if let &[NEGATIVE, _, code, ..] = message {
+        if let &[NEGATIVE, service, code, ..] = message {
             if code == PENDING {
                 link.counts.pending += 1;
                 link.asked = link.asked.map(|(head, _)| (head, now));
@@ -345,7 +377,7 @@ impl Listener {
                 link.counts.refused += 1;
                 link.counts.latest_refusal = Some(code);
             }
-            return Heard::Nothing;
+            return Heard::Refused { controller, refusal: Refusal { service, code } };
         }
         let is_own = |answer: &&Answer| {
             answer.question.controller == link.controller && message.starts_with(&answer.question.answer_head())

@@ -126,7 +126,11 @@ impl Kind {
             Channel::Current => Self::Current,
             Channel::PackVoltage | Channel::CellVoltage(_) => Self::Voltage,
             Channel::Temperature(_) => Self::Temperature,
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => Self::Reported,
+            Channel::ReportedSoc
+            | Channel::ReportedSoh
+            | Channel::SupplyVoltage
+            | Channel::PackIdentity
+            | Channel::Contactor => Self::Reported,
         }
     }
 

@@ -9,6 +9,7 @@ use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
+use crate::can::poll::PollChange;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -214,6 +215,8 @@ pub enum EventKind {
     Flood(FloodChange),
     /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
     MessageLoss(MessageLoss),
+    /// Diagnostic requests are sent, or no more.
+    Poll(PollChange),
     /// An interface event.
     Bus {
         /// Which interface.

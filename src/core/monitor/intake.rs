@@ -36,6 +36,8 @@ pub(super) struct Intake {
     gate: FloodGate,
     guards: Guards,
     buses: Buses,
+    /// Controllers in the listener's order.
+    pub(super) controllers: Vec<Controller>,
     /// Diagnostic answers.
     pub(super) listener: Listener,
     /// When the answer under way of each controller began.
@@ -75,6 +77,7 @@ impl Intake {
             guards: Guards::new(config.guards.clone()),
             buses: Buses::default(),
             moments: vec![None; listener.counts().count()],
+            controllers: listener.counts().map(|(controller, _)| controller).collect(),
             listener,
             bad_command_at: None,
         }

@@ -5,6 +5,7 @@ use super::{ControllerCount, Estimate, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
+use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
@@ -104,6 +105,11 @@ impl Monitor {
     /// What came from each controller that answers diagnostic requests.
     pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.intake.controllers()
+    }
+
+    /// Why no diagnostic request is sent (`None` = they are), and how many are refused for good; `None` without `[poll]`.
+    pub fn poll(&self) -> Option<(Option<PollSilence>, usize)> {
+        self.stages.sender.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
     /// Readings by outcome.

@@ -234,7 +234,7 @@ impl Sampler {
                 self.shared.sensor = None;
                 None
             }
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::SupplyVoltage | Channel::PackIdentity => None,
             Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
             Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
         }
@@ -557,7 +557,7 @@ impl Sampler {
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
             // Used by the monitor, not sampled.
-            | (Channel::PackIdentity, _) => None,
+            | (Channel::SupplyVoltage | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
@@ -571,7 +571,9 @@ fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
     match channel {
         Channel::Current => &config.current,
         Channel::Temperature(_) => &config.temperature,
-        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => &config.voltage,
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
+            &config.voltage
+        }
         Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
         Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
         Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
@@ -600,7 +602,11 @@ fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
         // No rule says when they should move.
-        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => 0.0,
+        Channel::ReportedSoc
+        | Channel::ReportedSoh
+        | Channel::SupplyVoltage
+        | Channel::PackIdentity
+        | Channel::Contactor => 0.0,
     }
 }
 

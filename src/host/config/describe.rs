@@ -34,6 +34,8 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
+    /// The diagnostic requests that are sent, in sentences; empty = none.
+    pub polling: Vec<String>,
     /// The J1939 node and its codes, in sentences; empty = there is none.
     pub j1939: Vec<String>,
 }
@@ -117,6 +119,8 @@ pub(super) fn describe(
     outputs: Vec<OutputUse>,
 ) -> Description {
     let model = &config.monitor.model;
+    let voltage_step_v = super::resolve::ranges(found, raw.pack.as_ref().map_or(1, |pack| pack.cells)).voltage_step_v;
+    let rounding_v = raw.estimator.as_ref().map_or(0.0, |keys| keys.rounding_v(voltage_step_v));
     let cell = format!(
         "{}: rated {} Ah, {} Ah when new, {} to {} V, {} RC branch{}{}",
         model.name,
@@ -131,18 +135,19 @@ pub(super) fn describe(
     Description {
         file: config.path.display().to_string(),
         cell,
-        pack: pack(config),
+        pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
         intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
+        polling: super::diagnostic::poll_words(config),
         j1939: super::j1939::words(config),
     }
 }
 
-fn pack(config: &Config) -> Vec<String> {
+fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
     let sample = &config.monitor.sample;
     let mut words = vec![match sample.voltage_source {
         VoltageSource::Cells => format!("{} cells in series, each with its own voltage", sample.cells),
@@ -166,6 +171,13 @@ fn pack(config: &Config) -> Vec<String> {
         };
         let from = if config.monitor.model.thermal.is_some() { "from the thermal model at" } else { "taken as" };
         words.push(format!("no temperature sensor{cells}: {from} {ambient_c} degrees C"));
+    }
+    if rounding_v > 0.0 {
+        words.push(format!(
+            "voltages come in steps of {} mV: their rounding counts as noise of {:.1} mV",
+            round(1000.0 * voltage_step_v),
+            1000.0 * rounding_v
+        ));
     }
     words.push("a positive current is a discharge in everything reported".to_owned());
     words
@@ -214,6 +226,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
             | Channel::CellVoltage(_)
             | Channel::ReportedSoc
             | Channel::ReportedSoh
+            | Channel::SupplyVoltage
             | Channel::PackIdentity
             | Channel::Contactor => None,
         },

@@ -3,6 +3,7 @@
 //! In: the tables of the file. Out: one [`AnswerDefinition`] per table, with its signals as a DBC would describe them, so
 //! that `[input.*]` names them as it names those of a DBC; and the [`Answer`]s that the core reads.
 
+use super::Config;
 use super::document::Faults;
 use super::keys::{AnswerSignalKeys, DiagnosticInput, WireOrder};
 use super::resolve::ResolvedSignal;
@@ -11,8 +12,10 @@ use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
 use crate::can::diagnostic::{Answer, AnswerSignal, Controller, Question, Service};
 use crate::can::isotp::MAX_MESSAGE;
+use crate::can::poll::{FOREIGN_SILENCE_NS, PollConfig, PollRequest};
 use crate::can::signal::{ByteOrder, LayoutFault, SignalLayout, ValueType};
-use crate::quantity::BusIndex;
+use crate::monitor::SupplyConfig;
+use crate::quantity::{BusIndex, Channel};
 
 /// One answer as it is configured.
 #[derive(Debug)]
@@ -25,6 +28,8 @@ pub(crate) struct AnswerDefinition {
     response: (CanId, Option<u8>),
     service: Service,
     identifier: u16,
+    /// How often it is asked for, by [`CarState`](crate::can::poll::CarState), s.
+    every_s: [Option<f64>; 3],
     /// Its signals; each layout begins at the signal's first byte.
     pub message: Message,
     /// Of each signal: its first byte behind the echoed service and identifier.
@@ -88,6 +93,73 @@ pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, Layou
     Ok(answers)
 }
 
+/// The requests that are sent; `None` = none. Notes what they need and do not have.
+pub(super) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) -> Option<PollConfig> {
+    let keys = raw.poll.as_ref().filter(|keys| keys.enabled)?;
+    let mut requests: Vec<PollRequest> = Vec::new();
+    for (resolved, place) in found.iter().filter_map(|resolved| Some((resolved, resolved.answer?))) {
+        let question = place.definition.question(resolved.bus);
+        let every_s = place.definition.every_s;
+        if every_s == [None; 3] {
+            continue;
+        }
+        let has_current = resolved.channel == Channel::Current;
+        let has_voltages = matches!(resolved.channel, Channel::CellVoltage(_) | Channel::PackVoltage);
+        match requests.iter_mut().find(|request| request.question == question) {
+            Some(request) => {
+                request.has_current |= has_current;
+                request.has_voltages |= has_voltages;
+            }
+            None => requests.push(PollRequest { question, every_s, has_current, has_voltages }),
+        }
+    }
+    if requests.is_empty() && !raw.broken {
+        let what = "must be false: no answer that is read has drive_every_s, charge_every_s or parked_every_s";
+        keys.place.fault(faults, "enabled", what);
+    }
+    let current = found.iter().find(|resolved| resolved.channel == Channel::Current).and_then(|it| it.answer);
+    if let Some(place) = current.filter(|place| place.definition.every_s[2].is_none()) {
+        let table = &place.definition.table;
+        let what = format!(
+            "must be false, or {table} must have parked_every_s: without the current nothing says that the car drives"
+        );
+        keys.place.fault(faults, "enabled", &what);
+    }
+    let watches_supply = raw.supply_voltage.is_some();
+    Some(PollConfig { requests, max_requests_per_s: keys.max_requests_per_s, watches_supply })
+}
+
+/// What will be sent, in sentences.
+pub(super) fn poll_words(config: &Config) -> Vec<String> {
+    let Some(poll) = &config.monitor.poll else { return Vec::new() };
+    let mut words: Vec<String> = poll.requests.iter().map(|request| request_words(config, request)).collect();
+    words.push(format!(
+        "at most {} requests a second, one at a time; nothing else can be sent to a controller",
+        poll.max_requests_per_s
+    ));
+    let low_supply = |supply: SupplyConfig| format!(", while the supply is below {} V or not known", supply.minimum_v);
+    words.push(format!(
+        "silent for {} s after another tester's request, while the bus sleeps{}, and on standby",
+        FOREIGN_SILENCE_NS / 1_000_000_000,
+        config.monitor.supply.map(low_supply).unwrap_or_default()
+    ));
+    if config.monitor.supply.is_none() {
+        words.push("the vehicle's supply voltage is not watched ([input.supply_voltage])".to_owned());
+    }
+    words
+}
+
+/// `can0: asks 7E4 for 22 01 01 every 1 s while driving, every 5 s while charging`.
+fn request_words(config: &Config, request: &PollRequest) -> String {
+    let Controller { bus, request: id, .. } = request.question.controller;
+    let interface = config.interfaces.get(bus.index()).map_or("?", |interface| interface.name.as_str());
+    let bytes: Vec<String> = request.question.request().iter().map(|byte| format!("{byte:02X}")).collect();
+    let states = ["while driving", "while charging", "while parked and awake"];
+    let period = |(every_s, state): (&Option<f64>, _)| every_s.map(|every_s| format!("every {every_s} s {state}"));
+    let periods: Vec<String> = request.every_s.iter().zip(states).filter_map(period).collect();
+    format!("{interface}: asks {id} for {} {}", bytes.join(" "), periods.join(", "))
+}
+
 /// The answers of all tables; those with a fault are noted and left out.
 pub(super) fn definitions(raw: &RawTables, faults: &mut Faults) -> Vec<AnswerDefinition> {
     raw.diagnostics.iter().filter_map(|keys| definition(keys, faults)).collect()
@@ -140,6 +212,7 @@ fn definition(keys: &DiagnosticInput, faults: &mut Faults) -> Option<AnswerDefin
         response: (response, keys.response_extension),
         service,
         identifier: keys.identifier,
+        every_s: [keys.drive_every_s, keys.charge_every_s, keys.parked_every_s],
         message,
         first_bytes,
     })

@@ -25,10 +25,11 @@ use crate::quantity::MAX_CELLS;
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
 pub(crate) use input::{
     AnswerSignalKeys, CellVoltageInput, ContactorInput, CurrentInput, DiagnosticInput, Input, PackIdentityInput,
-    PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource, TemperatureInput,
+    PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource, SupplyVoltageInput,
+    TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
-pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus};
+pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Poll};
 
 /// Coldest and hottest temperature that may be configured, degrees C.
 const TEMPERATURE_C: ValueRange = Between(-100.0, 200.0);

@@ -167,13 +167,21 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let laid_out = output::output(checks, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
     guards.extend(guard);
+    let poll = diagnostic::poll(&raw, &found, checks.faults);
     let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let traffic =
-        convert::Traffic { input: input_map(&found)?, answers: answers(&found).ok()?, guards, output, commands, j1939 };
+    let traffic = convert::Traffic {
+        input: input_map(&found)?,
+        answers: answers(&found).ok()?,
+        poll,
+        guards,
+        output,
+        commands,
+        j1939,
+    };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };

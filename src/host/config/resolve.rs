@@ -17,7 +17,7 @@ use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
-use crate::can::signal::LayoutFault;
+use crate::can::signal::{LayoutFault, ValueType};
 use crate::quantity::{BusIndex, CellIndex, Channel};
 
 /// Most cell numbers named in one fault.
@@ -269,6 +269,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
         Channel::Contactor => "contactors".to_owned(),
     }
@@ -298,6 +299,14 @@ impl ResolvedSignal<'_> {
         binding.offset = self.offset;
         binding.not_available.clone_from(&self.not_available);
         Ok(binding)
+    }
+
+    /// Distance of two neighbouring values, in our unit; 0 for IEEE floats.
+    fn step(&self) -> f64 {
+        match self.signal.layout.value_type {
+            ValueType::Unsigned | ValueType::Signed => (self.signal.layout.factor * self.scale).abs(),
+            ValueType::Float32 | ValueType::Float64 => 0.0,
+        }
     }
 
     /// The DBC's range in our unit and sign; infinite when it gives none.
@@ -330,7 +339,11 @@ pub(super) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     } else {
         widest(|channel| matches!(channel, Channel::CellVoltage(_)), 1.0)
     };
+    let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
+    let steps = found.iter().filter(|resolved| is_voltage(resolved.channel)).map(ResolvedSignal::step);
+    let per_cell = if found.iter().any(|it| it.channel == Channel::PackVoltage) { f64::from(series) } else { 1.0 };
     DbcRanges {
+        voltage_step_v: steps.fold(0.0, f64::max) / per_cell,
         current_a: widest(|channel| channel == Channel::Current, 1.0),
         voltage_v,
         temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),

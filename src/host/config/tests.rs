@@ -240,10 +240,10 @@ fn an_output_dbc_must_have_the_daemons_messages() {
 #[test]
 fn numbers_may_be_hex_or_have_underscores() {
     let output =
-        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
+        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 2_0.0e-0_1\n";
     let config = good(&format!("{PACK}{output}"));
     assert_eq!(config.monitor.estimator.consistency.window_s, 1000.0);
-    assert_eq!(config.monitor.estimator.voltage.noise_v, 1e-9);
+    assert_eq!(config.monitor.estimator.voltage.noise_v, 2.0);
 }
 
 /// Each edit of the good file (from, to) and the whole of what is said about it.
@@ -290,11 +290,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "dbc = []",
             "pack.toml:7: input.dbc = [], must be a list of DBC files where there is no [[input.diagnostic]]",
         ),
-        (
-            "dbc = [\"pack.dbc\"]",
-            "dbc = [\"pack.dbc\", 7]",
-            "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
-        ),
+        ("dbc = [\"pack.dbc\"]", "dbc = [\"pack.dbc\", 7]", "pack.toml:7: input.dbc = 7, must be a list of texts"),
     ];
     each_edit_gives(table);
 }

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::{CellSummary, ProtectedSummary};
 use crate::alarm::Change;
+use crate::can::poll::PollChange;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::CellIndex;
@@ -108,6 +109,9 @@ pub(super) fn note_event(
             }
         }
         EventKind::MessageLoss(_) => "message_loss",
+        EventKind::Poll(PollChange::Silent { .. }) => "poll_silent",
+        EventKind::Poll(PollChange::Asking) => "poll_asking",
+        EventKind::Poll(PollChange::Refused { .. }) => "poll_refused",
         EventKind::Bus { .. } => "bus",
         EventKind::J1939 { .. } => "j1939",
         EventKind::Gap { .. } => "gap",

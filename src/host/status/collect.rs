@@ -5,7 +5,8 @@ use std::collections::VecDeque;
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
     AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
-    MessageProtection, PackStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
+    StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::flood::FloodCount;
@@ -133,6 +134,7 @@ impl Sources<'_> {
             },
             protection: self.protection(),
             controllers: self.controllers(),
+            poll: self.monitor.poll().map(|(silent, refused)| PollStatus { silent, refused }),
             floods: self.floods(),
             latency: self.latency.clone(),
             store: self.store,

@@ -15,6 +15,7 @@ use sha2::{Digest, Sha256};
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
 use crate::can::diagnostic::ControllerCounts;
+use crate::can::poll::PollSilence;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, Statistics, Validity};
@@ -60,6 +61,9 @@ pub struct StatusDocument {
     /// Controllers that answer diagnostic requests.
     #[serde(default)]
     pub controllers: Vec<ControllerStatus>,
+    /// Diagnostic requests of this program; `None` = it sends none.
+    #[serde(default)]
+    pub poll: Option<PollStatus>,
     /// Input messages with frames dropped beyond the accepted rate.
     pub floods: Vec<MessageFlood>,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
@@ -284,6 +288,23 @@ pub struct StatusCount {
     pub status: String,
     /// Number of checks.
     pub count: u64,
+}
+
+/// Diagnostic requests of this program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PollStatus {
+    /// Why none is sent now; `None` = they are sent.
+    pub silent: Option<PollSilence>,
+    /// Requests that are not sent any more, because their controller refused them for good.
+    pub refused: usize,
+}
+
+impl PollStatus {
+    /// In words: `asking`, `silent: the bus sleeps`.
+    pub fn words(&self) -> String {
+        let state = self.silent.map_or_else(|| "asking".to_owned(), |reason| format!("silent: {}", reason.words()));
+        if self.refused == 0 { state } else { format!("{state}; {} refused for good", self.refused) }
+    }
 }
 
 /// A controller that answers diagnostic requests.

@@ -38,7 +38,7 @@ section! {
 }
 
 section! {
-    /// An answer to a diagnostic request, over ISO-TP, whoever asks for it: most electric cars tell their cell voltages only so. Nothing is sent. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
+    /// An answer to a diagnostic request, over ISO-TP, whoever asks for it: most electric cars report their cell voltages only so. Nothing is sent without `[poll]`. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
     DiagnosticInput at "input.diagnostic" {
         /// What its signals are named by, before the dot; several answers may share it.
         name: String, "", NotEmpty, Required;
@@ -54,6 +54,12 @@ section! {
         service: u8, "", Any, Required;
         /// Identifier of the values: two bytes with service 0x22, otherwise one.
         identifier: u16, "", Any, Required;
+        /// How often `[poll]` asks for it while the pack is discharged. Without it: not asked then.
+        drive_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
+        /// The same while the pack is charged. Without it: not asked then.
+        charge_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
+        /// The same while no current flows, or none is known, and the bus is awake all the same. Without it: not asked then.
+        parked_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
         /// The signals, one table each; those that no input names are not read.
         signals: SubTables<AnswerSignalKeys>, "", NotEmpty, Required;
     }
@@ -183,6 +189,16 @@ signal_section! {
     ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0") =>;
+    }
+}
+
+signal_section! {
+    /// Voltage of the vehicle's supply battery: while it is low, or not known, `[poll]` asks for nothing.
+    SupplyVoltageInput at "input.supply_voltage", "V per unit of the DBC" {
+        /// Least voltage at which requests may be sent. The default is that of a half empty lead battery of 12 V.
+        minimum_v: f64, "V", Above(0.0, 100.0), Default("12.2") =>;
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
     }
 }
 

@@ -1,5 +1,7 @@
 //! `[[input.diagnostic]]`: what becomes of it, and its faults, word for word.
 
+#![allow(clippy::panic, reason = "in a test a panic is the message")]
+
 use super::*;
 use crate::can::diagnostic::{Answer, Service};
 
@@ -56,6 +58,18 @@ fn check_says_where_such_a_signal_is() {
     let signal = description.signals.iter().find(|signal| signal.channel == "cell 4 voltage").unwrap();
     assert_eq!((signal.multiplex.as_str(), signal.start_bit), ("answer of 7EC to 22 01 03", 12));
     assert_eq!((signal.dbc.as_str(), signal.id.as_str()), ("input.diagnostic[2]", "7EC"));
+}
+
+#[test]
+fn coarse_steps_of_the_voltages_count_as_noise() {
+    let noise = |pack: &str| good(pack).monitor.estimator.voltage.noise_v;
+    let (fine, coarse) = (noise(PACK), noise(&pack()));
+    assert_eq!(fine, 0.005, "steps of 1 uV are within the noise");
+    // Steps of 20 mV: 5.8 mV rms beside the sensor's 5 mV.
+    assert!((coarse - 0.005_f64.hypot(0.020 / 12.0_f64.sqrt())).abs() < 1e-12, "{coarse}");
+    let (_, description) = read_texts(&pack(), CELL, DBC).unwrap();
+    let words = "voltages come in steps of 20 mV: their rounding counts as noise of 5.8 mV";
+    assert!(description.pack.contains(&words.to_owned()), "{:?}", description.pack);
 }
 
 #[test]
@@ -162,4 +176,48 @@ fn single_faults_of_answers() {
     let signals_of_no_table = good.replace("signals = [{ name", "signals = 3 # [{ name");
     let found = faults(&signals_of_no_table);
     assert_eq!(found, ["pack.toml:32: input.diagnostic[2].signals = 3, must be tables [[input.diagnostic.signals]]"]);
+}
+
+#[test]
+fn requests_are_sent_only_when_asked_for_and_check_says_which() {
+    let polled =
+        pack().replacen("identifier = 0x0102", "identifier = 0x0102\ndrive_every_s = 2\ncharge_every_s = 10", 1);
+    assert_eq!(good(&polled).monitor.poll, None, "off by default");
+    let on = polled.clone() + "[poll]\nenabled = true\n";
+    let (config, description) = read_texts(&on, CELL, DBC).unwrap();
+    let poll = config.monitor.poll.clone().unwrap();
+    let [request] = &poll.requests[..] else { panic!("{poll:?}") };
+    assert_eq!((request.every_s, request.has_voltages), ([Some(2.0), Some(10.0), None], true));
+    assert!(config.monitor.wants_all(BusIndex(0)), "to know whether the bus sleeps");
+    let words = [
+        "can0: asks 7E4 for 22 01 02 every 2 s while driving, every 10 s while charging",
+        "at most 10 requests a second, one at a time; nothing else can be sent to a controller",
+        "silent for 60 s after another tester's request, while the bus sleeps, and on standby",
+        "the vehicle's supply voltage is not watched ([input.supply_voltage])",
+    ];
+    assert_eq!(description.polling, words);
+    let supplied = on.clone() + "[input.supply_voltage]\nsignal = \"Status.Total\"\nminimum_v = 12\n";
+    let (config, description) = read_texts(&supplied, CELL, DBC).unwrap();
+    assert!(config.monitor.poll.unwrap().watches_supply);
+    assert!(
+        description.polling[2].contains("while the supply is below 12 V or not known"),
+        "{:?}",
+        description.polling
+    );
+}
+
+#[test]
+fn faults_of_polling() {
+    let none = pack() + "[poll]\nenabled = true\n";
+    let fault = "pack.toml:34: poll.enabled = true, must be false: no answer that is read has drive_every_s, charge_every_s or \
+                 parked_every_s";
+    assert_eq!(faults(&none), [fault]);
+    let polled = pack().replace("Status.Current", "Car.Unused").replacen(
+        "identifier = 0x0102",
+        "identifier = 0x0102\ndrive_every_s = 2",
+        1,
+    );
+    let fault = "pack.toml:35: poll.enabled = true, must be false, or input.diagnostic[1] must have parked_every_s: without the \
+                 current nothing says that the car drives";
+    assert_eq!(faults(&(polled + "[poll]\nenabled = true\n")), [fault]);
 }

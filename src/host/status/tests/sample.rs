@@ -2,6 +2,7 @@
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::diagnostic::ControllerCounts;
+use crate::can::poll::PollSilence;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
@@ -10,7 +11,8 @@ use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
     AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
-    MessageProtection, PackStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
+    StoreStatus, VERSION,
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
@@ -67,6 +69,7 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
                 ..ControllerCounts::default()
             },
         }],
+        poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
         store: Some(StoreStatus {
