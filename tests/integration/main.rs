@@ -12,11 +12,13 @@
 
 mod alarm_noise;
 mod alarm_tradeoff;
+mod bus_sleep;
 mod can_data;
 mod capacity_peers;
 mod check_cli;
 mod contactor;
 mod dbc_vectors;
+mod diagnostic;
 mod doctor;
 mod e2e_peer;
 #[cfg(feature = "lab")]
@@ -28,6 +30,7 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+mod isotp_peer;
 mod layering;
 mod life_decodes;
 mod log_grammar;

@@ -20,7 +20,7 @@ fn readings_are_counted_by_their_outcome() {
     let refused = after.out_of_range + after.rate_too_high - before.out_of_range - before.rate_too_high;
     assert_eq!((refused, after.accepted - before.accepted), (20, 100));
     // What does not come is stale once, not with every look.
-    (rig.voltages_v, rig.temperatures_c, rig.current_a, rig.reported_soc) = ([None; 2], [None; 2], None, None);
+    (rig.voltages_v, rig.temperatures_c, rig.current_a) = ([None; 2], [None; 2], None);
     rig.seconds(20);
     assert!((1..=6).contains(&rig.monitor.reading_counts().stale), "{:?}", rig.monitor.reading_counts());
 }

@@ -35,6 +35,8 @@ pub struct MonitorConfig {
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
     pub flood: FloodConfig,
+    /// Silence of all inputs, at rest, after which the buses sleep, s; `None` = never.
+    pub asleep_after_s: Option<f64>,
     /// Sample stage.
     pub sample: SampleConfig,
     /// Cell model.
@@ -143,7 +145,10 @@ impl MonitorConfig {
             ("[pack]", self.model == new.model && old_sample.ambient_c == new_sample.ambient_c),
             (
                 "[input]",
-                self.flood == new.flood && self.guards == new.guards && old_sample.contactor == new_sample.contactor,
+                self.flood == new.flood
+                    && self.guards == new.guards
+                    && self.asleep_after_s == new.asleep_after_s
+                    && old_sample.contactor == new_sample.contactor,
             ),
             ("[limits]", limits(old_sample) == limits(new_sample)),
             ("[estimator]", self.estimator == new.estimator),

@@ -229,6 +229,13 @@ pub enum EventKind {
         /// The change.
         what: NodeEvent,
     },
+    /// The buses fell silent as a whole while no current flowed, or carry inputs again: the vehicle sleeps.
+    BusAsleep {
+        /// They sleep from now on.
+        asleep: bool,
+        /// How long they slept, s, when they wake.
+        seconds: Option<f64>,
+    },
     /// Nothing was measured for this long (asleep, or the log has a hole).
     Gap {
         /// Seconds; `None` = unknown.

@@ -31,6 +31,7 @@ mod publisher;
 mod reconfigure;
 mod sampling;
 mod sender;
+mod sleep;
 mod snapshot;
 mod stages;
 mod statistics;
@@ -39,6 +40,7 @@ mod watch;
 
 use clock::{ASLEEP_S, Clock, HOUSEKEEPING_S, TimeJump};
 use intake::Intake;
+use sleep::Silence;
 use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
 
@@ -140,6 +142,13 @@ impl Monitor {
             }
             return;
         }
+        if stages.sleep.since.is_some() {
+            let mut wakes = false;
+            config.input.decode(bus, frame, |reading| wakes |= Stages::wakes(reading.channel));
+            if wakes {
+                stages.end_bus_sleep(now, out);
+            }
+        }
         config.input.decode(bus, frame, |Reading { channel, value }| {
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
@@ -169,6 +178,7 @@ impl Monitor {
                 });
             }
             Heard::Whole { controller, answer, data, is_single } => {
+                stages.end_bus_sleep(now, out);
                 let began = moments[controller].take();
                 // Of an answer with the current everything is of one time anyway: that of its end.
                 let is_now = is_single || answer.has(|channel| channel == Channel::Current);
@@ -191,7 +201,12 @@ impl Monitor {
             Input::Tick { .. } => {
                 if stages.sender.take_housekeeping_due(now, HOUSEKEEPING_S) {
                     intake.poll(now, out);
-                    stages.keep_house(now, intake.bus_fault(now, config.interfaces), out);
+                    let silence = stages.silence(now);
+                    if silence == Silence::Begins {
+                        intake.restart(now, out);
+                        stages.begin_bus_sleep(now, out);
+                    }
+                    stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
                 stages.send_due(now, out);
             }

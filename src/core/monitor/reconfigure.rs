@@ -60,6 +60,7 @@ impl Monitor {
         let stages = &mut self.stages;
         stages.estimation.reconfigure(&config, &stages.learning.state.learner);
         stages.sampling.reconfigure(&config);
+        stages.sleep.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);
         if old.j1939 != config.j1939 {
             stages.sender.reconfigure_j1939(at, &config, self.clock.has_started, out);

@@ -53,6 +53,9 @@ pub struct Snapshot {
     identity: Identity,
     #[serde(default)]
     statistics: Statistics,
+    /// Since when the buses sleep.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    asleep_since: Option<Timestamp>,
 }
 
 /// One cell of a snapshot.
@@ -123,7 +126,7 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
-        let Stages { sampling, estimation, learning, alarming, sender, statistics } = &self.stages;
+        let Stages { sampling, estimation, learning, alarming, sender, statistics, sleep } = &self.stages;
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
@@ -140,6 +143,7 @@ impl Monitor {
             buses,
             identity: sampling.identity,
             statistics: statistics.clone(),
+            asleep_since: sleep.since,
         }
     }
 
@@ -228,6 +232,7 @@ impl Stages {
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
         self.sender.schedule = snapshot.schedule;
+        self.sleep.since = snapshot.asleep_since;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
@@ -278,6 +283,7 @@ impl Snapshot {
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
         self.buses.rebase(by_nanos);
+        self.asleep_since = self.asleep_since.map(|since| since.plus_nanos(by_nanos));
     }
 }
 

@@ -9,6 +9,7 @@ use super::learning::Learning;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
+use super::sleep::{BusSleep, Silence};
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
 use crate::alarm::{AlarmInput, CommandOutcome, Observation};
 use crate::can::Frame;
@@ -28,6 +29,7 @@ pub(super) struct Stages {
     pub(super) alarming: Alarming,
     pub(super) sender: Sender,
     pub(super) statistics: Statistics,
+    pub(super) sleep: BusSleep,
 }
 
 impl Stages {
@@ -39,6 +41,7 @@ impl Stages {
             alarming: Alarming::new(config),
             sender: Sender::new(config),
             statistics: Statistics::default(),
+            sleep: BusSleep::new(config),
         }
     }
 
@@ -299,14 +302,20 @@ impl Stages {
     }
 
     /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.
-    pub(super) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
-        self.sampling.poll(now, out);
-        self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
+    pub(super) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, silence: Silence, out: &mut Outputs) {
+        let is_judged = silence == Silence::None;
+        if is_judged {
+            self.sampling.poll(now, out);
+            self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
+        }
         if !self.sampling.sampler.voltages_fresh(now) {
             // A cell without a voltage may be the weakest.
             self.forget_pack_state();
         }
-        self.watch(now, bus_fault, out);
+        if is_judged {
+            self.watch(now, out);
+        }
+        self.watch_computer(now, bus_fault, out);
     }
 
     /// Sends the frames that are due.

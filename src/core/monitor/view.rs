@@ -112,6 +112,11 @@ impl Monitor {
         self.stages.sender.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
+    /// Since when the buses sleep; `None` = they are awake.
+    pub fn asleep_since(&self) -> Option<Timestamp> {
+        self.stages.sleep.since
+    }
+
     /// Readings by outcome.
     pub fn reading_counts(&self) -> ReadingCounts {
         self.stages.sampling.sampler.reading_counts()

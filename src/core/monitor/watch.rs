@@ -48,13 +48,17 @@ struct SocSpread {
 }
 
 impl Stages {
-    /// Passes all values that are not learned at a transition to their rules; `bus_fault` is that of the interfaces.
-    pub(super) fn watch(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
+    /// Passes the values that follow from the inputs, and are not learned at a transition, to their rules.
+    pub(super) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
         self.watch_inputs(now, worst, out);
         self.watch_learned(now, any_lost, out);
         self.watch_pack(now, worst.is_some() && !any_lost, out);
+    }
+
+    /// Passes the values about interfaces and files to their rules, and publishes all alarms.
+    pub(super) fn watch_computer(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
         let store = self.alarming.store.failing(now);
         let mut publisher = self.publisher(now, out);
         publisher.observe(Rule::BusFault, None, bus_fault);

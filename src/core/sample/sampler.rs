@@ -354,6 +354,26 @@ impl Sampler {
         &self.channels
     }
 
+    /// For how long no reading of any input has come, s; `None` = not even `quiet_s`, or none has come at all.
+    pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
+        let received = |signal: &Signal| signal.received;
+        let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
+        // The current comes most often: mostly it answers for all.
+        if received(&self.state.signals[0]).is_some_and(is_recent) {
+            return None;
+        }
+        let latest = self.state.signals.iter().filter_map(received).max()?;
+        (!is_recent(latest)).then(|| now.since(latest))
+    }
+
+    /// The latest good reading of the pack current however old it is, A; 0 while the contactors are open.
+    pub fn latest_current_a(&self, now: Timestamp) -> Option<f64> {
+        if self.state.charge.is_open(now) {
+            return Some(0.0);
+        }
+        self.state.signals[0].good.map(|good| good.value())
+    }
+
     /// The highest fresh temperature, degrees C, and whether all sensors are fresh; `None` = no sensor is.
     pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
         let sensors = &self.state.signals[1..=self.sensors];

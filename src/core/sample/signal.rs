@@ -34,6 +34,12 @@ pub(super) struct TimedValue {
     pub(super) time: Timestamp,
 }
 
+impl TimedValue {
+    pub(super) fn value(self) -> f64 {
+        self.value
+    }
+}
+
 /// State of one signal.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {

@@ -52,6 +52,7 @@ pub(super) fn monitor(
             .as_ref()
             .map(|keys| SupplyConfig { minimum_v: keys.minimum_v, max_age_s: keys.max_age_s }),
         guards: traffic.guards,
+        asleep_after_s: Some(raw.input.as_ref()?.asleep_after_s).filter(|after_s| *after_s > 0.0),
         identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output: traffic.output,

@@ -94,6 +94,8 @@ impl EventLog {
                 tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());
             }
             EventKind::Poll(change) => log_poll(change),
+            EventKind::BusAsleep { asleep: true, .. } => tracing::info!("the buses sleep"),
+            EventKind::BusAsleep { asleep: false, seconds } => tracing::info!(seconds, "the buses are awake"),
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {

@@ -109,6 +109,8 @@ pub(super) fn note_event(
             }
         }
         EventKind::MessageLoss(_) => "message_loss",
+        EventKind::BusAsleep { asleep: true, .. } => "bus_asleep",
+        EventKind::BusAsleep { asleep: false, .. } => "bus_awake",
         EventKind::Poll(PollChange::Silent { .. }) => "poll_silent",
         EventKind::Poll(PollChange::Asking) => "poll_asking",
         EventKind::Poll(PollChange::Refused { .. }) => "poll_refused",

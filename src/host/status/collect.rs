@@ -134,6 +134,7 @@ impl Sources<'_> {
             },
             protection: self.protection(),
             controllers: self.controllers(),
+            asleep_since: self.monitor.asleep_since(),
             poll: self.monitor.poll().map(|(silent, refused)| PollStatus { silent, refused }),
             floods: self.floods(),
             latency: self.latency.clone(),

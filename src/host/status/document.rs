@@ -61,6 +61,9 @@ pub struct StatusDocument {
     /// Controllers that answer diagnostic requests.
     #[serde(default)]
     pub controllers: Vec<ControllerStatus>,
+    /// Since when the buses sleep; `None` = they are awake.
+    #[serde(default)]
+    pub asleep_since: Option<Timestamp>,
     /// Diagnostic requests of this program; `None` = it sends none.
     #[serde(default)]
     pub poll: Option<PollStatus>,

@@ -12,6 +12,8 @@ section! {
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file. Not needed where all of them are in the answers of `[[input.diagnostic]]`.
         dbc: Vec<String>, "", Any, Default("[]");
+        /// Silence of all inputs together, while no current flows, after which the buses are taken to sleep: that is no fault, raises no alarm and takes two events. At least the largest age of currents and voltages (`max_age_s` of the limits). 0: never; a parked vehicle's silent inputs are then missing.
+        asleep_after_s: f64, "s", Between(0.0, 86_400.0), Default("5.0");
         /// Most frames of one identifier on one interface that are processed in a second; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender takes no time from the others. The default is twice the rate of the fastest sensible sender (one frame a millisecond) and half the rate of a saturated bus of 500 kbit/s.
         max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
     }

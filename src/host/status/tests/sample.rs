@@ -69,6 +69,7 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
                 ..ControllerCounts::default()
             },
         }],
+        asleep_since: None,
         poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,

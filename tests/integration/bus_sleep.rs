@@ -1,0 +1,108 @@
+//! A parked vehicle: its buses fall silent as a whole, which is no fault; silence under load, or of one input, is one.
+
+use packwatch::alarm::{Change, Rule};
+use packwatch::monitor::{Downtime, Event, EventKind, Validity};
+
+use crate::support::rig::Rig;
+
+const ALARMS: &str = "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nsevere = 5\n[[alarm]]\nrule = \"input_implausible\"\nwarning = 0.5\n\
+                      [[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n";
+const HOUR: i64 = 3600;
+
+/// A pack that drove and has stood for a minute.
+fn parked() -> Rig {
+    let mut rig = Rig::new(ALARMS);
+    rig.seconds(10);
+    rig.current_a = Some(5.0);
+    rig.seconds(30);
+    rig.current_a = Some(0.0);
+    rig.seconds(60);
+    rig.events.clear();
+    rig
+}
+
+fn fall_silent(rig: &mut Rig) {
+    (rig.current_a, rig.voltages_v, rig.temperatures_c, rig.reported_soc) = (None, [None; 2], [None; 2], None);
+}
+
+fn come_back(rig: &mut Rig) {
+    (rig.current_a, rig.voltages_v) = (Some(0.0), [Some(3.69); 2]);
+    (rig.temperatures_c, rig.reported_soc) = ([Some(20.0); 2], Some(0.5));
+}
+
+fn sleeps(events: &[Event]) -> Vec<(bool, Option<f64>)> {
+    let sleep = |event: &Event| match event.kind {
+        EventKind::BusAsleep { asleep, seconds } => Some((asleep, seconds)),
+        _ => None,
+    };
+    events.iter().filter_map(sleep).collect()
+}
+
+#[test]
+fn a_night_is_four_events_and_no_alarm() {
+    let mut rig = parked();
+    fall_silent(&mut rig);
+    rig.seconds(8 * HOUR);
+    assert!(rig.monitor.asleep_since().is_some());
+    assert_eq!(rig.monitor.pack_view().validity, Validity::Unavailable, "unknown does not look like healthy");
+    assert_eq!(rig.monitor.lost_inputs().count(), 0, "nothing is missing");
+    come_back(&mut rig);
+    rig.seconds(60);
+    let kinds: Vec<_> = rig.events.iter().map(|event| event.kind).collect();
+    assert!(kinds.len() <= 4, "{kinds:#?}");
+    let [(true, None), (false, Some(slept_s))] = sleeps(&rig.events)[..] else { panic!("{kinds:#?}") };
+    assert!((f64::from(8 * 3600 - 10)..f64::from(8 * 3600)).contains(&slept_s), "{slept_s}");
+    assert_eq!((rig.changes(Rule::InputMissing), rig.monitor.pack_view().validity), (vec![], Validity::Valid));
+}
+
+#[test]
+fn a_restart_in_the_night_finds_a_sleeping_bus() {
+    let mut rig = parked();
+    fall_silent(&mut rig);
+    rig.seconds(HOUR);
+    rig.restart(Downtime::Seconds(60.0));
+    rig.seconds(HOUR);
+    assert!(rig.monitor.asleep_since().is_some());
+    assert_eq!(rig.changes(Rule::InputMissing), []);
+}
+
+#[test]
+fn silence_under_load_is_a_fault() {
+    let mut rig = parked();
+    rig.current_a = Some(5.0);
+    rig.seconds(20);
+    fall_silent(&mut rig);
+    rig.seconds(60);
+    assert_eq!(sleeps(&rig.events), []);
+    assert!(rig.changes(Rule::InputMissing).iter().filter(|change| **change == Change::Raised).count() >= 3);
+}
+
+#[test]
+fn one_silent_input_among_others_is_a_fault() {
+    let mut rig = parked();
+    rig.voltages_v[1] = None;
+    rig.seconds(60);
+    assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised, Change::Raised]));
+    // The others fall asleep later: the missing one stays missing.
+    fall_silent(&mut rig);
+    rig.seconds(60);
+    assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 2));
+}
+
+#[test]
+fn a_bus_that_never_brought_an_input_does_not_sleep() {
+    let mut rig = Rig::new(ALARMS);
+    fall_silent(&mut rig);
+    rig.seconds(60);
+    assert_eq!((sleeps(&rig.events), rig.monitor.asleep_since()), (vec![], None));
+    assert!(!rig.changes(Rule::InputMissing).is_empty(), "the wiring may be wrong");
+}
+
+#[test]
+fn without_a_time_out_a_silent_bus_is_missing() {
+    let mut rig = parked();
+    rig.reload(|config| config.asleep_after_s = None).unwrap();
+    fall_silent(&mut rig);
+    rig.seconds(60);
+    assert!(sleeps(&rig.events).is_empty() && !rig.changes(Rule::InputMissing).is_empty());
+}
