@@ -78,15 +78,16 @@ fn silence_under_load_is_a_fault() {
 }
 
 #[test]
-fn one_silent_input_among_others_is_a_fault() {
+fn silent_cells_among_other_inputs_are_a_fault() {
     let mut rig = parked();
-    rig.voltages_v[1] = None;
+    rig.voltages_v = [None; 2];
     rig.seconds(60);
-    assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised, Change::Raised]));
-    // The others fall asleep later: the missing one stays missing.
+    // Two cells, two severities.
+    assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised; 4]));
+    // The others fall asleep later: the missing ones stay missing.
     fall_silent(&mut rig);
     rig.seconds(60);
-    assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 2));
+    assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 4));
 }
 
 #[test]

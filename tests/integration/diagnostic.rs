@@ -101,7 +101,7 @@ fn the_leafs_log_gives_what_its_answers_say() {
 #[test]
 fn the_values_of_an_answer_are_of_its_first_frame() {
     let folder = tempfile::tempdir().unwrap();
-    let pack = LEAF.replace("cells = 96", "cells = 2").replacen("0x79B", "0x797", 1).replacen("0x7BB", "0x79A", 1);
+    let pack = LEAF.replace("cells = 96", "cells = 8").replacen("0x79B", "0x797", 1).replacen("0x7BB", "0x79A", 1);
     let config = packwatch::config::load(&written(folder.path(), &pack)).unwrap().monitor;
     let encoder = InputEncoder::new(&config.input).with_answers(&config.answers);
     let frames = |values: &[(Channel, Option<f64>)]| {
@@ -109,7 +109,7 @@ fn the_values_of_an_answer_are_of_its_first_frame() {
         encoder.encode(values, &mut made);
         made
     };
-    let cells = frames(&[0, 1].map(|cell| (Channel::CellVoltage(CellIndex(cell)), Some(3.7))));
+    let cells = frames(&[0, 1, 2, 3, 4, 5, 6, 7].map(|cell| (Channel::CellVoltage(CellIndex(cell)), Some(3.7))));
     let current = |current_a| frames(&[(Channel::Current, Some(current_a)), (Channel::ReportedSoc, Some(0.5))]);
     let (mut monitor, mut out) = (Monitor::new(config), Outputs { want_estimates: true, ..Outputs::default() });
     let mut give = |ms: i64, frame: &Frame, out: &mut Outputs| {
@@ -125,5 +125,5 @@ fn the_values_of_an_answer_are_of_its_first_frame() {
     rest.iter().for_each(|(_, frame)| give(300, frame, &mut out));
     monitor.settle(&mut out);
     let measured: Vec<_> = out.estimates.iter().map(|estimate| (estimate.time, estimate.measured.current_a)).collect();
-    assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 2]);
+    assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 8]);
 }
