@@ -2,10 +2,11 @@
 
 use std::fmt::Write as _;
 
+use super::alarm_groups::{AlarmGroup, grouped};
 use super::control_args::ControlArgs;
 use super::output::{print, word};
 use super::{Failure, output};
-use crate::alarm::{Alarm, Rule, Unit};
+use crate::alarm::{Rule, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
@@ -49,7 +50,7 @@ fn table(list: &AlarmList) -> String {
     if list.alarms.is_empty() {
         text.push_str("no alarm\n");
     } else {
-        text.push_str(&output::table(&HEAD, list.alarms.iter().map(row), HEAD.len()));
+        text.push_str(&output::table(&HEAD, grouped(&list.alarms).iter().map(row), HEAD.len()));
     }
     if list.omitted > 0 {
         let _ = writeln!(text, "and {} more, beyond the length of an answer", list.omitted);
@@ -68,13 +69,14 @@ fn table(list: &AlarmList) -> String {
     text
 }
 
-fn row(alarm: &Alarm) -> Vec<String> {
+fn row(group: &AlarmGroup) -> Vec<String> {
+    let alarm = &group.alarm;
     let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc);
     let has_been = alarm.occurrences > 0;
     vec![
         alarm.rule.name().to_owned(),
         alarm.severity.name().to_owned(),
-        cell(alarm.cell),
+        group.cells(),
         word(alarm.state),
         alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
         with_unit(alarm.rule, alarm.threshold),
@@ -110,7 +112,7 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{AlarmState, Severity};
+    use crate::alarm::{Alarm, AlarmState, Severity};
     use crate::control::protocol::UnknownAlarms;
     use crate::quantity::Timestamp;
 

@@ -1,6 +1,7 @@
 //! The command line: one file per command; here only parsing, dispatch and exit codes.
 #![expect(clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
 
+mod alarm_groups;
 mod alarms;
 mod check;
 mod command;

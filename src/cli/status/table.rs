@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use super::{config, duration, number, percent, shown, store, with_std, word};
-use crate::alarm::Alarm;
-use crate::cli::alarms::{cell as cell_name, with_unit};
+use crate::cli::alarm_groups::{AlarmGroup, grouped};
+use crate::cli::alarms::with_unit;
 use crate::cli::output;
 use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
@@ -40,6 +40,13 @@ fn head(text: &mut String, document: &StatusDocument) {
 
 fn pack(text: &mut String, document: &StatusDocument) {
     let pack = &document.pack;
+    if let Some(since) = document.asleep_since {
+        let asleep = duration(document.time.since(since));
+        let _ = writeln!(
+            text,
+            "asleep     for {asleep}: the buses are silent at rest, nothing is measured and nothing missing"
+        );
+    }
     let band = match (pack.soc_low, pack.soc_high) {
         (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),
         _ => String::new(),
@@ -128,6 +135,12 @@ fn interfaces(text: &mut String, document: &StatusDocument) {
         readings.accepted, service.missed_deadlines,
     );
     let _ = writeln!(text, "store      {}", store(document));
+    if let Some(poll) = document.poll {
+        let _ = writeln!(text, "requests   {}", poll.words());
+    }
+    for controller in &document.controllers {
+        let _ = writeln!(text, "answers    {} {}: {}", controller.interface, controller.id, controller.words());
+    }
 }
 
 fn alarms(text: &mut String, document: &StatusDocument) {
@@ -137,20 +150,21 @@ fn alarms(text: &mut String, document: &StatusDocument) {
         count => format!(", not known for {count}"),
     };
     let _ = writeln!(text, "alarms     {} raised of {} thresholds{unknown}", alarms.raised, alarms.thresholds);
-    for alarm in &alarms.list {
-        let _ = writeln!(text, "           {}", alarm_line(alarm));
+    for alarm in grouped(&alarms.list) {
+        let _ = writeln!(text, "           {}", alarm_line(&alarm));
     }
     if alarms.omitted > 0 {
         let _ = writeln!(text, "           and {} more", alarms.omitted);
     }
 }
 
-/// An alarm in a line.
-pub(super) fn alarm_line(alarm: &Alarm) -> String {
+/// An alarm, or one that many cells share, in a line.
+pub(super) fn alarm_line(group: &AlarmGroup) -> String {
+    let alarm = &group.alarm;
     let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value));
     let probability =
         alarm.probability.map_or_else(String::new, |probability| format!(", {:.0} % sure", 100.0 * probability));
-    let owner = alarm.cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell_name(Some(cell))));
+    let owner = group.owner();
     format!(
         "{} {} {owner} {}: {value}, threshold {}{probability}{}",
         alarm.severity.name(),

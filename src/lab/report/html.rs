@@ -3,7 +3,7 @@
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::context::PageContext;
-use super::data::{Data, Origin};
+use super::data::{AlarmRecord, Data, Origin};
 use super::pictures::{self, NOT_STORED};
 use super::{forecast, summary};
 use crate::chart::{Picture, Size, variables};
@@ -245,10 +245,19 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
 }
 
 fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
-    let rows = data.alarms.iter().rev().map(|row| {
+    // What many cells share is one row: the alarms of a rule that change in the same second.
+    let is_alike = |a: &AlarmRecord, b: &AlarmRecord| {
+        let kind = |row: &AlarmRecord| (row.rule.clone(), row.severity.clone(), row.change.clone(), row.cell.is_some());
+        kind(a) == kind(b) && (a.time_s - b.time_s).abs() < 1.0
+    };
+    let groups: Vec<&[AlarmRecord]> = data.alarms.chunk_by(is_alike).collect();
+    let row = |group: &&[AlarmRecord]| {
+        let row = &group[0];
+        let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
         let when = summary::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row)]
-    });
+        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row) + &more]
+    };
+    let rows = groups.iter().rev().map(row);
     let incidents = data.incidents.iter().rev();
     let incidents = incidents.map(|(time_s, what)| vec![summary::moment(data, *time_s), what.clone()]);
     html! {
@@ -260,7 +269,7 @@ fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
                 p.none { "no alarm was raised in this record" }
             }
             @if !data.alarms.is_empty() {
-                (table(&["When", "Rule", "Severity", "Change", "What"], rows, data.alarms.len()))
+                (table(&["When", "Rule", "Severity", "Change", "What"], rows, groups.len()))
             }
             @if !data.incidents.is_empty() {
                 h3 { "What else happened" }

@@ -9,6 +9,7 @@ use ratatui::widgets::{Block, Paragraph};
 use super::app::{App, Page};
 use super::theme::{Theme, clock};
 use super::{pages, plot};
+use crate::cli::alarm_groups::grouped;
 use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
 use crate::status::document::StatusDocument;
 
@@ -113,8 +114,9 @@ fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Re
 /// The most severe alarm and the number of alarms, shown on every page.
 fn alarm_line(document: &StatusDocument, theme: Theme) -> Line<'static> {
     let alarms = &document.alarms;
-    let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
-    let Some(worst) = raised.max_by_key(|alarm| alarm.severity as u8) else {
+    let groups = grouped(&alarms.list);
+    let raised = groups.iter().filter(|group| group.alarm.state.is_raised());
+    let Some(worst) = raised.max_by_key(|group| group.alarm.severity as u8) else {
         return Line::from(match (alarms.thresholds, alarms.unknown.len()) {
             (0, _) => "no threshold is configured".to_owned(),
             (_, 0) => "no alarm".to_owned(),
@@ -123,7 +125,7 @@ fn alarm_line(document: &StatusDocument, theme: Theme) -> Line<'static> {
     };
     let count = if alarms.raised == 1 { "1 alarm: ".to_owned() } else { format!("{} alarms: ", alarms.raised) };
     let text = super::super::table::alarm_line(worst);
-    Line::from(vec![Span::raw(count), Span::styled(text, theme.severity(worst.severity))])
+    Line::from(vec![Span::raw(count), Span::styled(text, theme.severity(worst.alarm.severity))])
 }
 
 fn tabs(document: &StatusDocument, chosen: Page) -> Line<'static> {

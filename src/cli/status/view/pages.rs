@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::app::{App, Page, Quantity};
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
+use crate::cli::alarm_groups::{AlarmGroup, grouped};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{number, shown, with_std, word};
 use crate::quantity::Timestamp;
@@ -181,11 +182,12 @@ fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
 
 fn alarms(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
     let alarms = &document.alarms;
-    let line = |alarm: &crate::alarm::Alarm| {
-        let style = if alarm.state.is_raised() { theme.severity(alarm.severity) } else { Style::new() };
-        Line::styled(alarm_line(alarm), style)
+    let line = |group: &AlarmGroup| {
+        let is_raised = group.alarm.state.is_raised();
+        let style = if is_raised { theme.severity(group.alarm.severity) } else { Style::new() };
+        Line::styled(alarm_line(group), style)
     };
-    let mut text: Vec<Line<'_>> = alarms.list.iter().map(line).collect();
+    let mut text: Vec<Line<'_>> = grouped(&alarms.list).iter().map(line).collect();
     if alarms.list.is_empty() {
         text.push(Line::from("no alarm"));
     }
