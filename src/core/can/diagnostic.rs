@@ -1,8 +1,8 @@
 //! Diagnostic answers (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) over ISO-TP: which are read, and where their signals are.
 //!
-//! In: frames of the configured identifiers, whoever asked. Out: whole answers, and their readings
-//! ([`Answer::readings`]). Of every controller it is counted what came: answers, refusals, answers that nobody was heard
-//! asking for, lost messages by their fault. Nothing is sent here. Memory: one message per configured controller.
+//! In: frames of the configured identifiers, from any tester. Out: whole answers, and their readings
+//! ([`Answer::readings`]). Of every controller it is counted what came: answers, refusals, answers without a request
+//! before, lost messages by their fault. Nothing is sent here. Memory: one message per configured controller.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ const NEGATIVE: u8 = 0x7F;
 const POSITIVE: u8 = 0x40;
 /// Code of a refusal that only says "wait" (requestCorrectlyReceived-ResponsePending).
 pub const PENDING: u8 = 0x78;
-/// An answer later than this after its request belongs to nobody: the longest P2* of ISO 14229-2, ns.
+/// An answer later than this after its request belongs to no request: the longest P2* of ISO 14229-2, ns.
 const ANSWER_WITHIN_NS: i64 = 5_000_000_000;
 /// Lost messages of a controller are reported at most this often, ns.
 const REPORT_EVERY_NS: i64 = 60_000_000_000;
@@ -205,7 +205,7 @@ pub enum Heard<'a> {
         /// Index in [`Listener::counts`].
         controller: usize,
     },
-    /// An answer goes on.
+    /// A further part of an answer.
     Continued {
         /// Index in [`Listener::counts`].
         controller: usize,
@@ -425,7 +425,7 @@ impl Link {
     }
 }
 
-/// Identifiers to be received for these answers, of requests too: they tell an answer that was asked for from another.
+/// Identifiers to be received for these answers, of requests too: an answer that was asked for differs from another by them.
 pub fn wanted(answers: &[Answer]) -> Vec<(BusIndex, CanId)> {
     let both = |answer: &Answer| {
         let Controller { bus, request, response, .. } = answer.question.controller;

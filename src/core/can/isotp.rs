@@ -2,7 +2,7 @@
 //!
 //! In: payloads of one sender's frames with their times. Out: whole messages, and a fault for each one that is lost. Classic
 //! frames and CAN FD (escapes of length), normal and extended addressing. A [`Receiver`] only listens: flow control is the
-//! business of whoever asked. It keeps one message and never more memory than has arrived.
+//! business of the tester. It keeps one message and never more memory than has arrived.
 
 use crate::quantity::Timestamp;
 

@@ -1,7 +1,7 @@
 //! Asks controllers for diagnostic answers, and stops at every sign that it could disturb.
 //!
 //! In: frames, answers, what the car does, the supply voltage, the time. Out: request and flow control frames, and a
-//! [`PollChange`] each time it falls silent or goes on. One request is outstanding at a time. It is silent while another tester
+//! [`PollChange`] each time it falls silent or asks again. One request is outstanding at a time. It is silent while another tester
 //! is at work, while the bus sleeps, while the supply is low or not known, and on standby.
 //!
 //! Only questions of a [`Service`](super::diagnostic::Service) can be sent: there is no way to express a write, a session or a
@@ -255,7 +255,7 @@ impl Poller {
         self.poll(now, out);
     }
 
-    /// The answer of several frames to the outstanding question begins: it may go on.
+    /// The answer of several frames to the outstanding question begins: the rest may come.
     pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
         let Some(question) = self.outstanding_of(controller) else { return };
         self.extend_wait(now, ANSWER_WITHIN_NS);
@@ -266,7 +266,7 @@ impl Poller {
         out.frames.extend(Frame::classic(request, &payload).map(|frame| (bus, frame)));
     }
 
-    /// The answer goes on.
+    /// A further part of the answer.
     pub fn handle_continued(&mut self, now: Timestamp, controller: &Controller) {
         if self.outstanding_of(controller).is_some() {
             self.extend_wait(now, ANSWER_WITHIN_NS);

@@ -88,7 +88,7 @@ impl Intake {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
         self.guards = new.guards.inheriting(&self.guards);
-        // The answers are the same (checked): messages under way go on.
+        // The answers are the same (checked): messages under way stay.
     }
 
     /// Judges a frame: `None` = it is dropped; otherwise whether its readings may be used.

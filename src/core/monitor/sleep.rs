@@ -41,7 +41,7 @@ impl BusSleep {
         Self { after_s: config.asleep_after_s.map(|after_s| after_s.max(oldest_s)), since: None }
     }
 
-    /// Another time-out; a sleep goes on.
+    /// Another time-out; a sleep lasts.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.after_s = Self::new(config).after_s;
     }

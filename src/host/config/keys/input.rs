@@ -40,7 +40,7 @@ section! {
 }
 
 section! {
-    /// An answer to a diagnostic request, over ISO-TP, whoever asks for it: most electric cars report their cell voltages only so. Nothing is sent without `[poll]`. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
+    /// An answer to a diagnostic request, over ISO-TP, whichever tester asks for it: most electric cars report their cell voltages only so. Nothing is sent without `[poll]`. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
     DiagnosticInput at "input.diagnostic" {
         /// What its signals are named by, before the dot; several answers may share it.
         name: String, "", NotEmpty, Required;
