@@ -14,5 +14,6 @@ pub mod guard;
 mod id_table;
 pub mod j1939;
 pub mod signal;
+pub mod unit;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

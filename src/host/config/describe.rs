@@ -18,6 +18,8 @@ use crate::sample::VoltageSource;
 pub struct Description {
     /// The configuration file.
     pub file: String,
+    /// What is allowed and unlikely, one line each.
+    pub warnings: Vec<String>,
     /// The cell model.
     pub cell: String,
     /// Assumptions about the pack, in sentences.
@@ -130,6 +132,7 @@ pub(super) fn describe(
     );
     Description {
         file: config.path.display().to_string(),
+        warnings: config.warnings.clone(),
         cell,
         pack: pack(config),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),

@@ -103,6 +103,14 @@ pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
     search.found
 }
 
+/// Notes a signal that is in none of the files.
+pub(super) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>, faults: &mut Faults) {
+    let hits = databases.signals().filter(|(_, message, signal)| is_named(source.signal, message, signal)).count();
+    if hits == 0 {
+        Search { raw, databases, faults, found: Vec::new() }.not_found(source);
+    }
+}
+
 /// Factor from the bus's sign of the current to ours.
 fn current_sign(raw: &RawTables) -> f64 {
     match raw.current.as_ref().map(|keys| keys.positive) {
