@@ -92,6 +92,8 @@ pub struct Finding {
     pub changes: Vec<Change>,
     /// What to do in addition, or where no line of the configuration helps.
     pub advice: Option<String>,
+    /// Titles of findings that are probably its consequences, and are not reported by themselves.
+    pub consequences: Vec<String>,
 }
 
 /// Result of a diagnosis.
@@ -113,7 +115,8 @@ impl Finding {
     /// A finding without lines to change.
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
-        Self { severity, topic, title: title.into(), seen, why, changes: Vec::new(), advice: None }
+        let (changes, consequences) = (Vec::new(), Vec::new());
+        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, consequences }
     }
 
     pub(super) fn seen(&mut self, seen: impl Into<String>) -> &mut Self {
@@ -149,6 +152,15 @@ impl Report {
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
         self.findings.insert(at, finding);
         &mut self.findings[at]
+    }
+
+    /// Moves the consequences of the first finding of a topic below it, by their titles.
+    pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&Finding) -> bool) {
+        let is_moved = |finding: &mut Finding| finding.topic != cause && is_consequence(finding);
+        let titles: Vec<String> = self.findings.extract_if(.., is_moved).map(|finding| finding.title).collect();
+        if let Some(finding) = self.findings.iter_mut().find(|finding| finding.topic == cause) {
+            finding.consequences = titles;
+        }
     }
 
     /// Whether there is an error or a warning.

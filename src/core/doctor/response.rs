@@ -8,6 +8,7 @@
 //!
 //! The largest steps and longest runs are kept: a choice by current or time alone does not bias the slope.
 
+use super::equal_cells::EqualCells;
 use super::series::median;
 use crate::quantity::Timestamp;
 
@@ -211,6 +212,7 @@ pub(crate) struct VoltageResponse {
     steps: Vec<CurrentStep>,
     pub(crate) runs: Vec<SteadyRun>,
     pub(crate) rests: Vec<SteadyRun>,
+    pub(crate) equal_cells: EqualCells,
 }
 
 impl VoltageResponse {
@@ -254,6 +256,7 @@ impl VoltageResponse {
         self.block.cells.iter_mut().for_each(|cell| *cell = (0.0, 0));
         let current_a = std::mem::take(&mut self.block.current_sum) / f64::from(self.block.readings.max(1));
         self.block.readings = 0;
+        self.equal_cells.push(&cells_v);
         let Some(voltage_v) = median(cells_v.iter().copied()) else { return };
         let mean = BlockMean { time: from, current_a, voltage_v, cells_v };
         let near = self.previous.take().filter(|before| (0.0..=MAX_GAP_S).contains(&mean.time.since(before.time)));
@@ -304,6 +307,11 @@ impl VoltageResponse {
         {
             *shortest = run;
         }
+    }
+
+    /// Time over which readings are averaged, s.
+    pub(crate) fn block_s(&self) -> f64 {
+        self.block_s
     }
 
     /// The pack's slope over the largest steps.

@@ -197,6 +197,16 @@ impl Doctor {
         self.best_response().slope_of(cell)
     }
 
+    /// Length of those blocks, s.
+    pub(super) fn slope_block_s(&self) -> f64 {
+        self.best_response().block_s()
+    }
+
+    /// The responses over short and long blocks.
+    pub(super) fn responses(&self) -> &[VoltageResponse; 2] {
+        &self.responses
+    }
+
     fn best_response(&self) -> &VoltageResponse {
         let [fast, slow] = &self.responses;
         let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());

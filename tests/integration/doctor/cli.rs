@@ -79,3 +79,17 @@ fn a_part_of_a_log_is_judged_and_another_interface_named() {
     assert_eq!(status, 0, "{page}");
     assert!(page.contains(": 20 s, "), "{page}");
 }
+
+#[test]
+fn a_wrong_byte_order_comes_first_and_the_rest_is_below_it() {
+    let mut broken = Broken::of(Bench::Pack96, 1);
+    for start in [16, 32, 48] {
+        broken.dbc(&format!("{start}|16@1+ (0.0001"), &format!("{start}|16@0+ (0.0001"));
+    }
+    let (status, page, _) = doctor(&broken, &[]);
+    let first = page.lines().find(|line| line.starts_with("ERROR")).unwrap();
+    assert!(first.contains("cell voltages: wrong byte order"), "{page}");
+    assert_eq!((status, page.matches("ERROR").count()), (78, 2), "{page}");
+    assert!(page.contains("ends in byte 9") || page.contains("end in byte 9"), "{page}");
+    assert!(page.lines().count() < 60, "{page}");
+}

@@ -6,7 +6,7 @@
 //! | `presence` | silent signals, number of cells |
 //! | `swapped` | one signal in another's place |
 //! | `values` | units, byte order, limits |
-//! | `frozen` | signals that stand still, cells that respond unlike the others |
+//! | `frozen` | signals that stand still, cells that respond unlike the others or have one voltage |
 //! | `electrical` | sign of the current, resistance (from steps, or from the `drift` of steady runs) |
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
@@ -26,7 +26,8 @@ mod unit;
 mod values;
 mod words;
 
-use super::report::Report;
+use super::plan::Kind;
+use super::report::{Finding, Report, Topic};
 use super::watch::Doctor;
 use context::Judge;
 
@@ -42,6 +43,8 @@ impl Doctor {
         presence::check(&mut judge);
         swapped::check(&mut judge);
         values::check(&mut judge);
+        swapped::check_odd(&mut judge);
+        frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
         electrical::check(&mut judge);
         timing::check(&mut judge);
@@ -50,6 +53,29 @@ impl Doctor {
             let span = words::seconds(awake_s);
             judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));
         }
+        fold(&mut judge);
         judge.report
+    }
+}
+
+/// Puts the consequences of a wrong layout below its finding.
+fn fold(judge: &mut Judge<'_>) {
+    const OF_VALUES: [Topic; 8] = [
+        Topic::CellCount,
+        Topic::Swapped,
+        Topic::Unit,
+        Topic::CurrentSign,
+        Topic::Frozen,
+        Topic::Cell,
+        Topic::Range,
+        Topic::CellModel,
+    ];
+    // A wrong temperature explains other temperatures only.
+    let explains_all = judge.wrong_layouts.iter().any(|kind| *kind != Kind::Temperature);
+    if !judge.wrong_layouts.is_empty() {
+        let is_consequence = |finding: &Finding| {
+            OF_VALUES.contains(&finding.topic) && (explains_all || finding.title.starts_with("temperature"))
+        };
+        judge.report.fold(Topic::Layout, is_consequence);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::unit::unit_of;
+use super::values::is_impossible;
 use super::words::{channel, number};
 use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::Topic;
@@ -15,6 +16,10 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     if !by_unit(judge) && !pack_voltage_as_current(judge) {
         by_values(judge);
     }
+}
+
+/// Signals with values unlike those of all the others.
+pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
 }
@@ -163,7 +168,7 @@ fn odd_sensors(judge: &mut Judge<'_>) {
         let (Some(value), Channel::Temperature(sensor)) = (series.values.median(), signal.binding.channel) else {
             continue;
         };
-        if (value - median_c).abs() <= 30.0 {
+        if (value - median_c).abs() <= 30.0 || is_impossible(series) {
             continue;
         }
         let still = if series.extent.changes == 0 { " and never moves" } else { "" };
