@@ -12,6 +12,7 @@
 //! | `series` | one signal: counts, periods, extent, roughness, and the same bits read with another layout |
 //! | `loss` | frames missing from a cyclic signal |
 //! | `equal_cells` | cells that always have the same voltage |
+//! | `other_current` | the current's message on another interface |
 //! | `response` | how the voltages follow the current: steps, steady runs, rests |
 //! | `watch` | [`Doctor`]: takes frames |
 //! | `judge` | turns everything received into a [`Report`] |
@@ -22,6 +23,7 @@
 mod equal_cells;
 mod judge;
 mod loss;
+mod other_current;
 mod plan;
 mod report;
 mod response;

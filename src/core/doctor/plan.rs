@@ -16,6 +16,9 @@ pub struct Plan {
     pub signals: Vec<SignalPlan>,
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
     pub more_cells: Vec<SignalPlan>,
+    /// Signals of the DBC that are not configured and look like the pack's voltage (beside cell voltages) or a state of charge,
+    /// by their channel; one for each interface.
+    pub beside: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
     /// Age from which a current, voltage and temperature is stale, s; `None` = never.

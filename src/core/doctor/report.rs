@@ -46,6 +46,8 @@ pub enum Topic {
     CurrentSign,
     /// Never moves.
     Frozen,
+    /// The cells do not add up to the pack's voltage.
+    PackVoltage,
     /// Outside the configured limits.
     Range,
     /// One cell is unlike the others.
@@ -58,6 +60,8 @@ pub enum Topic {
     CurrentOffset,
     /// Noisier than configured.
     Noise,
+    /// Two states of charge on the buses disagree.
+    ReportedSoc,
 }
 
 /// A line of the configuration to change.

@@ -215,6 +215,14 @@ pub(crate) struct VoltageResponse {
     pub(crate) equal_cells: EqualCells,
 }
 
+/// The response whose slope is determined better.
+pub(crate) fn best_response([fast, slow]: &[VoltageResponse; 2]) -> &VoltageResponse {
+    let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
+    // The short blocks where they suffice: they contain the load and nothing slower.
+    let fast_certainty = certainty(fast);
+    if fast_certainty >= 1.0 || fast_certainty >= certainty(slow) { fast } else { slow }
+}
+
 impl VoltageResponse {
     pub(crate) fn new(cells: usize, tolerance_a: f64, block_s: f64) -> Self {
         Self {

@@ -3,6 +3,8 @@
 //! In: the configuration file. Out: the plan, every fault as [`config::load`](crate::config::load) reports it, and where
 //! each key stands. A configuration of which no signal can be found in a DBC file is refused.
 
+mod beside;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -75,6 +77,7 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     Plan {
         interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
         more_cells: more_cells(raw, databases),
+        beside: beside::signals(raw, databases, found),
         messages: messages(found, &signals),
         signals,
         pack: pack_plan,

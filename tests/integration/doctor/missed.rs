@@ -29,8 +29,66 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
+/// A second bus on which identifier 100 is another sender's: its current runs against the first one's, delayed. The
+/// configured current is `on`.
+fn second_bus(broken: &mut Broken, on: &str) {
+    broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
+    broken.table("[input.cell_voltage]", "interface = \"can0\"");
+    broken.table("[[input.temperature]]", "interface = \"can0\"");
+    broken.table("[input.current]", &format!("interface = \"{on}\""));
+    let mut delayed = std::collections::VecDeque::new();
+    broken.frames(|stamp, interface, id, data| {
+        let line = format!("{stamp} {interface} {id}#{data}");
+        if id != "100" {
+            return Some(line);
+        }
+        delayed.push_back(data.to_owned());
+        let other = if delayed.len() > 700 { delayed.pop_front()? } else { "1400000000000000".to_owned() };
+        Some(format!("{line}\n{stamp} can1 {id}#{other}"))
+    });
+}
+
+/// Fills in the pack's own voltage, `by` times the sum of the cells as the first of them is in the mean.
+fn pack_voltage(broken: &mut Broken, by: f64) {
+    let cells = if broken.bench == Pack96 { 96.0 } else { 12.0 };
+    let (mut sum, mut n) = (0.0, 0.0);
+    broken.data("110", |data| {
+        if data[0] == 0 {
+            (sum, n) = (sum + 1e-4 * f64::from(u16::from_le_bytes([data[2], data[3]])), n + 1.0);
+        }
+    });
+    let code = (10.0 * by * cells * sum / n).round() as u16;
+    broken.data("100", |data| data[2..4].copy_from_slice(&code.to_le_bytes()));
+}
+
+/// Two states of charge: the pack's own of 80 %, and the dash's.
+pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
+    broken.dbc(
+        "CM_ \"Example",
+        "BO_ 768 Bms: 8 BMS\n SG_ PackSoc : 0|8@1+ (1,0) [0|100] \"%\" X\n\nBO_ 769 Dash: 8 BMS\n SG_ DisplaySoc : 0|8@1+ (1,0) \
+         [0|100] \"%\" X\n\nCM_ \"Example",
+    );
+    broken.config("[input.cell_voltage]", "[input.reported_soc]\nsignal = \"Bms.PackSoc\"\n\n[input.cell_voltage]");
+    let mut n = 0;
+    broken.frames(|stamp, interface, id, data| {
+        n += u32::from(id == "100");
+        let line = format!("{stamp} {interface} {id}#{data}");
+        let is_time = id == "100" && n % 50 == 1;
+        Some(if is_time {
+            format!("{line}\n{stamp} {interface} 300#50\n{stamp} {interface} 301#{dash:02X}")
+        } else {
+            line
+        })
+    });
+}
+
 /// As the healthy ones, with what the doctor looks at in addition.
-pub(crate) const HEALTHY: &[(&str, fn(&mut Broken))] = &[("one frame in a hundred lost", |b| lose(b, "100", 100))];
+pub(crate) const HEALTHY: &[(&str, fn(&mut Broken))] = &[
+    ("two buses with one identifier", |b| second_bus(b, "can0")),
+    ("the pack's voltage is the sum of its cells", |b| pack_voltage(b, 1.005)),
+    ("the dash agrees", |b| two_socs(b, 82)),
+    ("one frame in a hundred lost", |b| lose(b, "100", 100)),
+];
 
 pub(crate) const MISSED: &[Fault] = &[
     fault("byte order of the cells, start bits unmoved", byte_order_alone, &[Topic::Layout], "", &[Pack12, Pack96], 2),
@@ -158,4 +216,21 @@ pub(crate) const MISSED: &[Fault] = &[
         &[Pack12, Total],
         3,
     ),
+    fault(
+        "current of the other bus",
+        |b| second_bus(b, "can1"),
+        &[Topic::Interface],
+        "interface = \"can0\"",
+        &[Pack12],
+        3,
+    ),
+    fault(
+        "the pack's voltage is not the sum of its cells",
+        |b| pack_voltage(b, 1.1),
+        &[Topic::PackVoltage],
+        "",
+        &[Pack12, Pack96],
+        2,
+    ),
+    fault("the dash shows another SOC", |b| two_socs(b, 60), &[Topic::ReportedSoc], "", &[Pack12], 2),
 ];

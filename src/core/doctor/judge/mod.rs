@@ -3,6 +3,8 @@
 //! | file | checks |
 //! | --- | --- |
 //! | `bus` | interfaces, identifiers, error frames, foreign senders, end-to-end protection |
+//! | `other_bus` | the current's message on two interfaces |
+//! | `beside` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
 //! | `swapped` | one signal in another's place |
 //! | `values` | units, byte order, limits |
@@ -13,12 +15,14 @@
 //!
 //! All share `context`. A factor found in `values` is applied before `electrical` runs.
 
+mod beside;
 mod bus;
 mod context;
 mod drift;
 mod electrical;
 mod frozen;
 mod model;
+mod other_bus;
 mod presence;
 mod swapped;
 mod timing;
@@ -41,12 +45,14 @@ impl Doctor {
         let mut judge = Judge::new(&self);
         bus::check(&mut judge);
         presence::check(&mut judge);
+        other_bus::check(&mut judge);
         swapped::check(&mut judge);
         values::check(&mut judge);
         swapped::check_odd(&mut judge);
         frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
         electrical::check(&mut judge);
+        beside::check(&mut judge);
         timing::check(&mut judge);
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < SHORT_S {
