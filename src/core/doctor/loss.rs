@@ -1,7 +1,7 @@
 //! Frames missing from a cyclic signal.
 //!
 //! In: the times between two readings, s. Out: the share of readings that are missing. The cycle is the median of the first
-//! gaps; afterwards a gap of n cycles is n - 1 missing readings. A sender without a cycle is told from one that loses frames
+//! gaps; afterwards a gap of n cycles is n - 1 missing readings. A sender without a cycle differs from one that loses frames
 //! by its gaps, which are not multiples.
 
 use super::series::median;

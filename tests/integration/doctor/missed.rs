@@ -82,8 +82,11 @@ pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
     });
 }
 
+/// A change of a healthy pack, with its name.
+type Change = (&'static str, fn(&mut Broken));
+
 /// As the healthy ones, with what the doctor looks at in addition.
-pub(crate) const HEALTHY: &[(&str, fn(&mut Broken))] = &[
+pub(crate) const HEALTHY: &[Change] = &[
     ("two buses with one identifier", |b| second_bus(b, "can0")),
     ("the pack's voltage is the sum of its cells", |b| pack_voltage(b, 1.005)),
     ("the dash agrees", |b| two_socs(b, 82)),

@@ -15,6 +15,8 @@ const SMALLEST_STEP: f64 = 0.02;
 const UNIT_RATIO: f64 = 6.0;
 /// A resistance this many times the model's is a finding.
 const ODD_RATIO: f64 = 2.5;
+/// The same where several strings are configured and fewer would explain it.
+const FEWER_STRINGS_RATIO: f64 = 2.0;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     if judge.doctor.frames == 0 || judge.is_mixed_up {
@@ -112,10 +114,11 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     } else {
         (fast / ohm, "lower", "another cell, or several in parallel behind one voltage tap")
     };
+    let configured = judge.plan.pack.strings;
+    let strings = likely_strings(configured, ohm, (fast, slow));
     if ratio >= UNIT_RATIO {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
-    } else if ratio >= ODD_RATIO {
-        let strings = likely_strings(judge.plan.pack.strings, ohm, (fast, slow));
+    } else if ratio >= ODD_RATIO || ratio >= FEWER_STRINGS_RATIO && strings.is_some_and(|n| n < configured) {
         let title = format!("resistance {} times {direction} than the cell model's", number(ratio));
         let finding = warning(judge, Topic::CellModel, title).seen(seen).why(why);
         if let Some(strings) = strings {
