@@ -158,12 +158,19 @@ impl Report {
         &mut self.findings[at]
     }
 
-    /// Moves the consequences of the first finding of a topic below it, by their titles.
+    /// Moves further findings of a topic, and its consequences, below its first finding, by their titles. What the further
+    /// ones advise is added to its advice.
     pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&Finding) -> bool) {
-        let is_moved = |finding: &mut Finding| finding.topic != cause && is_consequence(finding);
-        let titles: Vec<String> = self.findings.extract_if(.., is_moved).map(|finding| finding.title).collect();
-        if let Some(finding) = self.findings.iter_mut().find(|finding| finding.topic == cause) {
-            finding.consequences = titles;
+        let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
+        let is_moved = |finding: &mut Finding| finding.topic == cause || is_consequence(finding);
+        let moved: Vec<Finding> = self.findings.extract_if(first + 1.., is_moved).collect();
+        let before: Vec<Finding> = self.findings.extract_if(..first, |finding| is_consequence(finding)).collect();
+        let Some(finding) = self.findings.iter_mut().find(|finding| finding.topic == cause) else { return };
+        for other in before.into_iter().chain(moved) {
+            let advice = other.advice.filter(|_| other.topic == cause);
+            finding.advice =
+                finding.advice.take().into_iter().chain(advice).reduce(|all, more| format!("{all}; {more}"));
+            finding.consequences.push(other.title);
         }
     }
 
@@ -176,6 +183,24 @@ impl Report {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn consequences_and_further_findings_of_a_cause_are_below_its_first() {
+        let mut report = Report::default();
+        let mut add = |topic, title: &str, advice: &str| {
+            report.add(Finding::new(Severity::Error, topic, title)).advice(advice);
+        };
+        add(Topic::Interface, "other", "");
+        add(Topic::CellCount, "count", "not this");
+        add(Topic::Layout, "cells", "a");
+        add(Topic::Layout, "current", "b");
+        add(Topic::Cell, "cell 4", "nor this");
+        report.fold(Topic::Layout, |finding| [Topic::CellCount, Topic::Cell].contains(&finding.topic));
+        let titles: Vec<&str> = report.findings.iter().map(|finding| finding.title.as_str()).collect();
+        assert_eq!(titles, ["other", "cells"]);
+        assert_eq!(report.findings[1].consequences, ["count", "current", "cell 4"]);
+        assert_eq!(report.findings[1].advice.as_deref(), Some("a; b"));
+    }
 
     #[test]
     fn findings_are_sorted_by_severity_then_cause_before_effect() {

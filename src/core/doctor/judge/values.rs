@@ -132,9 +132,25 @@ fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<Be
     })
 }
 
+/// The layout with which the temperatures are possible, if they are not as configured.
+fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
+    let ambient_c = judge.plan.pack.ambient_c;
+    let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
+    let is_plausible = median_c.is_some_and(|median_c| PLAUSIBLE_C.contains(&median_c));
+    better_layout(all, |signal, other| {
+        let is_near = (other.extent.mean() - ambient_c).abs() < 45.0 && other.extent.range() < 40.0;
+        is_near && (is_smoother(signal, other) || !is_plausible || signal.1.count() == 0)
+    })
+}
+
 /// Whether the frames end before the signals of a kind because of the byte order in the DBC.
 pub(super) fn is_short_by_layout(judge: &Judge<'_>, kind: Kind) -> bool {
-    kind == Kind::Voltage && better_voltages(judge, &judge.signals(kind)).is_some()
+    let all = judge.signals(kind);
+    match kind {
+        Kind::Voltage => better_voltages(judge, &all).is_some(),
+        Kind::Temperature => better_temperatures(judge, &all).is_some(),
+        Kind::Current | Kind::Reported => false,
+    }
 }
 
 /// The factor or its reciprocal, whichever is above 1.
@@ -206,10 +222,6 @@ fn temperatures(judge: &mut Judge<'_>) {
     let ambient_c = judge.plan.pack.ambient_c;
     let is_plausible = PLAUSIBLE_C.contains(&median_c);
     let impossible: Vec<_> = all.iter().filter(|(_, series)| is_impossible(series)).copied().collect();
-    let better = better_layout(&all, |signal, other| {
-        let is_near = (other.extent.mean() - ambient_c).abs() < 45.0 && other.extent.range() < 40.0;
-        is_near && (is_smoother(signal, other) || !is_plausible)
-    });
     let unit = TEMPERATURE_UNITS
         .into_iter()
         .map(|(factor, offset, name)| (factor, offset, name, median_c * factor + offset))
@@ -217,7 +229,7 @@ fn temperatures(judge: &mut Judge<'_>) {
         .min_by(|a, b| (a.3 - ambient_c).abs().total_cmp(&(b.3 - ambient_c).abs()));
     // A wrong unit explains more than another bit order, unless the values jump.
     let is_steady = all.iter().all(|(_, series)| series.extent.range() < 60.0);
-    if let Some(better) = better.filter(|_| unit.is_none() || !is_steady) {
+    if let Some(better) = better_temperatures(judge, &all).filter(|_| unit.is_none() || !is_steady) {
         wrong_layout(judge, &all, better, "temperatures");
     } else if !impossible.is_empty() && (is_plausible || 4 * impossible.len() < 3 * all.len()) {
         impossible_sensors(judge, &impossible, all.len());
