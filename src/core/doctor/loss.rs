@@ -13,7 +13,7 @@ const FEWEST: u32 = 30;
 /// Longest gap that counts as loss, cycles: a longer one is a pause.
 const LONGEST: f64 = 5.0;
 /// A gap is a multiple of the cycle within this fraction of the cycle.
-const TOLERANCE: f64 = 0.25;
+const TOLERANCE: f64 = 0.4;
 /// Share of the gaps that must be multiples.
 const REGULAR: f64 = 0.9;
 

@@ -195,6 +195,25 @@ pub(crate) const MISSED: &[Fault] = &[
         2,
     ),
     fault("one current in seven lost", |b| lose(b, "100", 7), &[Topic::Period], "", &[Pack12, Total, Steady, Walk], 2),
+    fault(
+        "one current in seven lost, uneven sender",
+        |b| {
+            lose(b, "100", 7);
+            let mut n = 0_u32;
+            b.frames(|stamp, interface, id, data| {
+                n = n.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                let late_us = if id == "100" { u64::from(n >> 16) * 3000 / 65536 } else { 0 };
+                let (seconds, fraction) = stamp.trim_matches(['(', ')']).split_once('.').unwrap();
+                let ns = 1000 * late_us + fraction.parse::<u64>().unwrap();
+                let seconds = seconds.parse::<u64>().unwrap() + ns / 1_000_000_000;
+                Some(format!("({seconds}.{:09}) {interface} {id}#{data}", ns % 1_000_000_000))
+            })
+        },
+        &[Topic::Period],
+        "",
+        &[Pack12],
+        2,
+    ),
     fault("one page in seven lost", |b| lose(b, "110", 7), &[Topic::Period], "", &[Pack12, Pack96], 2),
     fault("one temperature in seven lost", |b| lose(b, "120", 7), &[Topic::Period], "", &[Pack12], 2),
     fault(
@@ -226,6 +245,28 @@ pub(crate) const MISSED: &[Fault] = &[
         "interface = \"can0\"",
         &[Pack12],
         3,
+    ),
+    fault(
+        "current of the other pack",
+        |b| {
+            second_bus(b, "can1");
+            b.frames(|stamp, interface, id, data| {
+                let code = i16::from_le_bytes([0, 2].map(|at| u8::from_str_radix(&data[at..at + 2], 16).unwrap()));
+                let half = (code / 2).to_le_bytes();
+                match (interface, id) {
+                    ("can1", "100") => None,
+                    (_, "100") => Some(format!(
+                        "{stamp} {interface} {id}#{data}\n{stamp} can1 {id}#{:02X}{:02X}000000000000",
+                        half[0], half[1]
+                    )),
+                    _ => Some(format!("{stamp} {interface} {id}#{data}")),
+                }
+            })
+        },
+        &[Topic::Interface],
+        "interface = \"can0\"",
+        &[Pack12],
+        2,
     ),
     fault(
         "the pack's voltage is not the sum of its cells",

@@ -3,23 +3,33 @@
 use super::context::{EXPLAINED, Judge, error, warning};
 use super::words::number;
 use crate::doctor::other_current::OtherCurrent;
-use crate::doctor::plan::SignalPlan;
+use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::Topic;
 use crate::doctor::response::Slope;
 use crate::doctor::series::Series;
-use crate::quantity::{BusIndex, Channel};
+use crate::quantity::BusIndex;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };
     let others = judge.doctor.other_currents.iter().filter(|(_, other)| other.series.count() > 0);
     let here = judge.doctor.slope();
     for (bus, other) in others {
-        match (here.is_some_and(|slope| is_clear(&slope)), other.slope().filter(is_clear)) {
+        let there = other.slope().filter(is_clear);
+        match (here.is_some_and(|slope| is_clear(&slope)), there) {
             (false, Some(there)) => followed(judge, signal, (*bus, &there), here),
-            (false, None) if !is_alike(series, &other.series) => undecided(judge, signal, (*bus, other)),
-            (true, _) | (false, None) => {}
+            _ if is_alike(series, &other.series) => {}
+            // Two packs on two buses: the voltages follow both currents.
+            (true, Some(_)) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
+            (true, _) => {}
+            (false, None) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
+            (false, None) => undecided(judge, signal, (*bus, other)),
         }
     }
+}
+
+/// Whether the voltages are read from an interface.
+fn has_voltages(judge: &Judge<'_>, bus: BusIndex) -> bool {
+    judge.signals(Kind::Voltage).iter().any(|(signal, _)| signal.binding.bus == bus)
 }
 
 /// Whether voltages follow a current.
@@ -49,24 +59,28 @@ fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex,
         .change(&signal.table, "interface", format!("{other:?}"));
 }
 
+/// The current and the voltages come from two interfaces, and both have the current's message.
+fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
+    let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
+    let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
+    warning(judge, Topic::Interface, format!("the current is read from {configured}, the voltages from {name}"))
+        .seen(format!(
+            "{} ({}) is on {name} too, with other values: {low} to {high} A",
+            signal.message, signal.binding.id
+        ))
+        .why("a pack usually sends both on one bus; the other one may be another pack's")
+        .change(&signal.table, "interface", format!("{name:?}"))
+        .advice("compare the resistance and the charge with the pack's; listen under load");
+}
+
 /// The voltages follow neither, or nothing moved.
 fn undecided(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
-    let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
-    let (message, id) = (&signal.message, signal.binding.id);
-    let is_voltage = |s: &&SignalPlan| {
-        matches!(s.binding.channel, Channel::CellVoltage(_) | Channel::PackVoltage) && s.binding.bus == bus
-    };
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
-    if judge.plan.signals.iter().any(|s| is_voltage(&s)) {
-        warning(judge, Topic::Interface, format!("the current is read from {configured}, the voltages from {name}"))
-            .seen(format!("{message} ({id}) is on {name} too, with other values: {low} to {high} A"))
-            .why("a pack usually sends both on one bus")
-            .change(&signal.table, "interface", format!("{name:?}"))
-            .advice("drive or charge for a minute while listening: the voltages then show which current is the pack's");
-    } else {
-        judge.unjudged(format!(
-            "{message} ({id}) is on {name} too, with other values ({low} to {high} A): which one is the pack's current shows \
-             only under load; drive or charge for a minute"
-        ));
-    }
+    judge.unjudged(format!(
+        "{} ({}) is on {} too, with other values ({low} to {high} A): which one is the pack's current shows only under load; \
+         drive or charge for a minute",
+        signal.message,
+        signal.binding.id,
+        judge.interface(bus)
+    ));
 }

@@ -162,7 +162,9 @@ fn odd_cells(judge: &mut Judge<'_>) {
 /// Sensors with a value unlike that of all the others.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
-    let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
+    // Impossible ones were reported with the values.
+    let possible = |series: &Series| series.values.median().filter(|_| !is_impossible(series));
+    let median_c = judge.median_of(Kind::Temperature, possible);
     let Some(median_c) = median_c.filter(|_| sensors.len() >= 4 && judge.cell_voltage().is_some()) else { return };
     for (signal, series) in sensors {
         let (Some(value), Channel::Temperature(sensor)) = (series.values.median(), signal.binding.channel) else {

@@ -31,12 +31,14 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
     let name = format!("{}{}", message.name, signal.name).to_ascii_lowercase().replace('_', "");
     let own = signal.name.to_ascii_lowercase().replace('_', "");
     let has = |text: &str, words: &[&str]| words.iter().any(|word| text.contains(word));
-    if has(&own, &["min", "max", "lim", "target", "request", "avg", "cell", "aux", "12v", "lv", "charger"]) {
+    if has(&own, &["min", "max", "lim", "target", "request", "avg", "cell", "aux", "12v", "lv"]) {
         return None;
     }
     let is_volt = unit.is_some_and(|unit| unit.quantity == Quantity::Voltage);
     let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::Other("a percentage"));
-    if is_volt && has(&name, &["pack", "total", "batt", "hv", "bms", "stack"]) && has(&own, &["volt", "sum", "ubat"]) {
+    let is_pack = |text: &str| has(text, &["pack", "total", "batt", "stack", "hv", "bms"]);
+    let is_elsewhere = has(&own, &["link", "dc", "iso", "contactor", "charg"]);
+    if is_volt && !is_elsewhere && (is_pack(&own) || is_pack(&name) && has(&own, &["volt", "sum"])) {
         (!raw.is_pack_total()).then_some(Channel::PackVoltage)
     } else if is_share && (own.ends_with("soc") || own.starts_with("soc") || has(&own, &["stateofcharge"])) {
         Some(Channel::ReportedSoc)
@@ -65,4 +67,36 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
         scale,
         offset: 0.0,
     })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::can::dbc::Database;
+    use crate::config::PartialConfig;
+
+    #[test]
+    fn names_and_units_decide_what_is_compared() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
+        let raw = PartialConfig::read(&folder.join("example.toml")).unwrap().raw;
+        let channel = |message: &str, signal: &str, unit: &str| {
+            let text = format!("BO_ 1 {message}: 8 X\n SG_ {signal} : 0|16@1+ (1,0) [0|0] \"{unit}\" X\n");
+            let database = Database::parse(&format!("VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n{text}")).unwrap();
+            channel_of(&raw, &database.messages[0], &database.messages[0].signals[0])
+        };
+        let voltage = Some(Channel::PackVoltage);
+        assert_eq!(channel("PackStatus", "PackVoltage", "V"), voltage);
+        assert_eq!((channel("Bms", "Volt", "V"), channel("X", "HV_Batt_U", "V")), (voltage, voltage));
+        for other in ["PackVoltageMax", "DcLinkVoltage", "ChargeVoltageLimit", "CellVoltage1"] {
+            assert_eq!(channel("Bms", other, "V"), None, "{other}");
+        }
+        assert_eq!(channel("Bms", "PackVoltage", "A"), None);
+        for soc in ["DisplaySOC", "SOC_dash", "State_of_Charge"] {
+            assert_eq!(channel("Dash", soc, "%"), Some(Channel::ReportedSoc), "{soc}");
+        }
+        assert_eq!((channel("Dash", "SocMin", "%"), channel("Dash", "Soc", "V")), (None, None));
+    }
 }
