@@ -6,9 +6,9 @@
 use toml::de::{DeTable, DeValue};
 
 use super::document::{Document, Faults, TablePlace};
-use super::keys::{Interface, SignalSource};
+use super::keys::{CurrentInput, Interface, SignalSource};
 use super::resolve::{self, Databases};
-use super::schema::SectionInfo;
+use super::schema::{Section as _, SectionInfo};
 use super::tables::{RawTables, SECTIONS};
 
 /// Notes interfaces that are not there, and missing ones where there are several.
@@ -21,6 +21,10 @@ pub(super) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut 
         true => format!("must be {}", raw.interface_names()),
         false => format!("must be the name of one of {count} interfaces"),
     };
+    if count > 1 && !raw.is_written::<CurrentInput>() {
+        let line = raw.input.as_ref().map_or(1, |input| input.place.line);
+        faults.add(&document.file, line, format!("{}.interface is missing, {allowed}", CurrentInput::PATH));
+    }
     for (place, table) in with_key("interface").flat_map(|info| tables(document, info)) {
         let is_fault = match table.get("interface").map(|value| value.get_ref().as_str()) {
             Some(Some(name)) => {

@@ -35,6 +35,7 @@ const TEMPERATURES_C: (f64, f64) = (-40.0, 80.0);
 pub(super) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
     let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
     for (place, signals) in by_table(raw, found) {
+        unreadable(place, &signals, faults);
         ends(place, &signals, faults);
         let before = faults.len();
         units(place, &signals, (model, series), faults);
@@ -64,7 +65,7 @@ fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
 
 /// Signals whose bits cannot hold a value that the pack has: the first of the table.
 fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16), faults: &mut Faults) {
-    let beyond = signals.iter().find_map(|resolved| {
+    let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
         let needed = needed_values(resolved.channel, pack)?;
         let (low, high) = held(resolved, resolved.scale, resolved.offset);
         (low > needed.1 || high < needed.0).then_some((resolved, needed, (low, high)))
@@ -99,6 +100,28 @@ fn by_table<'r, 'd>(
 /// The signal's name, and that of its table's message.
 fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
+}
+
+/// Signals with a layout or range that is no layout or range: one fault per table and reason.
+fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+    let mut reasons: Vec<(String, &ResolvedSignal<'_>, usize)> = Vec::new();
+    for resolved in signals {
+        let Err(reason) = resolved.binding() else { continue };
+        let reason = reason.to_string();
+        match reasons.iter_mut().find(|(known, ..)| *known == reason) {
+            Some((.., others)) => *others += 1,
+            None => reasons.push((reason, resolved, 0)),
+        }
+    }
+    for (reason, first, others) in reasons {
+        let (name, file) = (name(first, first.signal), first.file);
+        let others = match others {
+            0 => String::new(),
+            1 => " and 1 other".to_owned(),
+            others => format!(" and {others} others"),
+        };
+        place.fault(faults, "signal", &format!("{name}{others} in {file} cannot be read: {reason}"));
+    }
 }
 
 /// Signals, and the multiplexors they depend on, that reach beyond their message: one fault per table.
@@ -303,7 +326,8 @@ struct AllowedRange<'a> {
 /// Notes ranges of plausible readings that allow none.
 pub(super) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
     let Some(pack) = &raw.pack else { return };
-    let dbc = resolve::ranges(found, pack.cells);
+    let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
+    let dbc = resolve::ranges(&readable, pack.cells);
     let input = |belongs: fn(Channel) -> bool| {
         let first = found.iter().find(|resolved| belongs(resolved.channel))?;
         raw.source(first.channel).map(|source| source.place)

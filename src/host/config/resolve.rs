@@ -203,9 +203,6 @@ impl<'d> Search<'_, 'd> {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = format!("{}.{}", message.name, signal.name);
-        if let Err(error) = Binding::new(bus, message, signal, channel) {
-            source.place.fault(self.faults, "signal", &format!("{full_name} in {file} cannot be read: {error}"));
-        }
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
         if message.len_bytes > 8 && !fd {
             let what = format!(

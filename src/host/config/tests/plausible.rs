@@ -78,8 +78,9 @@ fn many_signals_behind_their_message_are_one_fault_that_names_the_byte_order() {
 
 #[test]
 fn an_empty_range_is_a_fault_wherever_it_comes_from() {
-    let all = faults(&[], &[("[0|5]", "[1.35|0.1]")]);
-    assert!(!all.is_empty() && all[0].contains("range is [1.35|0.1]"), "{all:?}");
+    let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and 3 others in pack.dbc cannot be \
+                 read: range is [1.35|0.1], the first must not be above the second";
+    assert_eq!(faults(&[], &[("[0|5]", "[1.35|0.1]")]), [fault]);
     let limits = |keys: &str| {
         let pack = format!("Status.Temperature\"\n{keys}");
         faults(&[("Status.Temperature\"\n", &pack)], &[])
@@ -261,6 +262,9 @@ fn a_missing_interface_is_reported_beside_every_other_fault() {
         let all = faults(&[second, broken], &[]);
         assert!(all.iter().any(|fault| fault == wanted) && all.len() == 4, "{all:#?}");
     }
+    let absent = faults(&[second, ("[input.current]\nsignal = \"Status.Current\"\npositive = \"charge\"\n", "")], &[]);
+    let wanted = "pack.toml:8: input.current.interface is missing, must be can0 or can1";
+    assert!(absent.iter().any(|fault| fault == wanted), "{absent:#?}");
     let unnamed = faults(&[second, ("name = \"can1\"", "nam = \"can1\"")], &[]);
     let wanted = "pack.toml:10: input.current.interface is not set, must be the name of one of 2 interfaces";
     assert!(unnamed.iter().any(|fault| fault == wanted), "{unnamed:#?}");
