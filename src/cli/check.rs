@@ -57,6 +57,7 @@ fn show(description: &Description, page: &mut String) {
     list("signals", &table(description.signals.iter().map(signal)), "", page);
     list("plausible readings", &description.limits, "", page);
     list("checks of frames", &description.intake, "", page);
+    list("diagnostic requests", &description.polling, "none is sent", page);
     list("outputs", &table(description.outputs.iter().map(sent)), "nothing is sent", page);
     list("alarms", &description.alarms, "none", page);
     if !description.j1939.is_empty() {

@@ -1,4 +1,4 @@
-//! `packwatch acknowledge`, `clear` and `pack-replaced`: commands to the running daemon.
+//! `packwatch acknowledge`, `clear`, `pack-replaced` and `poll`: commands to the running daemon.
 //!
 //! They succeed when something changed or there was nothing to change; a failure names every refused alarm and the reason.
 
@@ -31,6 +31,38 @@ pub(crate) struct ReplacedArgs {
     yes: bool,
     #[command(flatten)]
     control: ControlArgs,
+}
+
+/// Arguments of `poll`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct PollArgs {
+    /// What the daemon shall do
+    action: PollAction,
+    #[command(flatten)]
+    control: ControlArgs,
+}
+
+/// What the daemon shall do with its diagnostic requests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum PollAction {
+    /// Send none, until `resume` or a restart: while the car is in a workshop, or another tester is at work
+    Standby,
+    /// Send them again
+    Resume,
+}
+
+/// Runs `poll`.
+pub(crate) fn poll(args: &PollArgs) -> Result<(), Failure> {
+    let standby = args.action == PollAction::Standby;
+    let request = Request::Command(Command::Poll { standby });
+    let done: CommandOutcome = args.control.client().ask(request).map_err(Failure::new)?;
+    match (done.refused, standby) {
+        (0, true) => print("no diagnostic requests are sent until `packwatch poll resume`\n"),
+        (0, false) => print("diagnostic requests are sent when nothing else speaks against it (`packwatch status`)\n"),
+        _ => Err(Failure::new(
+            "the daemon sends no diagnostic requests: its configuration has no [poll] with enabled = true",
+        )),
+    }
 }
 
 /// Runs `acknowledge`.

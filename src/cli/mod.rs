@@ -69,6 +69,8 @@ enum Command {
     Clear(command::AlarmArgs),
     /// Inform the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
+    /// Stop the diagnostic requests of the running daemon, or let it send them again
+    Poll(command::PollArgs),
     /// Forget the learned values, with or without a running daemon
     Reset(reset::Args),
     /// Show, export or verify the history in the store
@@ -145,6 +147,7 @@ pub fn main() -> ExitCode {
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
         Command::PackReplaced(args) => command::pack_replaced(&args),
+        Command::Poll(args) => command::poll(&args),
         Command::Reset(args) => reset::run(&args),
         Command::History(args) => history::run(&args),
         Command::TestAlarm(args) => test_alarm::run(&args),

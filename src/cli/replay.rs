@@ -80,7 +80,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
 
 pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let sample = &config.monitor.sample;
-    let encoder = InputEncoder::new(&config.monitor.input);
+    let encoder = InputEncoder::new(&config.monitor.input).with_answers(&config.monitor.answers);
     let mut protector = InputProtector::new(&config.monitor.guards);
     LogOptions {
         interfaces: config.interface_names(),

@@ -175,7 +175,7 @@ struct FrameMaker {
 
 impl FrameMaker {
     fn new(monitor: &MonitorConfig, settings: &Settings, start: Timestamp) -> Self {
-        let encoder = InputEncoder::new(&monitor.input);
+        let encoder = InputEncoder::new(&monitor.input).with_answers(&monitor.answers);
         let mut made = Vec::new();
         encoder.encode(&[(Channel::Current, Some(0.0))], &mut made);
         let with_current = made.iter().map(|(bus, frame)| (*bus, frame.id())).collect();

@@ -170,6 +170,8 @@ pub enum Channel {
     ReportedSoc,
     /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with the estimate, never used by it.
     ReportedSoh,
+    /// Voltage of the vehicle's 12 V (or 24 V) supply, V: without enough of it nothing is asked. Never used by an estimate.
+    SupplyVoltage,
     /// Serial number of the pack, or another number that identifies it.
     PackIdentity,
 }

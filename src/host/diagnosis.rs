@@ -139,7 +139,7 @@ pub fn replay(
     interrupt: &Interrupt,
     each: &mut dyn FnMut(DiagnosisProgress),
 ) -> Result<(Report, LogCounts), LogError> {
-    let encoder = InputEncoder::new(&survey.input);
+    let encoder = InputEncoder::new(&survey.input).with_answers(&survey.answers);
     let mut protector = InputProtector::new(&survey.plan.guards);
     let mut source = LogSource::new(
         logs.to_vec(),

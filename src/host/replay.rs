@@ -420,7 +420,8 @@ impl Replay {
         let offset = self.monitor.current_offset();
         summary.current_offset_a = offset.map(|offset| offset.mean);
         summary.current_offset_std_a = offset.map(|offset| offset.std());
-        (summary.protected, summary.dropped) = intake::summaries(&self.monitor, &self.settings.interfaces);
+        (summary.protected, summary.dropped, summary.controllers) =
+            intake::summaries(&self.monitor, &self.settings.interfaces);
         summary.first_s = span.first.map(Timestamp::secs);
         summary.last_s = span.latest.map(Timestamp::secs);
         summary.awake_s = span.awake_s();

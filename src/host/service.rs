@@ -170,6 +170,7 @@ impl Service {
                 fd: interface.fd,
                 ids: self.config.monitor.wanted_ids(bus),
                 patterns: self.config.monitor.wanted_patterns(bus),
+                all: self.config.monitor.wants_all(bus),
                 receive_buffer_bytes: self.receive_buffer_bytes,
             };
             let (link, output) = Link::new(config, clock, inbox.clone());

@@ -126,6 +126,7 @@ pub(super) fn write_table(out: &mut impl Write, summary: &ReplaySummary) -> io::
     rows.extend(
         s.dropped.iter().map(|of| ("too many frames", format!("{} {}: {} dropped", of.interface, of.id, of.dropped))),
     );
+    rows.extend(s.controllers.iter().map(|of| ("diagnostic", format!("{} {}: {}", of.interface, of.id, of.words()))));
     rows.extend(s.notes.iter().map(|note| ("note", note.clone())));
     write_rows(out, &rows)?;
     write_cells(out, summary)?;

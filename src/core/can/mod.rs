@@ -1,18 +1,21 @@
 //! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames, end-to-end
-//! protection, J1939.
+//! protection, diagnostic requests and answers over ISO-TP, J1939.
 //!
 //! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are accepted:
 //! bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
 
 pub mod dbc;
 pub mod decode;
+pub mod diagnostic;
 pub mod e2e;
 pub mod encode;
 pub mod flood;
 pub mod frame;
 pub mod guard;
 mod id_table;
+pub mod isotp;
 pub mod j1939;
+pub mod poll;
 pub mod signal;
 pub mod unit;
 

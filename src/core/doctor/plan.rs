@@ -14,6 +14,8 @@ pub struct Plan {
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
+    /// Configured signals in diagnostic answers, which the doctor does not read.
+    pub diagnostic_inputs: usize,
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured and look like the pack's voltage (beside cell voltages) or a state of charge,
@@ -129,7 +131,11 @@ impl Kind {
             Channel::Current => Self::Current,
             Channel::PackVoltage | Channel::CellVoltage(_) => Self::Voltage,
             Channel::Temperature(_) => Self::Temperature,
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => Self::Reported,
+            Channel::ReportedSoc
+            | Channel::ReportedSoh
+            | Channel::SupplyVoltage
+            | Channel::PackIdentity
+            | Channel::Contactor => Self::Reported,
         }
     }
 

@@ -208,6 +208,7 @@ impl Doctor {
                 Channel::Temperature(_)
                 | Channel::ReportedSoc
                 | Channel::ReportedSoh
+                | Channel::SupplyVoltage
                 | Channel::PackIdentity
                 | Channel::Contactor => continue,
             };

@@ -6,9 +6,11 @@ use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
 use crate::alarm::RuleConfig;
 use crate::can::CanId;
 use crate::can::decode::InputMap;
+use crate::can::diagnostic::{self, Answer};
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
+use crate::can::poll::PollConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
@@ -21,6 +23,12 @@ pub struct MonitorConfig {
     pub interfaces: usize,
     /// Meaning of the input frames.
     pub input: InputMap,
+    /// Diagnostic answers that are read.
+    pub answers: Vec<Answer>,
+    /// Diagnostic requests that are sent; `None` = none.
+    pub poll: Option<PollConfig>,
+    /// Supply voltage from which requests may be sent.
+    pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
     /// Readings in a row that must give another pack identity, where such a signal is among `input`.
@@ -45,12 +53,28 @@ pub struct MonitorConfig {
     pub j1939: Option<J1939Config>,
 }
 
+/// What is asked of the supply voltage before requests are sent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SupplyConfig {
+    /// Least voltage, V.
+    pub minimum_v: f64,
+    /// A reading older than this says nothing, s.
+    pub max_age_s: f64,
+}
+
 impl MonitorConfig {
+    /// Whether every frame of an interface is received: requests are sent there, and only where the bus is awake.
+    pub fn wants_all(&self, bus: BusIndex) -> bool {
+        self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
+    }
+
     /// Identifiers to be received on an interface, ascending.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
+        ids.extend(diagnostic::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
         ids.sort_unstable();
+        ids.dedup();
         ids
     }
 
@@ -82,8 +106,9 @@ impl MonitorConfig {
             ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
             ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
             ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
-            ("[input]", self.input == new.input),
+            ("[input]", self.input == new.input && self.answers == new.answers),
             ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
+            ("[poll]", self.poll == new.poll && self.supply == new.supply),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
             ("pack.cell_model", self.model == same_model),
             ("estimator.capacity_state", self.estimator.capacity_state == new.estimator.capacity_state),

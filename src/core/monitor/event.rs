@@ -5,9 +5,11 @@ use serde::{Deserialize, Serialize};
 use super::input::{BusEvent, Command, Source};
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::decode::Channel;
+use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
+use crate::can::poll::PollChange;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -211,6 +213,10 @@ pub enum EventKind {
     Protection(GuardChange),
     /// More frames of one identifier come than the limit allows; or no more.
     Flood(FloodChange),
+    /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
+    MessageLoss(MessageLoss),
+    /// Diagnostic requests are sent, or no more.
+    Poll(PollChange),
     /// An interface event.
     Bus {
         /// Which interface.

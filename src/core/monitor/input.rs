@@ -138,6 +138,11 @@ pub enum Command {
     Clear(Selector),
     /// Another pack is connected: forget the values learned of the old one.
     PackReplaced,
+    /// Send no diagnostic requests, or send them again.
+    Poll {
+        /// Send none.
+        standby: bool,
+    },
     /// Send a rule's alarm frame, marked as a test, for a while.
     Test {
         /// Which rule.

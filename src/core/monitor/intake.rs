@@ -11,10 +11,12 @@ use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
+use crate::can::diagnostic::{self, Controller, ControllerCounts, Listener};
 use crate::can::encode::{self, CommandFields, CommandPlan};
 use crate::can::flood::{FloodCount, FloodGate};
 use crate::can::guard::{GuardCounts, Guards};
 use crate::quantity::{BusIndex, Fault, Timestamp};
+use crate::sample::Moment;
 
 /// Rejected command frames are reported at most this often, s.
 const BAD_COMMAND_S: f64 = 1.0;
@@ -34,6 +36,12 @@ pub(super) struct Intake {
     gate: FloodGate,
     guards: Guards,
     buses: Buses,
+    /// Controllers in the listener's order.
+    pub(super) controllers: Vec<Controller>,
+    /// Diagnostic answers.
+    pub(super) listener: Listener,
+    /// When the answer under way of each controller began.
+    pub(super) moments: Vec<Option<Moment>>,
     /// When a rejected command frame was last reported.
     pub(super) bad_command_at: Option<Timestamp>,
 }
@@ -44,15 +52,33 @@ pub(super) struct Intake {
 pub(super) struct IntakeState {
     protected: Vec<GuardCounts>,
     dropped: Vec<FloodCount>,
+    #[serde(default)]
+    controllers: Vec<ControllerCount>,
+}
+
+/// What came from a controller that answers diagnostic requests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ControllerCount {
+    /// The controller.
+    #[serde(flatten)]
+    pub controller: Controller,
+    /// What came from it.
+    #[serde(flatten)]
+    pub counts: ControllerCounts,
 }
 
 impl Intake {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         let commands = config.commands.iter().map(|commands| (commands.bus, commands.plan.id(), 1));
+        let answers = diagnostic::wanted(&config.answers).into_iter().map(|(bus, id)| (bus, id, 1));
+        let listener = Listener::new(&config.answers);
         Self {
-            gate: FloodGate::new(&config.flood, config.input.messages().chain(commands)),
+            gate: FloodGate::new(&config.flood, config.input.messages().chain(commands).chain(answers)),
             guards: Guards::new(config.guards.clone()),
             buses: Buses::default(),
+            moments: vec![None; listener.counts().count()],
+            controllers: listener.counts().map(|(controller, _)| controller).collect(),
+            listener,
             bad_command_at: None,
         }
     }
@@ -62,6 +88,7 @@ impl Intake {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
         self.guards = new.guards.inheriting(&self.guards);
+        // The answers are the same (checked): messages under way go on.
     }
 
     /// Judges a frame: `None` = it is dropped; otherwise whether its readings may be used.
@@ -115,6 +142,7 @@ impl Intake {
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.poll(now);
         self.gate.poll(now);
+        self.listener.poll(now);
         self.report(now, out);
     }
 
@@ -122,6 +150,8 @@ impl Intake {
     pub(super) fn restart(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.restart();
         self.gate.restart();
+        self.listener.restart();
+        self.moments.fill(None);
         self.report(now, out);
     }
 
@@ -135,29 +165,40 @@ impl Intake {
         self.gate.counts()
     }
 
+    /// What came from each controller that answers diagnostic requests.
+    pub(super) fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
+        self.listener.counts().map(|(controller, counts)| ControllerCount { controller, counts })
+    }
+
+    /// The counts, for a stored state. Answers under way are not in it: after the downtime their rest does not come.
     pub(super) fn snapshot(&self) -> (IntakeState, Buses) {
-        let state = IntakeState { protected: self.guards.counts().collect(), dropped: self.gate.counts().collect() };
+        let state = IntakeState {
+            protected: self.guards.counts().collect(),
+            dropped: self.gate.counts().collect(),
+            controllers: self.controllers().collect(),
+        };
         (state, self.buses.clone())
     }
 
     pub(super) fn restore(&mut self, state: &IntakeState, buses: Buses) {
         self.guards.restore(&state.protected);
         self.gate.restore(&state.dropped);
+        self.listener.restore(state.controllers.iter().map(|of| (of.controller, of.counts)));
         self.buses = buses;
     }
 
     #[inline]
-    fn report(&mut self, time: Timestamp, out: &mut Outputs) {
-        if !self.guards.changes.is_empty() || !self.gate.changes.is_empty() {
+    pub(super) fn report(&mut self, time: Timestamp, out: &mut Outputs) {
+        if !self.guards.changes.is_empty() || !self.gate.changes.is_empty() || !self.listener.losses.is_empty() {
             self.report_changes(time, out);
         }
     }
 
     fn report_changes(&mut self, time: Timestamp, out: &mut Outputs) {
         let protection = self.guards.changes.drain(..).map(EventKind::Protection);
-        out.events.extend(
-            protection.chain(self.gate.changes.drain(..).map(EventKind::Flood)).map(|kind| Event { time, kind }),
-        );
+        let floods = self.gate.changes.drain(..).map(EventKind::Flood);
+        let losses = self.listener.losses.drain(..).map(EventKind::MessageLoss);
+        out.events.extend(protection.chain(floods).chain(losses).map(|kind| Event { time, kind }));
     }
 }
 

@@ -43,12 +43,14 @@ use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
 
 use crate::can::Frame;
-use crate::quantity::{BusIndex, Reading, Timestamp};
+use crate::can::diagnostic::Heard;
+use crate::can::poll::Poller;
+use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
 
-pub use config::MonitorConfig;
+pub use config::{MonitorConfig, SupplyConfig};
 pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
-pub use intake::CommandConfig;
+pub use intake::{CommandConfig, ControllerCount};
 pub use j1939::{AlarmCode, J1939Config};
 pub use outputs::{Estimate, MeasuredValues, Outputs, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
@@ -78,8 +80,14 @@ impl Monitor {
     /// Takes one input; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
     /// driver may leave it out.
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
-        let first_event = out.events.len();
+        let (first_event, first_frame) = (out.events.len(), out.frames.len());
         self.dispatch(input, out);
+        if self.stages.sender.poller.is_some() {
+            // Own requests do not come back from the bus: their answers were asked for all the same.
+            for sent in &out.frames[first_frame..] {
+                self.intake.listener.handle(sent.time, sent.bus, &sent.frame);
+            }
+        }
         self.stages.statistics.note(&input, &out.events[first_event..]);
     }
 
@@ -92,6 +100,10 @@ impl Monitor {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
+                if self.stages.sender.poller.is_some() {
+                    self.stages.poll_after_frame(self.clock.now, bus, frame, out);
+                    self.find_due();
+                }
                 if self.stages.sender.j1939.is_some() {
                     self.stages.sender.handle_j1939_frame(self.clock.now, bus, frame, out);
                     self.find_due();
@@ -131,6 +143,43 @@ impl Monitor {
         config.input.decode(bus, frame, |Reading { channel, value }| {
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
+        if !intake.listener.is_empty() {
+            self.handle_diagnostic(bus, frame, out);
+        }
+    }
+
+    /// Takes a frame of diagnostic requests and answers. The values of an answer are of the moment at which its first frame
+    /// came: the controller has put it together by then, and sends the rest as fast as the tester lets it.
+    fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        let Self { clock, intake, stages, .. } = self;
+        let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
+        match listener.handle(now, bus, frame) {
+            Heard::Nothing => {}
+            Heard::Begun { controller } => {
+                moments[controller] = Some(stages.sampling.sampler.moment(now));
+                let begun = |poller: &mut Poller, out: &mut _| poller.handle_begun(now, &controllers[controller], out);
+                stages.sender.poll_with(now, out, begun);
+            }
+            Heard::Continued { controller } => {
+                stages.sender.poll_with(now, out, |poller, _| poller.handle_continued(now, &controllers[controller]));
+            }
+            Heard::Refused { controller, refusal } => {
+                stages.sender.poll_with(now, out, |poller, out| {
+                    poller.handle_refusal(now, &controllers[controller], refusal, out);
+                });
+            }
+            Heard::Whole { controller, answer, data, is_single } => {
+                let began = moments[controller].take();
+                // Of an answer with the current everything is of one time anyway: that of its end.
+                let is_now = is_single || answer.has(|channel| channel == Channel::Current);
+                let moment = began.filter(|_| !is_now);
+                for reading in answer.readings(data) {
+                    stages.handle_answer_reading(now, bus, moment.as_ref(), reading, out);
+                }
+                stages.sender.poll_with(now, out, |poller, out| poller.handle_answer(now, &answer.question, out));
+            }
+        }
+        intake.report(now, out);
     }
 
     /// Takes an input that is neither a frame nor a gap, at its time.

@@ -6,11 +6,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::j1939::J1939;
-use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
+use super::{Event, EventKind, MonitorConfig, Outputs, SupplyConfig, Transmit};
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, StoredAlarm};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
-use crate::quantity::{BusIndex, Timestamp};
+use crate::can::poll::{PollOutputs, Poller};
+use crate::quantity::{BusIndex, Fault, Timestamp};
 
 /// Period of a test's frames, s: a consumer that reads once a second receives several.
 const TEST_PERIOD_S: f64 = 0.1;
@@ -40,6 +41,10 @@ pub(super) struct Sender {
     /// A running test of an alarm frame; it ends with the process.
     test: Option<AlarmTest>,
     pub(super) j1939: Option<J1939>,
+    pub(super) poller: Option<Poller>,
+    supply: Option<SupplyConfig>,
+    /// Outputs of the poller, kept for their memory.
+    polled: PollOutputs,
 }
 
 /// A running test of an alarm frame.
@@ -101,6 +106,9 @@ impl Sender {
             schedule: Schedule::default(),
             test: None,
             j1939: config.j1939.clone().map(J1939::new),
+            poller: config.poll.as_ref().map(Poller::new),
+            supply: config.supply,
+            polled: PollOutputs::default(),
         }
     }
 
@@ -152,7 +160,8 @@ impl Sender {
         let sending = self.config.as_ref().map(|_| schedule.status.min(schedule.health).min(schedule.alarm));
         let test = self.test.map(|test| test.next.min(test.end));
         let node = self.j1939.as_ref().and_then(J1939::next_due);
-        [sending, test, node].into_iter().flatten().fold(schedule.housekeeping, Timestamp::min)
+        let poller = self.poller.as_ref().and_then(Poller::next_due);
+        [sending, test, node, poller].into_iter().flatten().fold(schedule.housekeeping, Timestamp::min)
     }
 
     /// Whether housekeeping is due.
@@ -282,6 +291,29 @@ impl Sender {
     fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
+    }
+
+    /// Does something with the poller, if there is one, and sends what it wants to.
+    pub(super) fn poll_with(
+        &mut self,
+        now: Timestamp,
+        out: &mut Outputs,
+        act: impl FnOnce(&mut Poller, &mut PollOutputs),
+    ) {
+        let Some(poller) = &mut self.poller else { return };
+        act(poller, &mut self.polled);
+        let transmit = |(bus, frame)| Transmit { time: now, bus, frame, announces: false };
+        out.frames.extend(self.polled.frames.drain(..).map(transmit));
+        let event = |change| Event { time: now, kind: EventKind::Poll(change) };
+        out.events.extend(self.polled.changes.drain(..).map(event));
+    }
+
+    /// Takes a reading of the vehicle's supply voltage.
+    pub(super) fn handle_supply(&mut self, now: Timestamp, value: Result<f64, Fault>) {
+        if let (Some(poller), Some(supply)) = (&mut self.poller, self.supply) {
+            let is_good = value.is_ok_and(|volts| volts >= supply.minimum_v);
+            poller.set_supply(is_good.then(|| now.plus_secs(supply.max_age_s)));
+        }
     }
 
     /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.

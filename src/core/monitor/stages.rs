@@ -11,11 +11,13 @@ use super::sampling::Sampling;
 use super::sender::Sender;
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
 use crate::alarm::{AlarmInput, CommandOutcome, Observation};
+use crate::can::Frame;
 use crate::can::encode::StatusFields;
+use crate::can::poll::CarState;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
-use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
-use crate::sample::CellSample;
+use crate::quantity::{BusIndex, Channel, Mode, Reading, Timestamp};
+use crate::sample::{CellSample, Moment};
 
 /// All stages behind the intake.
 #[derive(Debug)]
@@ -67,8 +69,10 @@ impl Stages {
 
     #[inline(never)]
     fn handle_other_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
-        if reading.channel == Channel::PackIdentity {
-            return self.handle_identity(now, bus, reading, out);
+        match reading.channel {
+            Channel::PackIdentity => return self.handle_identity(now, bus, reading, out),
+            Channel::SupplyVoltage => return self.sender.handle_supply(now, reading.value),
+            _ => {}
         }
         let sample = self.sampling.handle_reading(now, reading, out);
         if matches!(reading.channel, Channel::Current | Channel::Contactor) {
@@ -76,6 +80,43 @@ impl Stages {
         }
         if let Some(sample) = sample {
             self.handle_sample(now, sample, out);
+        }
+    }
+
+    /// Passes a frame of others to the poller, and what the car does now.
+    pub(super) fn poll_after_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        let state = self.car_state();
+        self.sender.poll_with(now, out, |poller, out| {
+            poller.set_state(now, state);
+            poller.handle_frame(now, bus, frame, out);
+        });
+    }
+
+    /// What the car does, by the pack's mode.
+    fn car_state(&self) -> CarState {
+        match self.learning.mode() {
+            Mode::Discharge => CarState::Drive,
+            Mode::Charge => CarState::Charge,
+            Mode::Rest | Mode::Unknown => CarState::Parked,
+        }
+    }
+
+    /// Takes a reading of a diagnostic answer, whose values may be of an earlier moment.
+    pub(super) fn handle_answer_reading(
+        &mut self,
+        now: Timestamp,
+        bus: BusIndex,
+        moment: Option<&Moment>,
+        reading: Reading,
+        out: &mut Outputs,
+    ) {
+        match (reading.channel, moment) {
+            (Channel::CellVoltage(_) | Channel::PackVoltage, Some(moment)) => {
+                if let Some(sample) = self.sampling.handle_reading(now, reading, out) {
+                    self.handle_sample(now, sample.measured_at(moment), out);
+                }
+            }
+            _ => self.handle_other_reading(now, bus, reading, out),
         }
     }
 
@@ -182,6 +223,14 @@ impl Stages {
                 let changed = u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX);
                 CommandOutcome { changed, refused: 0 }
             }
+            Command::Poll { standby } => {
+                let is_there = self.sender.poller.is_some();
+                self.sender.poll_with(now, out, |poller, out| {
+                    poller.set_standby(standby);
+                    poller.poll(now, out);
+                });
+                CommandOutcome { changed: u32::from(is_there), refused: u32::from(!is_there) }
+            }
             Command::Test { rule, seconds } => {
                 let has_output = self.sender.start_test(now, rule, seconds, &self.alarming.engine, out);
                 CommandOutcome { changed: 0, refused: u32::from(!has_output) }
@@ -218,6 +267,7 @@ impl Stages {
     /// the pack's values wait for a new reading of every cell.
     pub(super) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
+        self.sender.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
         self.estimation.bank.change_all(crate::cell::CellEstimator::note_sleep);
@@ -262,6 +312,11 @@ impl Stages {
     /// Sends the frames that are due.
     pub(super) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sender.poll_j1939(now, out);
+        let state = self.car_state();
+        self.sender.poll_with(now, out, |poller, out| {
+            poller.set_state(now, state);
+            poller.poll(now, out);
+        });
         let Some([is_status_due, is_health_due, is_alarm_due]) = self.sender.take_frames_due(now) else { return };
         if is_status_due {
             let fields = self.status_fields();

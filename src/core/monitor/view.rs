@@ -1,10 +1,11 @@
 //! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
 
 use super::stages::Stages;
-use super::{Estimate, Monitor, Statistics, Validity};
+use super::{ControllerCount, Estimate, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
+use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
@@ -99,6 +100,16 @@ impl Monitor {
     /// Input messages with dropped frames, because more came than the limit allows.
     pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.intake.dropped()
+    }
+
+    /// What came from each controller that answers diagnostic requests.
+    pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
+        self.intake.controllers()
+    }
+
+    /// Why no diagnostic request is sent (`None` = they are), and how many are refused for good; `None` without `[poll]`.
+    pub fn poll(&self) -> Option<(Option<PollSilence>, usize)> {
+        self.stages.sender.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
 
     /// Readings by outcome.

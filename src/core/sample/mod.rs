@@ -14,4 +14,4 @@ pub mod signal;
 
 pub use config::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
-pub use sampler::{CellSample, Sampler, SamplerState, SignalChange};
+pub use sampler::{CellSample, Moment, Sampler, SamplerState, SignalChange};

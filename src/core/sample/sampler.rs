@@ -119,6 +119,26 @@ pub struct Sampler {
     shared: SharedInputs,
 }
 
+/// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
+/// answer to a diagnostic request does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    time: Timestamp,
+    current_a: Option<f64>,
+    charge_as: f64,
+    offset_s: f64,
+    unmeasured_s: f64,
+}
+
+impl CellSample {
+    /// The same voltage, measured at this moment.
+    #[must_use]
+    pub fn measured_at(self, moment: &Moment) -> Self {
+        let Moment { time, current_a, charge_as, offset_s, unmeasured_s } = *moment;
+        Self { time, current_a, charge_as, offset_s, unmeasured_s, ..self }
+    }
+}
+
 /// Inputs shared by all readings of one time, until a current arrives (for the sensor's value, until a temperature does).
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
@@ -214,7 +234,7 @@ impl Sampler {
                 self.shared.sensor = None;
                 None
             }
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::SupplyVoltage | Channel::PackIdentity => None,
             Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
             Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
         }
@@ -448,6 +468,14 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
+    /// The present moment, for voltages of now that arrive later.
+    pub fn moment(&mut self, now: Timestamp) -> Moment {
+        let time = self.advance(now);
+        self.refresh_shared_inputs(time);
+        let SharedInputs { totals, cell_current_a: current_a, cell_charge_as: charge_as, .. } = self.shared;
+        Moment { time, current_a, charge_as, offset_s: totals.offset_s, unmeasured_s: totals.unmeasured_s }
+    }
+
     #[inline]
     fn refresh_shared_inputs(&mut self, time: Timestamp) {
         if self.shared.is_known && self.shared.time == time {
@@ -529,7 +557,7 @@ impl Sampler {
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
             // Used by the monitor, not sampled.
-            | (Channel::PackIdentity, _) => None,
+            | (Channel::SupplyVoltage | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
@@ -543,7 +571,9 @@ fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
     match channel {
         Channel::Current => &config.current,
         Channel::Temperature(_) => &config.temperature,
-        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => &config.voltage,
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
+            &config.voltage
+        }
         Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
         Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
         Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
@@ -572,7 +602,11 @@ fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
         // No rule says when they should move.
-        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity | Channel::Contactor => 0.0,
+        Channel::ReportedSoc
+        | Channel::ReportedSoh
+        | Channel::SupplyVoltage
+        | Channel::PackIdentity
+        | Channel::Contactor => 0.0,
     }
 }
 

@@ -6,11 +6,13 @@ use super::alarm::RatedCell;
 use super::keys::{Pack, TemperatureInput};
 use super::tables::RawTables;
 use crate::can::decode::InputMap;
+use crate::can::diagnostic::Answer;
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
+use crate::can::poll::PollConfig;
 use crate::cell::CellModel;
 use crate::health::HealthConfig;
-use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig};
+use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig, SupplyConfig};
 use crate::quantity::SensorIndex;
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
@@ -18,6 +20,8 @@ use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 #[derive(Debug)]
 pub(super) struct Traffic {
     pub input: InputMap,
+    pub answers: Vec<Answer>,
+    pub poll: Option<PollConfig>,
     pub guards: Vec<GuardConfig>,
     pub output: Option<OutputConfig>,
     pub commands: Option<CommandConfig>,
@@ -41,6 +45,12 @@ pub(super) fn monitor(
     Some(MonitorConfig {
         interfaces: raw.interfaces.len(),
         input: traffic.input,
+        answers: traffic.answers,
+        poll: traffic.poll,
+        supply: raw
+            .supply_voltage
+            .as_ref()
+            .map(|keys| SupplyConfig { minimum_v: keys.minimum_v, max_age_s: keys.max_age_s }),
         guards: traffic.guards,
         identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
@@ -48,7 +58,7 @@ pub(super) fn monitor(
         commands: traffic.commands,
         j1939: traffic.j1939,
         sample: sample(raw, pack, &model, found)?,
-        estimator: raw.estimator.as_ref()?.config(pack, &model, &capacity),
+        estimator: raw.estimator.as_ref()?.config(pack, &model, &capacity, found.voltage_step_v),
         health: HealthConfig {
             transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
             capacity,
@@ -61,7 +71,7 @@ pub(super) fn monitor(
     })
 }
 
-/// Ranges the DBC gives, in our units and sign; infinite where it gives none.
+/// Ranges and steps the DBC gives, in our units and sign; infinite where it gives none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct DbcRanges {
     /// Pack current, A, positive = discharge.
@@ -70,6 +80,8 @@ pub(super) struct DbcRanges {
     pub voltage_v: (f64, f64),
     /// Temperature, degrees C.
     pub temperature_c: (f64, f64),
+    /// Coarsest step of a cell's voltage, V; 0 where it is unknown.
+    pub voltage_step_v: f64,
 }
 
 /// A range that refuses nothing.

@@ -2,7 +2,7 @@
 
 use super::alarm::{self, RatedCell};
 use super::document::{Faults, TablePlace};
-use super::keys::{CellVoltageInput, MethodKey, Pack, PackVoltageInput, TemperatureInput};
+use super::keys::{CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput};
 use super::tables::RawTables;
 use crate::cell::{CapacityState, CellModel};
 
@@ -14,6 +14,7 @@ const MAX_INTERFACE_NAME: usize = 15;
 /// Notes keys that do not fit together.
 pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
     interfaces(raw, faults);
+    sources(raw, faults);
     voltages(raw, faults);
     if let Some(pack) = &raw.pack {
         temperatures(pack, raw, faults);
@@ -65,6 +66,14 @@ fn voltages(raw: &RawTables, faults: &mut Faults) {
             faults.add(&raw.file, line, text);
         }
         (true, false) | (false, true) => {}
+    }
+}
+
+/// Signals are looked up somewhere.
+fn sources(raw: &RawTables, faults: &mut Faults) {
+    let Some(input) = raw.input.as_ref().filter(|input| input.dbc.is_empty()) else { return };
+    if !raw.broken && !raw.is_written::<DiagnosticInput>() {
+        input.place.fault(faults, "dbc", "must be a list of DBC files where there is no [[input.diagnostic]]");
     }
 }
 

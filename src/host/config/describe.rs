@@ -36,6 +36,8 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
+    /// The diagnostic requests that are sent, in sentences; empty = none.
+    pub polling: Vec<String>,
     /// The J1939 node and its codes, in sentences; empty = there is none.
     pub j1939: Vec<String>,
 }
@@ -66,10 +68,10 @@ pub struct SignalUse {
     pub message: String,
     /// Signal name.
     pub signal: String,
-    /// Condition under which the signal is in the frame: `Page = 3`; empty = always.
+    /// Where the signal is: `Page = 3` of a multiplexed frame, `answer of 7EC to 22 01 01`; empty = in every frame.
     pub multiplex: String,
-    /// DBC start bit.
-    pub start_bit: u16,
+    /// DBC start bit; in an answer its first bit, counted behind the echoed service and identifier.
+    pub start_bit: usize,
     /// Length, bits.
     pub length_bits: u16,
     /// `little-endian` or `big-endian`.
@@ -119,6 +121,8 @@ pub(super) fn describe(
     outputs: Vec<OutputUse>,
 ) -> Description {
     let model = &config.monitor.model;
+    let voltage_step_v = super::resolve::ranges(found, raw.pack.as_ref().map_or(1, |pack| pack.cells)).voltage_step_v;
+    let rounding_v = raw.estimator.as_ref().map_or(0.0, |keys| keys.rounding_v(voltage_step_v));
     let cell = format!(
         "{}: rated {} Ah, {} Ah when new, {} to {} V, {} RC branch{}{}",
         model.name,
@@ -134,18 +138,19 @@ pub(super) fn describe(
         file: config.path.display().to_string(),
         warnings: config.warnings.clone(),
         cell,
-        pack: pack(config),
+        pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
         intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
+        polling: super::diagnostic::poll_words(config),
         j1939: super::j1939::words(config),
     }
 }
 
-fn pack(config: &Config) -> Vec<String> {
+fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
     let sample = &config.monitor.sample;
     let mut words = vec![match sample.voltage_source {
         VoltageSource::Cells => format!("{} cells in series, each with its own voltage", sample.cells),
@@ -170,6 +175,13 @@ fn pack(config: &Config) -> Vec<String> {
         let from = if config.monitor.model.thermal.is_some() { "from the thermal model at" } else { "taken as" };
         words.push(format!("no temperature sensor{cells}: {from} {ambient_c} degrees C"));
     }
+    if rounding_v > 0.0 {
+        words.push(format!(
+            "voltages come in steps of {} mV: their rounding counts as noise of {:.1} mV",
+            round(1000.0 * voltage_step_v),
+            1000.0 * rounding_v
+        ));
+    }
     words.push("a positive current is a discharge in everything reported".to_owned());
     words
 }
@@ -190,8 +202,8 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
         dbc: resolved.file.to_owned(),
         message: resolved.message.name.clone(),
         signal: resolved.signal.name.clone(),
-        multiplex: multiplex(resolved),
-        start_bit: layout.start_bit,
+        multiplex: resolved.answer.map_or_else(|| multiplex(resolved), |answer| answer.words()),
+        start_bit: resolved.answer.map_or(usize::from(layout.start_bit), |answer| answer.bit(layout)),
         length_bits: layout.length_bits,
         byte_order: match layout.byte_order {
             ByteOrder::LittleEndian => "little-endian",
@@ -217,6 +229,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
             | Channel::CellVoltage(_)
             | Channel::ReportedSoc
             | Channel::ReportedSoh
+            | Channel::SupplyVoltage
             | Channel::PackIdentity
             | Channel::Contactor => None,
         },

@@ -10,9 +10,10 @@ mod traffic;
 
 use super::StoreConfig;
 use super::schema::Presence::{Default, Optional, Required};
+use super::schema::SubTables;
 use super::schema::section;
 use super::setting::ValueRange::{self, Above, Any, Between, NotEmpty};
-use super::setting::{CellRanges, choice};
+use super::setting::{CellRanges, NumberRange, choice};
 use super::threshold::Threshold;
 
 use crate::alarm::{Comparison, Rule};
@@ -23,11 +24,12 @@ use crate::quantity::MAX_CELLS;
 
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
 pub(crate) use input::{
-    CellVoltageInput, ContactorInput, CurrentInput, Input, PackIdentityInput, PackVoltageInput, ProtectedInput,
-    ReportedSocInput, ReportedSohInput, SignalSource, TemperatureInput,
+    AnswerSignalKeys, CellVoltageInput, ContactorInput, CurrentInput, DiagnosticInput, Input, PackIdentityInput,
+    PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource, SupplyVoltageInput,
+    TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
-pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus};
+pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Poll};
 
 /// Coldest and hottest temperature that may be configured, degrees C.
 const TEMPERATURE_C: ValueRange = Between(-100.0, 200.0);
@@ -41,6 +43,15 @@ pub(crate) enum PositiveCurrent {
     Charge,
     /// Out of the pack.
     Discharge,
+}
+
+/// Which byte of a number comes first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum WireOrder {
+    /// The most significant one.
+    Big,
+    /// The least significant one.
+    Little,
 }
 
 /// Method that measures the capacity in a half-cycle.
@@ -57,6 +68,7 @@ pub(crate) enum MethodKey {
 pub(crate) struct E2eKey(pub Option<Profile>);
 
 choice!(PositiveCurrent { "charge" => Self::Charge, "discharge" => Self::Discharge });
+choice!(WireOrder { "big" => Self::Big, "little" => Self::Little });
 choice!(MethodKey { "swing" => Self::Swing, "nominal" => Self::Nominal });
 choice!(E2eKey {
     "off" => Self(None),

@@ -40,6 +40,7 @@ mod commands;
 mod convert;
 mod cross;
 mod describe;
+mod diagnostic;
 mod document;
 mod input_tables;
 mod j1939;
@@ -58,6 +59,7 @@ mod tables;
 mod threshold;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
+pub(crate) use diagnostic::answers;
 pub(crate) use document::TablePlace;
 use document::{Document, Faults};
 pub(crate) use keys::SignalSource;
@@ -66,7 +68,7 @@ pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;
 pub use reference::reference;
 use resolve::Checks;
-pub(crate) use resolve::{Databases, ResolvedSignal, channel_words, input_map};
+pub(crate) use resolve::{Databases, NamedSignal, ResolvedSignal, channel_words, input_map};
 pub(crate) use tables::RawTables;
 
 /// A configuration that cannot be wrong.
@@ -163,8 +165,7 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     cross::check(&raw, model.as_ref(), faults);
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
-    let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
-    let databases = Databases::load(path, names, read, faults);
+    let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
@@ -178,12 +179,21 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let laid_out = output::output(checks, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
     guards.extend(guard);
+    let poll = diagnostic::poll(&raw, &found, checks.faults);
     let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let traffic = convert::Traffic { input: input_map(&found)?, guards, output, commands, j1939 };
+    let traffic = convert::Traffic {
+        input: input_map(&found)?,
+        answers: answers(&found).ok()?,
+        poll,
+        guards,
+        output,
+        commands,
+        j1939,
+    };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();

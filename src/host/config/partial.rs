@@ -39,8 +39,7 @@ impl PartialConfig {
         let Some(text) = read_text(path, &read_file, again) else { return Err(ConfigFaults(faults)) };
         let document = Document::parse(&path.display().to_string(), &text, again);
         let raw = RawTables::read(&document, again);
-        let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
-        let Some(databases) = Databases::load(path, names, &read_file, again) else { return Err(ConfigFaults(faults)) };
+        let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
         let model = read_model(path, &document, &read_file, again);
         Ok(Self { config, faults, raw, databases, model })
     }

@@ -126,7 +126,9 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut 
 
 /// Signals, and the multiplexors they depend on, that reach beyond their message: one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
-    let parts = signals.iter().flat_map(|resolved| {
+    // An answer has no length that is known before it comes.
+    let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
+    let parts = in_frames.flat_map(|resolved| {
         let selectors = selectors(resolved).map(|(_, selector)| selector);
         selectors.chain([resolved.signal]).map(|signal| (*resolved, signal))
     });
@@ -178,8 +180,9 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) 
         for resolved in signals {
             let selectors = selectors(resolved).map(|(_, selector)| selector);
             let earlier = found.iter().take_while(|other| !std::ptr::eq(*other, resolved));
-            let beside = earlier.filter(|other| is_beside(other, resolved)).map(|other| other.signal);
-            let shared = selectors.chain(beside).filter(|other| other.layout.overlaps(&resolved.signal.layout));
+            let beside = earlier.filter(|other| is_beside(other, resolved) && has_bits_of(other, resolved));
+            let selectors = selectors.filter(|other| other.layout.overlaps(&resolved.signal.layout));
+            let shared = selectors.chain(beside.map(|other| other.signal));
             pairs.extend(shared.map(|other| (name(resolved, other), name(resolved, resolved.signal))));
         }
         let Some((first, second)) = pairs.first() else { continue };
@@ -205,6 +208,18 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
+/// Whether two inputs of one message share bits; the layouts of an answer's signals begin at their own first bytes.
+fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
+    let bits = |resolved: &ResolvedSignal<'_>| {
+        let first = resolved.answer?.bit(&resolved.signal.layout);
+        Some(first..first + usize::from(resolved.signal.layout.length_bits))
+    };
+    match (bits(a), bits(b)) {
+        (Some(a), Some(b)) => a.start < b.end && b.start < a.end,
+        _ => a.signal.layout.overlaps(&b.signal.layout),
+    }
+}
+
 /// Whether two ranges, ends included, have a code in common.
 fn is_met(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
@@ -214,7 +229,7 @@ fn is_met(a: (u64, u64), b: (u64, u64)) -> bool {
 fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     match channel {
         Channel::Current => Some((Quantity::Current, "A")),
-        Channel::PackVoltage | Channel::CellVoltage(_) => Some((Quantity::Voltage, "V")),
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage => Some((Quantity::Voltage, "V")),
         Channel::Temperature(_) => Some((Quantity::Temperature, "degrees C")),
         _ => None,
     }

@@ -7,8 +7,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::convert::{DbcRanges, UNLIMITED};
+use super::diagnostic::{self, AnswerDefinition, AnswerPlace};
 use super::document::{Faults, TablePlace};
-use super::keys::{PositiveCurrent, SignalSource};
+use super::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
 use super::pattern::Pattern;
 use super::schema::did_you_mean;
 use super::tables::RawTables;
@@ -16,7 +17,7 @@ use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
-use crate::can::signal::LayoutFault;
+use crate::can::signal::{LayoutFault, ValueType};
 use crate::quantity::{BusIndex, CellIndex, Channel};
 
 /// Most cell numbers named in one fault.
@@ -25,10 +26,36 @@ const MAX_NAMED_CELLS: usize = 8;
 /// Longest identity, bits: the whole numbers a reading represents exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
-/// The DBC files of a configuration.
+/// The DBC files and diagnostic answers of a configuration.
 #[derive(Debug)]
 pub(crate) struct Databases {
     files: Vec<(String, Database)>,
+    answers: Vec<AnswerDefinition>,
+}
+
+/// A signal that can be named.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct NamedSignal<'d> {
+    /// DBC file, or table of the answer.
+    pub file: &'d str,
+    /// Its message.
+    pub message: &'d Message,
+    /// The signal.
+    pub signal: &'d Signal,
+    /// Its position, where it is in a diagnostic answer.
+    pub answer: Option<AnswerPlace<'d>>,
+}
+
+impl NamedSignal<'_> {
+    /// `Message.Signal`.
+    pub(crate) fn full_name(&self) -> String {
+        format!("{}.{}", self.message.name, self.signal.name)
+    }
+
+    fn is_named(&self, full_name: &str) -> bool {
+        let rest = full_name.strip_prefix(self.message.name.as_str()).and_then(|rest| rest.strip_prefix('.'));
+        rest == Some(self.signal.name.as_str())
+    }
 }
 
 /// A configured signal, found.
@@ -44,6 +71,8 @@ pub(crate) struct ResolvedSignal<'d> {
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
+    /// Its position, where it is in a diagnostic answer.
+    pub answer: Option<AnswerPlace<'d>>,
     /// Factor from the DBC's unit and sign to ours; negative when the bus counts charge positive.
     pub scale: f64,
     /// Added after it, in our unit and sign.
@@ -60,25 +89,35 @@ pub(super) struct Checks<'a> {
 }
 
 impl Databases {
-    /// Reads the files; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
-    pub(super) fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+    /// Reads the files and answers; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
+    pub(super) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
         let mut files = Vec::new();
-        for name in names {
+        for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
             let path = beside(config, name);
             files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
         }
         let files = files.into_iter().collect::<Option<Vec<_>>>()?;
-        (!files.is_empty()).then_some(Self { files })
+        let answers = diagnostic::definitions(raw, faults);
+        let are_all_usable = answers.len() == raw.count::<DiagnosticInput>();
+        (are_all_usable && !(files.is_empty() && answers.is_empty())).then_some(Self { files, answers })
     }
 
-    /// Every signal with its file and message.
-    pub(crate) fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
+    /// Every signal that can be named.
+    pub(crate) fn signals(&self) -> impl Iterator<Item = NamedSignal<'_>> {
         let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
-        messages.flat_map(|(file, message)| message.signals.iter().map(move |signal| (file, message, signal)))
+        let of_files = messages.flat_map(|(file, message)| {
+            message.signals.iter().map(move |signal| NamedSignal { file, message, signal, answer: None })
+        });
+        let of_answers = self.answers.iter().flat_map(|answer| {
+            let (file, message) = (answer.table.as_str(), &answer.message);
+            answer.signals().map(move |(signal, place)| NamedSignal { file, message, signal, answer: Some(place) })
+        });
+        of_files.chain(of_answers)
     }
 
     fn file_names(&self) -> String {
-        let names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
+        let mut names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
+        names.extend((!self.answers.is_empty()).then_some("[[input.diagnostic]]"));
         names.join(" or ")
     }
 }
@@ -105,8 +144,7 @@ pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
 
 /// Notes a signal that is in none of the files.
 pub(super) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>, faults: &mut Faults) {
-    let hits = databases.signals().filter(|(_, message, signal)| is_named(source.signal, message, signal)).count();
-    if hits == 0 {
+    if !databases.signals().any(|signal| signal.is_named(source.signal)) {
         Search { raw, databases, faults, found: Vec::new() }.not_found(source);
     }
 }
@@ -126,19 +164,16 @@ struct Search<'s, 'd> {
     found: Vec<ResolvedSignal<'d>>,
 }
 
-/// A signal that matches a name, with its file and message.
-type SignalMatch<'d> = (&'d str, &'d Message, &'d Signal);
-
 impl<'d> Search<'_, 'd> {
     /// A signal with a name of its own.
     fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
         let name = source.signal;
-        let hits: Vec<SignalMatch<'d>> = self.databases.signals().filter(|(_, m, s)| is_named(name, m, s)).collect();
+        let hits: Vec<NamedSignal<'d>> = self.databases.signals().filter(|signal| signal.is_named(name)).collect();
         match hits[..] {
             [] => self.not_found(source),
             [hit] => self.add(channel, source, sign, hit),
-            [(first, ..), .., (last, ..)] => {
-                let what = format!("must be in one DBC file, is in {first} and {last}");
+            [first, .., last] => {
+                let what = format!("must be in one place, is in {} and {}", first.file, last.file);
                 source.place.fault(self.faults, "signal", &what);
             }
         }
@@ -146,7 +181,7 @@ impl<'d> Search<'_, 'd> {
 
     fn not_found(&mut self, source: &SignalSource<'_>) {
         let what = format!("must be a signal (Message.Signal) of {}", self.databases.file_names());
-        let names: Vec<String> = self.databases.signals().map(|(_, m, s)| format!("{}.{}", m.name, s.name)).collect();
+        let names: Vec<String> = self.databases.signals().map(|signal| signal.full_name()).collect();
         let hint = did_you_mean(source.signal, names.iter().map(String::as_str));
         source.place.fault(self.faults, "signal", &(what + &hint));
     }
@@ -163,9 +198,9 @@ impl<'d> Search<'_, 'd> {
         if !pattern.has_cell() && cells > 1 {
             return source.place.fault(self.faults, "signal", "must have {n} in place of the cell's number");
         }
-        let mut hits: BTreeMap<u32, Vec<SignalMatch<'d>>> = BTreeMap::new();
+        let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
-            if let Some(number) = pattern.fits(&format!("{}.{}", hit.1.name, hit.2.name)) {
+            if let Some(number) = pattern.fits(&hit.full_name()) {
                 hits.entry(number.unwrap_or(u32::from(keys.first))).or_default().push(hit);
             }
         }
@@ -178,10 +213,8 @@ impl<'d> Search<'_, 'd> {
                 None | Some([]) => missing.push(number),
                 Some([hit]) => self.add(Channel::CellVoltage(CellIndex(index)), source, 1.0, *hit),
                 Some([a, .., b]) => {
-                    let what = format!(
-                        "must give each cell one signal, {number} is {}.{} and {}.{}",
-                        a.1.name, a.2.name, b.1.name, b.2.name
-                    );
+                    let what =
+                        format!("must give each cell one signal, {number} is {} and {}", a.full_name(), b.full_name());
                     source.place.fault(self.faults, "signal", &what);
                 }
             }
@@ -192,19 +225,14 @@ impl<'d> Search<'_, 'd> {
         }
     }
 
-    fn add(
-        &mut self,
-        channel: Channel,
-        source: &SignalSource<'_>,
-        sign: f64,
-        (file, message, signal): SignalMatch<'d>,
-    ) {
+    fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, named: NamedSignal<'d>) {
+        let NamedSignal { file, message, signal, answer } = named;
         let Some(bus) = self.raw.bus_of(source.interface) else {
             return; // an interface that is not there was noted by the cross checks
         };
-        let full_name = format!("{}.{}", message.name, signal.name);
+        let full_name = named.full_name();
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
-        if message.len_bytes > 8 && !fd {
+        if message.len_bytes > 8 && !fd && answer.is_none() {
             let what = format!(
                 "message {} has {} bytes, must have fd = true on its interface",
                 message.name, message.len_bytes
@@ -232,12 +260,8 @@ impl<'d> Search<'_, 'd> {
         let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
         let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
         let (scale, offset) = (sign * usual_scale, sign * source.offset);
-        self.found.push(ResolvedSignal { channel, bus, file, message, signal, scale, offset, not_available });
+        self.found.push(ResolvedSignal { channel, bus, file, message, signal, answer, scale, offset, not_available });
     }
-}
-
-fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
-    full_name.strip_prefix(message.name.as_str()).and_then(|rest| rest.strip_prefix('.')) == Some(signal.name.as_str())
 }
 
 /// Name of a channel, for people (cells and sensors from 1).
@@ -249,6 +273,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
         Channel::Contactor => "contactors".to_owned(),
     }
@@ -280,6 +305,14 @@ impl ResolvedSignal<'_> {
         Ok(binding)
     }
 
+    /// Distance of two neighbouring values, in our unit; 0 for IEEE floats.
+    fn step(&self) -> f64 {
+        match self.signal.layout.value_type {
+            ValueType::Unsigned | ValueType::Signed => (self.signal.layout.factor * self.scale).abs(),
+            ValueType::Float32 | ValueType::Float64 => 0.0,
+        }
+    }
+
     /// The DBC's range in our unit and sign; infinite when it gives none.
     pub(super) fn range(&self) -> (f64, f64) {
         let layout = &self.signal.layout;
@@ -291,9 +324,10 @@ impl ResolvedSignal<'_> {
     }
 }
 
-/// The decoder's map; `None` when a layout cannot be read (noted when it was found).
+/// The decoder's map, without the diagnostic answers; `None` when a layout cannot be read (noted when it was found).
 pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
-    let bindings: Result<Vec<_>, _> = found.iter().map(ResolvedSignal::binding).collect();
+    let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
+    let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();
     bindings.ok().map(InputMap::new)
 }
 
@@ -309,7 +343,11 @@ pub(super) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     } else {
         widest(|channel| matches!(channel, Channel::CellVoltage(_)), 1.0)
     };
+    let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
+    let steps = found.iter().filter(|resolved| is_voltage(resolved.channel)).map(ResolvedSignal::step);
+    let per_cell = if found.iter().any(|it| it.channel == Channel::PackVoltage) { f64::from(series) } else { 1.0 };
     DbcRanges {
+        voltage_step_v: steps.fold(0.0, f64::max) / per_cell,
         current_a: widest(|channel| channel == Channel::Current, 1.0),
         voltage_v,
         temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),

@@ -221,9 +221,9 @@ pub(crate) use table_field;
 /// Lists the tables of a file, in the order of the reference page: the struct of all of them and how it is read.
 ///
 /// Each is `one` (always read: without it in the file its defaults hold, and its required keys are missing), `optional`
-/// (read where it is written) or `many` (`[[path]]`, any number of times).
+/// (read where it is written) or `many` (`[[path]]`, any number of times); `with` names the tables that one of its keys holds.
 macro_rules! tables {
-    ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident),+ $(,)? }) => {
+    ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*
         #[derive(Debug)]
         pub(crate) struct $name {
@@ -270,7 +270,7 @@ macro_rules! tables {
 
         /// Every table, in the order of the reference page.
         pub(crate) const $sections: &[$crate::config::schema::SectionInfo] =
-            &[$( $crate::config::schema::SectionInfo::$kind::<$section>() ),+];
+            &[$( $crate::config::schema::SectionInfo::$kind::<$section>(), $( $crate::config::schema::SectionInfo::many::<$below>(), )? )+];
     };
 }
 pub(crate) use tables;
@@ -291,6 +291,9 @@ impl TableReader<'_> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);
         };
+        if let Some(tables) = T::read_tables(self, key, value) {
+            return tables;
+        }
         match T::read(value, &key.allowed) {
             Ok(setting) => Some(setting),
             Err(wrong) => {
@@ -307,6 +310,25 @@ impl TableReader<'_> {
         }
     }
 
+    /// The tables below a key; `None` when one of them is faulty (noted).
+    fn sub_tables<S: Section>(&mut self, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Vec<S>> {
+        let DeValue::Array(items) = value.get_ref() else { return None }; // noted by the check for unknown keys
+        if items.is_empty() {
+            self.place.fault(self.faults, key.name, &key.must_be());
+            return None;
+        }
+        let read = |(item, number): (&Spanned<DeValue<'_>>, usize)| {
+            let DeValue::Table(table) = item.get_ref() else { return None };
+            let path = format!("{}[{number}]", self.place.key(key.name));
+            let place = self.document.place(&path, self.document.line(&item.span()), table);
+            let Self { document, broken, ref mut faults, .. } = *self;
+            S::read(&mut TableReader { document, broken, table: Some(table), place, faults })
+        };
+        // Every one is read, so that each fault is noted.
+        let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
+        tables.into_iter().collect()
+    }
+
     fn absent<T: Setting>(&mut self, key: &Key) -> Option<T> {
         match key.presence {
             Presence::Optional => T::absent(),
@@ -321,6 +343,22 @@ impl TableReader<'_> {
                 None
             }
         }
+    }
+}
+
+/// A key whose value is a list of declared tables, `[{ ... }, ...]` or `[[...]]`.
+#[derive(Debug, Clone)]
+pub(crate) struct SubTables<S>(pub Vec<S>);
+
+impl<S: Section> Setting for SubTables<S> {
+    const KIND: &'static str = "a list of tables";
+
+    fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
+        Err(ValueFault::Type(value.span()))
+    }
+
+    fn read_tables(reader: &mut TableReader<'_>, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
+        Some(reader.sub_tables(key, value).map(Self))
     }
 }
 

@@ -6,6 +6,11 @@ use std::ops::{Range, RangeInclusive};
 use toml::Spanned;
 use toml::de::{DeInteger, DeValue};
 
+use super::schema::{Key, TableReader};
+
+/// Most numbers in a row: more than any pack has cells.
+const MAX_ROW: usize = 2048;
+
 /// The range of a key's value; of each element when the value is a list.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum ValueRange {
@@ -73,6 +78,10 @@ pub(crate) trait Setting: Sized {
     const CHOICES: &'static [&'static str] = &[];
     /// Reads and checks a value.
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault>;
+    /// Reads and checks a value that is tables with keys of their own; `None` = the type is no such value.
+    fn read_tables(_: &mut TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
+        None
+    }
     /// Value of a key that is not written and has no default.
     fn absent() -> Option<Self> {
         None
@@ -177,6 +186,23 @@ impl Setting for CellRanges {
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         typed(value, value.get_ref().as_str().and_then(Self::parse))
+    }
+}
+
+/// Numbers in a row: `"1-32"`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct NumberRange(pub RangeInclusive<u16>);
+
+impl Setting for NumberRange {
+    const KIND: &'static str = "numbers in a row, like \"1-32\"";
+
+    fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
+        let parse = |text: &str| {
+            let (first, last) = text.split_once('-')?;
+            let (first, last) = (first.trim().parse::<u16>().ok()?, last.trim().parse::<u16>().ok()?);
+            (first <= last && usize::from(last - first) < MAX_ROW).then_some(Self(first..=last))
+        };
+        typed(value, value.get_ref().as_str().and_then(parse))
     }
 }
 

@@ -2,10 +2,10 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits, Estimator, Input,
-    Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput,
-    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, TemperatureInput,
-    TemperatureLimits, Transition, Usable, VoltageLimits,
+    Alarm, AnswerSignalKeys, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
+    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack,
+    PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput,
+    SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -16,6 +16,7 @@ tables! {
         pack: one Pack,
         interfaces: many Interface,
         input: one Input,
+        diagnostics: many DiagnosticInput with AnswerSignalKeys,
         current: one CurrentInput,
         contactor: optional ContactorInput,
         cell_voltage: optional CellVoltageInput,
@@ -23,6 +24,7 @@ tables! {
         temperatures: many TemperatureInput,
         reported_soc: optional ReportedSocInput,
         reported_soh: optional ReportedSohInput,
+        supply_voltage: optional SupplyVoltageInput,
         pack_identity: optional PackIdentityInput,
         protected: many ProtectedInput,
         current_limits: one CurrentLimits,
@@ -35,6 +37,7 @@ tables! {
         usable: optional Usable,
         alarms: many Alarm,
         j1939: optional J1939,
+        poll: one Poll,
         output: optional Output,
         output_status: one OutputStatus,
         output_health: one OutputHealth,
@@ -92,6 +95,7 @@ impl RawTables {
             Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.config()),
             Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.config()),
             Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
+            Channel::SupplyVoltage => self.supply_voltage.as_ref().map(|keys| keys.config()),
             Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.config()),
             Channel::Contactor => self.contactor.as_ref().map(|keys| keys.config()),
         }
@@ -104,6 +108,7 @@ impl RawTables {
             Channel::PackVoltage,
             Channel::ReportedSoc,
             Channel::ReportedSoh,
+            Channel::SupplyVoltage,
             Channel::PackIdentity,
             Channel::Contactor,
             Channel::CellVoltage(CellIndex(0)),

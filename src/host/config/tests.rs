@@ -9,6 +9,7 @@ use proptest::prelude::*;
 
 mod alarms;
 mod cell_model;
+mod diagnostic;
 mod j1939;
 mod plausible;
 mod protect;
@@ -241,10 +242,10 @@ fn an_output_dbc_must_have_the_daemons_messages() {
 #[test]
 fn numbers_may_be_hex_or_have_underscores() {
     let output =
-        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
+        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 2_0.0e-0_1\n";
     let config = good(&format!("{PACK}{output}"));
     assert_eq!(config.monitor.estimator.consistency.window_s, 1000.0);
-    assert_eq!(config.monitor.estimator.voltage.noise_v, 1e-9);
+    assert_eq!(config.monitor.estimator.voltage.noise_v, 2.0);
 }
 
 /// Each edit of the good file (from, to) and the whole of what is said about it.
@@ -286,12 +287,12 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without blank or /",
         ),
         ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
-        ("dbc = [\"pack.dbc\"]", "dbc = []", "pack.toml:7: input.dbc = [], must be a list of texts that is not empty"),
         (
             "dbc = [\"pack.dbc\"]",
-            "dbc = [\"pack.dbc\", 7]",
-            "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
+            "dbc = []",
+            "pack.toml:7: input.dbc = [], must be a list of DBC files where there is no [[input.diagnostic]]",
         ),
+        ("dbc = [\"pack.dbc\"]", "dbc = [\"pack.dbc\", 7]", "pack.toml:7: input.dbc = 7, must be a list of texts"),
     ];
     each_edit_gives(table);
 }
@@ -478,7 +479,7 @@ fn a_signal_in_two_dbc_files_is_ambiguous() {
     let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
     assert_eq!(
         all[0],
-        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one DBC file, is in pack.dbc and twin.dbc"
+        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one place, is in pack.dbc and twin.dbc"
     );
     let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give each cell one signal, \
                 1 is Cells.CellVoltage1 and Cells.CellVoltage1";

@@ -5,6 +5,7 @@
 //! | `alarms` | `all` (false): includes those at rest | [`AlarmList`] |
 //! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects every | [`CommandOutcome`] |
 //! | `pack_replaced` | | [`CommandOutcome`] |
+//! | `poll` | `standby`: no diagnostic requests are sent | [`CommandOutcome`] |
 //! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
 //! Every line has `version`. Anything else gets an error with the value found and the values allowed.
@@ -20,11 +21,12 @@ use crate::quantity::{MAX_CELLS, Timestamp};
 pub const VERSION: u64 = 1;
 
 /// Requests and the keys they may have.
-const REQUESTS: [(&str, &[&str]); 5] = [
+const REQUESTS: [(&str, &[&str]); 6] = [
     ("alarms", &["all"]),
     ("acknowledge", &["rule", "severity", "cell"]),
     ("clear", &["rule", "severity", "cell"]),
     ("pack_replaced", &[]),
+    ("poll", &["standby"]),
     ("test", &["rule", "seconds"]),
 ];
 
@@ -220,6 +222,7 @@ mod tests {
             Command::Acknowledge(Selector::default()),
             Command::Clear(which),
             Command::PackReplaced,
+            Command::Poll { standby: true },
             Command::Test { rule: Rule::BusFault, seconds: 2.5 },
         ];
         let lists = [Request::Alarms { all: false }, Request::Alarms { all: true }];
@@ -242,7 +245,7 @@ mod tests {
         assert_eq!(fault(r#"{"version":2,"request":"alarms"}"#), "version = 2, must be 1");
         assert_eq!(
             fault(r#"{"version":1,"request":"reboot"}"#),
-            r#"request = "reboot", must be alarms, acknowledge, clear, pack_replaced, test"#
+            r#"request = "reboot", must be alarms, acknowledge, clear, pack_replaced, poll, test"#
         );
         assert_eq!(
             fault(r#"{"version":1,"request":"alarms","all":1}"#),

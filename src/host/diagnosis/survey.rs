@@ -10,10 +10,11 @@ use std::path::Path;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
+use crate::can::diagnostic::Answer;
 use crate::cell::CellModel;
 use crate::config::{
-    Config, ConfigFaults, Databases, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource, TablePlace,
-    input_map,
+    Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
+    TablePlace, answers, input_map,
 };
 use crate::doctor::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
@@ -28,6 +29,8 @@ pub struct Survey {
     pub plan: Plan,
     /// The signals that were found.
     pub input: InputMap,
+    /// The diagnostic answers that were found.
+    pub answers: Vec<Answer>,
     /// The whole, when it is good.
     pub config: Option<Config>,
     /// Every fault; empty when it is good.
@@ -51,17 +54,20 @@ impl Survey {
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
     let partial = PartialConfig::read(path)?;
     let found = partial.signals();
+    let answers = answers(&found).unwrap_or_default();
     let input = input_map(&found).filter(|_| !partial.raw.interfaces.is_empty() && !found.is_empty());
     let Some(input) = input else { return Err(ConfigFaults(partial.faults)) };
     let plan = plan(&partial, &found);
     let places = partial.raw.places().map(|place| (place.path.clone(), place.clone())).collect();
-    Ok(Survey { plan, input, places, config: partial.config, faults: partial.faults })
+    Ok(Survey { plan, input, answers, places, config: partial.config, faults: partial.faults })
 }
 
 fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     let PartialConfig { config, raw, model, databases, .. } = partial;
     let (pack, config, model) = (raw.pack.as_ref(), config.as_ref(), model.as_ref());
-    let signals: Vec<SignalPlan> = found.iter().filter_map(|resolved| signal(raw, resolved)).collect();
+    // The doctor reads frames, not the answers that several of them make.
+    let in_frames: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.answer.is_none()).cloned().collect();
+    let signals: Vec<SignalPlan> = in_frames.iter().filter_map(|resolved| signal(raw, resolved)).collect();
     let strings = pack.map_or(1, |pack| pack.strings);
     let pack_ah = model.map_or(USUAL_AH, |model| model.rated_capacity_ah) * f64::from(strings);
     let pack_plan = PackPlan {
@@ -78,8 +84,9 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
         interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
         more_cells: more_cells(raw, databases),
         beside: beside::signals(raw, databases, found),
-        messages: messages(found, &signals),
+        messages: messages(&in_frames, &signals),
         signals,
+        diagnostic_inputs: found.len() - in_frames.len(),
         pack: pack_plan,
         limits: config.map(limits).unwrap_or_default(),
         max_ages_s: max_ages_s(raw),
@@ -126,7 +133,7 @@ fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     };
     let end = u32::from(keys.first) + u32::from(pack.cells);
     let mut numbered: BTreeMap<u32, SignalPlan> = BTreeMap::new();
-    for (_, message, signal) in databases.signals() {
+    for NamedSignal { message, signal, .. } in databases.signals().filter(|signal| signal.answer.is_none()) {
         let name = format!("{}.{}", message.name, signal.name);
         let Some(Some(number)) = pattern.fits(&name).filter(|number| number.is_some_and(|n| n >= end)) else {
             continue;

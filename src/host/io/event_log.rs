@@ -4,8 +4,10 @@
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
+use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
+use crate::can::poll::PollChange;
 use crate::monitor::{BusEvent, Event, EventKind};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -88,6 +90,10 @@ impl EventLog {
             EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
             }
+            EventKind::MessageLoss(MessageLoss { bus, id, fault, lost }) => {
+                tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());
+            }
+            EventKind::Poll(change) => log_poll(change),
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
@@ -176,6 +182,17 @@ impl EventLog {
 /// A cell's number as people count, from 1.
 fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
+}
+
+fn log_poll(change: PollChange) {
+    match change {
+        PollChange::Silent { reason } => tracing::info!("diagnostic requests stop: {}", reason.words()),
+        PollChange::Asking => tracing::info!("diagnostic requests are sent"),
+        PollChange::Refused { id, service, identifier, code } => {
+            let request = format!("{service:02X} {identifier:04X}");
+            tracing::warn!(%id, request, "diagnostic request refused for good, code {code:02X}: it is not sent again");
+        }
+    }
 }
 
 fn log_alarm(kind: &EventKind) {

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::monitor::Monitor;
 use crate::quantity::BusIndex;
-use crate::status::document::MessageFlood;
+use crate::status::document::{ControllerStatus, MessageFlood};
 
 /// A protected message and how often each status of its check was given.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -19,8 +19,11 @@ pub struct ProtectedSummary {
     pub counts: BTreeMap<&'static str, u64>,
 }
 
-/// The protected messages and the dropped frames of a monitor.
-pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> (Vec<ProtectedSummary>, Vec<MessageFlood>) {
+/// What the checks of one monitor have counted.
+type Summaries = (Vec<ProtectedSummary>, Vec<MessageFlood>, Vec<ControllerStatus>);
+
+/// The protected messages, the dropped frames and the diagnostic answers of a monitor.
+pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> Summaries {
     let name = |bus: BusIndex| interfaces.get(bus.index()).map_or("unknown", String::as_str).to_owned();
     let protected = monitor.protected().map(|of| ProtectedSummary {
         interface: name(of.bus),
@@ -32,5 +35,10 @@ pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> (Vec<Protec
         id: of.id.to_string(),
         dropped: of.dropped,
     });
-    (protected.collect(), dropped.collect())
+    let controllers = monitor.controllers().map(|of| ControllerStatus {
+        interface: name(of.controller.bus),
+        id: of.controller.response.to_string(),
+        counts: of.counts,
+    });
+    (protected.collect(), dropped.collect(), controllers.collect())
 }

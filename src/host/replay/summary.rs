@@ -6,10 +6,11 @@ use serde::Serialize;
 
 use super::{CellSummary, ProtectedSummary};
 use crate::alarm::Change;
+use crate::can::poll::PollChange;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::CellIndex;
-use crate::status::document::MessageFlood;
+use crate::status::document::{ControllerStatus, MessageFlood};
 
 /// Raised alarms listed one by one; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
@@ -34,6 +35,8 @@ pub struct ReplaySummary {
     pub protected: Vec<ProtectedSummary>,
     /// Messages with more frames than the configured rate.
     pub dropped: Vec<MessageFlood>,
+    /// Controllers that answer diagnostic requests.
+    pub controllers: Vec<ControllerStatus>,
     /// Events by kind.
     pub events: BTreeMap<&'static str, u64>,
     /// The first 1,000 alarms raised.
@@ -105,6 +108,10 @@ pub(super) fn note_event(
                 "flood_over"
             }
         }
+        EventKind::MessageLoss(_) => "message_loss",
+        EventKind::Poll(PollChange::Silent { .. }) => "poll_silent",
+        EventKind::Poll(PollChange::Asking) => "poll_asking",
+        EventKind::Poll(PollChange::Refused { .. }) => "poll_refused",
         EventKind::Bus { .. } => "bus",
         EventKind::J1939 { .. } => "j1939",
         EventKind::Gap { .. } => "gap",

@@ -4,8 +4,9 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
-    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
+    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
+    StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::flood::FloodCount;
@@ -16,7 +17,7 @@ use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkHealth, LinkOutput};
-use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor, Statistics};
+use crate::monitor::{BusStatistics, CellView, ControllerCount, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
@@ -60,6 +61,7 @@ pub struct CounterBaseline {
     time_backwards: u64,
     protected: Vec<GuardCounts>,
     floods: Vec<FloodCount>,
+    controllers: Vec<ControllerCount>,
 }
 
 impl CounterBaseline {
@@ -78,6 +80,7 @@ impl CounterBaseline {
             time_backwards: monitor.time_backwards(),
             protected: monitor.protected().collect(),
             floods: monitor.dropped().collect(),
+            controllers: monitor.controllers().collect(),
         }
     }
 }
@@ -130,6 +133,8 @@ impl Sources<'_> {
                 clients: self.clients,
             },
             protection: self.protection(),
+            controllers: self.controllers(),
+            poll: self.monitor.poll().map(|(silent, refused)| PollStatus { silent, refused }),
             floods: self.floods(),
             latency: self.latency.clone(),
             store: self.store,
@@ -155,6 +160,18 @@ impl Sources<'_> {
                 StatusCount { status: status.name().to_owned(), count: count.saturating_sub(before) }
             });
             MessageProtection { interface: self.name(guard.bus), id: guard.id.to_string(), checks: checks.collect() }
+        });
+        each.collect()
+    }
+
+    fn controllers(&self) -> Vec<ControllerStatus> {
+        let each = self.monitor.controllers().map(|ControllerCount { controller, counts }| {
+            let before = self.before.controllers.iter().find(|it| it.controller == controller);
+            ControllerStatus {
+                interface: self.name(controller.bus),
+                id: controller.response.to_string(),
+                counts: before.map_or(counts, |before| counts.since(&before.counts)),
+            }
         });
         each.collect()
     }

@@ -14,6 +14,8 @@ use sha2::{Digest, Sha256};
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
+use crate::can::diagnostic::ControllerCounts;
+use crate::can::poll::PollSilence;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, Statistics, Validity};
@@ -56,6 +58,12 @@ pub struct StatusDocument {
     pub counters: StatusCounters,
     /// Protected input messages.
     pub protection: Vec<MessageProtection>,
+    /// Controllers that answer diagnostic requests.
+    #[serde(default)]
+    pub controllers: Vec<ControllerStatus>,
+    /// Diagnostic requests of this program; `None` = it sends none.
+    #[serde(default)]
+    pub poll: Option<PollStatus>,
     /// Input messages with frames dropped beyond the accepted rate.
     pub floods: Vec<MessageFlood>,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
@@ -243,7 +251,7 @@ pub struct AlarmStatus {
     pub omitted: usize,
 }
 
-/// Counters. All start at 0 with the program, also those of interfaces, protected messages and floods, except `lifetime`: a
+/// Counters. All start at 0 with the program, also those of interfaces, protected messages, controllers and floods, except `lifetime`: a
 /// stored count may be a minute old after a power cut, and a falling counter is wrong for readers that sum differences.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
@@ -280,6 +288,56 @@ pub struct StatusCount {
     pub status: String,
     /// Number of checks.
     pub count: u64,
+}
+
+/// Diagnostic requests of this program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PollStatus {
+    /// Why none is sent now; `None` = they are sent.
+    pub silent: Option<PollSilence>,
+    /// Requests that are not sent any more, because their controller refused them for good.
+    pub refused: usize,
+}
+
+impl PollStatus {
+    /// In words: `asking`, `silent: the bus sleeps`.
+    pub fn words(&self) -> String {
+        let state = self.silent.map_or_else(|| "asking".to_owned(), |reason| format!("silent: {}", reason.words()));
+        if self.refused == 0 { state } else { format!("{state}; {} refused for good", self.refused) }
+    }
+}
+
+/// A controller that answers diagnostic requests.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ControllerStatus {
+    /// Interface it is on.
+    pub interface: String,
+    /// Identifier of its answers, as in [`MessageProtection`].
+    pub id: String,
+    /// What came from it.
+    #[serde(flatten)]
+    pub counts: ControllerCounts,
+}
+
+impl ControllerStatus {
+    /// The counts in words: `120 answers, 3 refused (latest code 31), 2 lost: wrong sequence 2`.
+    pub fn words(&self) -> String {
+        let counts = &self.counts;
+        let mut words = format!("{} answers", counts.read);
+        let mut add = |count: u64, what: &str| {
+            if count > 0 {
+                words.push_str(&format!(", {count} {what}"));
+            }
+        };
+        add(counts.unasked, "of them unasked");
+        add(counts.other, "not configured");
+        add(counts.pending, "\"wait\"");
+        add(counts.refused, &format!("refused (latest code {:02X})", counts.latest_refusal.unwrap_or_default()));
+        for (fault, count) in counts.losses() {
+            add(count, &format!("lost: {}", fault.words()));
+        }
+        words
+    }
 }
 
 /// Frames dropped of one input message.

@@ -19,6 +19,7 @@ use prometheus_client::registry::{Registry, Unit};
 
 use super::document::{CellStatus, PackStatus, StatusDocument};
 use crate::alarm::Severity;
+use crate::can::diagnostic::ControllerCounts;
 use crate::io::socket::LinkState;
 use crate::monitor::Validity;
 use crate::quantity::Mode;
@@ -207,6 +208,19 @@ fn interfaces(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Re
     families.counter("interface_unsent_frames", "Frames that could not be sent", unsent)?;
     let flooded = document.floods.iter().map(|flood| (message(&flood.interface, &flood.id), flood.dropped));
     families.counter("message_flood_dropped_frames", "Frames of a message beyond the accepted rate", flooded)?;
+    let controllers = document.controllers.iter().flat_map(|it| {
+        let ControllerCounts { read, other, refused, pending, unasked, .. } = it.counts;
+        let outcomes =
+            [("read", read), ("other", other), ("refused", refused), ("pending", pending), ("unasked", unasked)];
+        outcomes.map(|(outcome, count)| {
+            let mut labels = message(&it.interface, &it.id);
+            labels.push(("outcome", outcome.to_owned()));
+            (labels, count)
+        })
+    });
+    families.counter("diagnostic_answers", "Diagnostic answers of a controller by outcome", controllers)?;
+    let lost = document.controllers.iter().map(|it| (message(&it.interface, &it.id), it.counts.lost_in_all()));
+    families.counter("diagnostic_lost_messages", "Diagnostic messages of a controller that were lost", lost)?;
     let checks = document.protection.iter().flat_map(|protected| {
         protected.checks.iter().map(|check| {
             let mut labels = message(&protected.interface, &protected.id);

@@ -23,7 +23,7 @@ pub(super) struct Feeder {
 impl Feeder {
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
         Self {
-            encoder: InputEncoder::new(&config.input),
+            encoder: InputEncoder::new(&config.input).with_answers(&config.answers),
             protector: InputProtector::new(&config.guards),
             monitor: Monitor::new(config),
             ticks: Ticks::new(TICK_PERIOD_MS, sleep_gap_s),

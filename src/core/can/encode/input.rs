@@ -4,19 +4,36 @@
 //! written as its "not available" code, or else as a code that its receiver rejects (NaN, out of range); where there is no
 //! such code the whole frame is left out and its values are counted as not carried. A frame without any value is sent only
 //! if one of its signals has a "not available" code. Values beyond the bits saturate; values outside the DBC's range stay
-//! outside, so that their receiver detects the fault.
+//! outside, so that their receiver detects the fault. A diagnostic answer is made with its request and flow control, as on a
+//! bus with a tester.
 
 use std::collections::BTreeMap;
 
 use crate::can::decode::{Binding, Channel, InputMap};
+use crate::can::diagnostic::{Answer, AnswerSignal, Controller, Question};
+use crate::can::isotp::segment;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
+
+/// Flow control that lets everything come at once.
+const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
 /// Makes input frames from values.
 #[derive(Debug, Clone)]
 pub struct InputEncoder {
     pages: Vec<InputPage>,
+    answers: Vec<AnswerPage>,
+}
+
+/// One diagnostic answer.
+#[derive(Debug, Clone)]
+struct AnswerPage {
+    question: Question,
+    /// The answer's message, with all signals 0.
+    template: Vec<u8>,
+    /// Signals and the byte of the message with which each begins.
+    fields: Vec<(usize, InputField)>,
 }
 
 /// One message, or one multiplexer page of it.
@@ -67,6 +84,15 @@ impl InputField {
         }
     }
 
+    /// Whether a frame is needed for it.
+    fn is_sent(&self, given: &BTreeMap<Channel, Option<f64>>) -> bool {
+        match given.get(&self.channel) {
+            Some(Some(_)) => true,
+            Some(None) => self.has_not_available,
+            None => false,
+        }
+    }
+
     fn code(&self, value: Option<f64>) -> Option<u64> {
         let value = value.and_then(|value| self.plan.code_beyond_range((value - self.offset) / self.scale));
         value.or(self.missing)
@@ -86,7 +112,13 @@ impl InputEncoder {
             templates.dedup();
             templates.into_iter().map(|template| InputPage::new(message, template))
         });
-        Self { pages: pages.collect() }
+        Self { pages: pages.collect(), answers: Vec::new() }
+    }
+
+    /// The same with diagnostic answers, made after the frames.
+    #[must_use]
+    pub fn with_answers(self, answers: &[Answer]) -> Self {
+        Self { answers: answers.iter().map(AnswerPage::new).collect(), ..self }
     }
 
     /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value now". Returns how many
@@ -102,7 +134,52 @@ impl InputEncoder {
                 out.push((page.bus, frame));
             }
         }
+        for answer in &self.answers {
+            if let Some(message) = answer.message(&given) {
+                open.retain(|channel| !answer.fields.iter().any(|(_, field)| field.channel == *channel));
+                answer.exchange(&message, out);
+            }
+        }
         open.len()
+    }
+}
+
+impl AnswerPage {
+    fn new(answer: &Answer) -> Self {
+        let mut template = answer.question.answer_head();
+        let head = template.len();
+        let ends = answer.signals.iter().map(|signal| signal.first_byte + signal.binding.plan.bytes_needed());
+        template.resize(head + ends.max().unwrap_or(0), 0);
+        let field = |signal: &AnswerSignal| (head + signal.first_byte, InputField::new(&signal.binding));
+        Self { question: answer.question, template, fields: answer.signals.iter().map(field).collect() }
+    }
+
+    /// The answer with these values; `None` when none of them is in it, or one that is missing has no code.
+    fn message(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Vec<u8>> {
+        if !self.fields.iter().any(|(_, field)| field.is_sent(given)) {
+            return None;
+        }
+        let mut message = self.template.clone();
+        for (first_byte, field) in &self.fields {
+            let code = field.code(given.get(&field.channel).copied().flatten())?;
+            field.plan.encode_raw(message.get_mut(*first_byte..)?, code).ok()?;
+        }
+        Some(message)
+    }
+
+    /// Appends the request, the answer, and the flow control behind its first frame.
+    fn exchange(&self, message: &[u8], out: &mut Vec<(BusIndex, Frame)>) {
+        let Controller { bus, request, request_extension, response, response_extension } = self.question.controller;
+        let of_tester = |payload: &[u8]| Frame::classic(request, payload).map(|frame| (bus, frame));
+        out.extend(segment(request_extension, &self.question.request(), 0).first().and_then(|it| of_tester(it)));
+        let frames = segment(response_extension, message, 0);
+        for (index, payload) in frames.iter().enumerate() {
+            out.extend(Frame::classic(response, payload).map(|frame| (bus, frame)));
+            if index == 0 && frames.len() > 1 {
+                let go_on: Vec<u8> = request_extension.into_iter().chain(FLOW_CONTROL).collect();
+                out.extend(of_tester(&go_on));
+            }
+        }
     }
 }
 
@@ -120,12 +197,7 @@ impl InputPage {
     }
 
     fn frame(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Frame> {
-        let is_sent = |field: &InputField| match given.get(&field.channel) {
-            Some(Some(_)) => true,
-            Some(None) => field.has_not_available,
-            None => false,
-        };
-        if !self.fields.iter().any(is_sent) {
+        if !self.fields.iter().any(|field| field.is_sent(given)) {
             return None;
         }
         let mut payload = self.template;

@@ -1,6 +1,6 @@
 //! The tables of what is read from the buses: `[input]` and the signals below it.
 
-use super::{CellRanges, PositiveCurrent};
+use super::{CellRanges, NumberRange, PositiveCurrent, SubTables, WireOrder};
 use crate::can::e2e::Profile;
 use crate::config::document::TablePlace;
 use crate::config::schema::Presence::{Default, Optional, Required};
@@ -10,8 +10,8 @@ use crate::config::setting::ValueRange::{Above, Any, Between, NotEmpty};
 section! {
     /// The inputs: what is read from the buses. One of `[input.cell_voltage]` and `[input.pack_voltage]` is needed, and `[input.current]`.
     Input at "input" {
-        /// DBC files that describe the signals named below, relative to this file.
-        dbc: Vec<String>, "", NotEmpty, Required;
+        /// DBC files that describe the signals named below, relative to this file. Not needed where all of them are in the answers of `[[input.diagnostic]]`.
+        dbc: Vec<String>, "", Any, Default("[]");
         /// Most frames of one identifier on one interface that are processed in a second; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender takes no time from the others. The default is twice the rate of the fastest sensible sender (one frame a millisecond) and half the rate of a saturated bus of 500 kbit/s.
         max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
     }
@@ -37,13 +37,73 @@ section! {
     }
 }
 
+section! {
+    /// An answer to a diagnostic request, over ISO-TP, whoever asks for it: most electric cars report their cell voltages only so. Nothing is sent without `[poll]`. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
+    DiagnosticInput at "input.diagnostic" {
+        /// What its signals are named by, before the dot; several answers may share it.
+        name: String, "", NotEmpty, Required;
+        /// CAN identifier of the requests; above 0x7FF one of 29 bits.
+        request: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
+        /// CAN identifier of the answers.
+        response: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
+        /// First data byte of the requests, with extended addressing. Without it: normal addressing.
+        request_extension: Option<u8>, "", Any, Optional;
+        /// First data byte of the answers, with extended addressing. Without it: normal addressing.
+        response_extension: Option<u8>, "", Any, Optional;
+        /// Service: 0x22 (ReadDataByIdentifier of UDS), 0x21 (ReadDataByLocalIdentifier of KWP 2000) or 0x01 (current data of OBD).
+        service: u8, "", Any, Required;
+        /// Identifier of the values: two bytes with service 0x22, otherwise one.
+        identifier: u16, "", Any, Required;
+        /// How often `[poll]` asks for it while the pack is discharged. Without it: not asked then.
+        drive_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
+        /// The same while the pack is charged. Without it: not asked then.
+        charge_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
+        /// The same while no current flows, or none is known, and the bus is awake all the same. Without it: not asked then.
+        parked_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
+        /// The signals, one table each; those that no input names are not read.
+        signals: SubTables<AnswerSignalKeys>, "", NotEmpty, Required;
+    }
+}
+
+section! {
+    /// A signal of the answer, or a row of equal ones. Its value is code x factor + offset.
+    AnswerSignalKeys at "input.diagnostic.signals" {
+        /// Its name, with `{n}` where the number stands in a row of them.
+        name: String, "", NotEmpty, Required;
+        /// Position of its first (most significant) bit, counted from the most significant bit of the byte behind the echoed service and identifier (as `bix` of OBDb).
+        bit: u32, "bits", Between(0.0, 8.0 * 65_535.0), Required;
+        /// Its length.
+        length: u16, "bits", Between(1.0, 64.0), Required;
+        /// Whether its codes are two's complement.
+        signed: bool, "", Any, Default("false");
+        /// Which of its bytes comes first: the most ("big") or the least significant one ("little", for whole bytes).
+        byte_order: WireOrder, "", Any, Default("\"big\"");
+        /// Value of one code.
+        factor: f64, "unit", Between(-1e9, 1e9), Default("1.0");
+        /// Value of code 0.
+        offset: f64, "unit", Between(-1e9, 1e9), Default("0.0");
+        /// Unit of the value, as a DBC would name it.
+        unit: String, "", Any, Default("\"\"");
+        /// Smallest value that is plausible; below it the reading is bad. Without it: any.
+        minimum: Option<f64>, "unit", Any, Optional;
+        /// Largest value that is plausible; above it the reading is bad. Without it: any.
+        maximum: Option<f64>, "unit", Any, Optional;
+        /// Codes that mean "not available".
+        not_available: Vec<u64>, "", Any, Default("[]");
+        /// Numbers that `{n}` in the name counts through. Without it: one signal.
+        numbers: Option<NumberRange>, "", Any, Optional;
+        /// Bits from the first bit of one to that of the next. Without it: the length.
+        step: Option<u32>, "bits", Between(1.0, 8.0 * 65_535.0), Optional;
+    }
+}
+
 /// Declares a table that names a signal on a bus; every such table has these keys.
 macro_rules! signal_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
         section! {
             $(#[doc = $about])+
             $name at $path gives SignalSource<'_>, |keys| {
-                /// `Message.Signal` of one of the DBC files; in `[input.cell_voltage]` a pattern, see there.
+                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer; in `[input.cell_voltage]` a pattern, see there.
                 signal: String, "", NotEmpty, Required => signal: &keys.signal;
                 /// Interface that carries the signal. Needed when there are several.
                 interface: Option<String>, "", NotEmpty, Optional => interface: keys.interface.as_deref();
@@ -129,6 +189,16 @@ signal_section! {
     ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0") =>;
+    }
+}
+
+signal_section! {
+    /// Voltage of the vehicle's supply battery: while it is low, or not known, `[poll]` asks for nothing.
+    SupplyVoltageInput at "input.supply_voltage", "V per unit of the DBC" {
+        /// Least voltage at which requests may be sent. The default is that of a half empty lead battery of 12 V.
+        minimum_v: f64, "V", Above(0.0, 100.0), Default("12.2") =>;
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
     }
 }
 

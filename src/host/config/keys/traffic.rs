@@ -7,6 +7,17 @@ use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Any, Between, NotEmpty};
 
 section! {
+    /// Diagnostic requests, which this program sends itself, for the answers of `[[input.diagnostic]]` that have a period. Off by default: polling can disturb a car (warning lamps, a car that does not fall asleep, an empty 12 V battery), so try it in a standing car first.
+    /// Only the services that an answer can have (0x22, 0x21, 0x01) can be sent, one request at a time. Nothing is sent for a minute after the request of another tester; while the bus sleeps (no frame of others for two seconds); while the supply voltage is low (`[input.supply_voltage]`); on `packwatch poll standby`. A controller that refuses a request for good (0x11, 0x31, 0x33) is not asked for it again; other failures are asked less and less often. All frames of a polled interface are received, and recorded by `--record`.
+    Poll at "poll" {
+        /// Whether requests are sent.
+        enabled: bool, "", Any, Default("false");
+        /// Most requests in a second, of all answers together.
+        max_requests_per_s: f64, "1/s", Between(0.01, 100.0), Default("10.0");
+    }
+}
+
+section! {
     /// A J1939 node, in addition to the frames of `[output]`: it claims an address and sends alarms as trouble codes, in DM1 once a second and on every change, in DM2 on request.
     /// Of a rule's alarms that share a parameter number the most severe is sent. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
     /// The NAME identifies the node: of two nodes that claim one address the one with the smaller NAME keeps it, and the other stops sending.

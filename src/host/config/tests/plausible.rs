@@ -297,3 +297,22 @@ fn a_byte_order_mark_is_read_over_and_utf_16_is_named() {
         assert_eq!(read_bytes(text), Err(vec![fault.to_owned()]));
     }
 }
+
+#[test]
+fn signals_of_an_answer_share_bits_where_the_answer_has_them() {
+    let answer = |keys: &str| {
+        format!(
+            "{}\n[[input.diagnostic]]\nname = \"Car\"\nrequest = 0x7E4\nresponse = 0x7EC\nservice = 0x22\nidentifier = 1\n\
+             signals = [{{ name = \"Cell{{n}}\", numbers = \"1-4\", bit = 32, length = 8, factor = 0.02{keys} }}]\n",
+            PACK.replace("Cells.Cell{n}", "Car.Cell{n}")
+        )
+    };
+    assert!(read_texts(&answer(""), CELL, DBC).is_ok(), "each begins at the first bit of its own byte");
+    let fault = "pack.toml:12: input.cell_voltage.signal = \"Car.Cell{n}\", Car.Cell1 and Car.Cell2 (and 2 other pairs) share \
+                 bits of one message, must be apart";
+    assert_eq!(read_texts(&answer(", step = 4"), CELL, DBC).unwrap_err(), [fault]);
+    let unit = "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Car.Cell1 is \"mV\" (1.0 if the \
+                DBC is wrong and it is V)";
+    let all = read_texts(&answer(", unit = \"mV\"").replace("0.02", "20.0"), CELL, DBC).unwrap_err();
+    assert_eq!(all, [unit]);
+}

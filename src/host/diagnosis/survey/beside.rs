@@ -6,7 +6,7 @@
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
-use crate::config::{Databases, RawTables, ResolvedSignal};
+use crate::config::{Databases, NamedSignal, RawTables, ResolvedSignal};
 use crate::doctor::SignalPlan;
 use crate::quantity::{BusIndex, Channel};
 
@@ -16,8 +16,9 @@ const MAX_SIGNALS: usize = 64;
 /// The comparable signals.
 pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedSignal<'_>]) -> Vec<SignalPlan> {
     let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
-    let free = databases.signals().filter(|(_, _, signal)| !is_configured(signal));
-    let wanted = free.filter_map(|(_, message, signal)| Some((message, signal, channel_of(raw, message, signal)?)));
+    let free = databases.signals().filter(|named| named.answer.is_none() && !is_configured(named.signal));
+    let wanted = free
+        .filter_map(|NamedSignal { message, signal, .. }| Some((message, signal, channel_of(raw, message, signal)?)));
     let buses = u8::try_from(raw.interfaces.len()).unwrap_or(u8::MAX);
     let bound = wanted.flat_map(|(message, signal, channel)| {
         (0..buses).filter_map(move |bus| plan(BusIndex(bus), message, signal, channel))

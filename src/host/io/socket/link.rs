@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
 use super::counters::{LinkHealth, LinkState, SharedHealth};
-use super::raw::{CALL_BATCH, RawRead, RawSocket, filters, index_of};
+use super::raw::{CALL_BATCH, RawRead, RawSocket, every_frame, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -51,6 +51,8 @@ pub struct LinkConfig {
     pub ids: Vec<CanId>,
     /// Further extended identifiers, as identifier and mask.
     pub patterns: Vec<(u32, u32)>,
+    /// Every frame is wanted.
+    pub all: bool,
     /// Receive buffer to ask for, bytes.
     pub receive_buffer_bytes: usize,
 }
@@ -173,12 +175,12 @@ impl Link {
 
     /// Opens the interface and sends its state as an event; `None` when it cannot be opened.
     async fn open(&mut self) -> Option<OpenSocket> {
-        let LinkConfig { interface, fd, ids, patterns, receive_buffer_bytes, .. } = &self.config;
-        let opened =
-            RawSocket::open(interface, *fd, &filters(ids, patterns), *receive_buffer_bytes).and_then(|socket| {
-                let error = socket.take_error()?;
-                Ok((watch(socket)?, error))
-            });
+        let LinkConfig { interface, fd, ids, patterns, all, receive_buffer_bytes, .. } = &self.config;
+        let filters = if *all { every_frame() } else { filters(ids, patterns) };
+        let opened = RawSocket::open(interface, *fd, &filters, *receive_buffer_bytes).and_then(|socket| {
+            let error = socket.take_error()?;
+            Ok((watch(socket)?, error))
+        });
         let (socket, error) = match opened {
             Ok(opened) => opened,
             Err(error) => {
@@ -280,7 +282,7 @@ impl Link {
 
     fn is_wanted(&self, id: CanId) -> bool {
         let fits = |&(wanted, mask): &(u32, u32)| matches!(id, CanId::Extended(raw) if raw & mask == wanted);
-        self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
+        self.config.all || self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
     }
 
     /// Forwards one frame or event.

@@ -1,6 +1,8 @@
 //! A sample document for tests: every value is present, except a few that are unknown.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
+use crate::can::diagnostic::ControllerCounts;
+use crate::can::poll::PollSilence;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
@@ -8,8 +10,9 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, LossStatus, MessageFlood, MessageProtection, PackStatus,
-    RemainingStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
+    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
+    StoreStatus, VERSION,
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
@@ -55,6 +58,18 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
             id: "3E9".to_owned(),
             checks: vec![StatusCount { status: "ok".to_owned(), count: 99 }],
         }],
+        controllers: vec![ControllerStatus {
+            interface: "can0".to_owned(),
+            id: "7EC".to_owned(),
+            counts: ControllerCounts {
+                read: 120,
+                refused: 3,
+                latest_refusal: Some(0x31),
+                lost: [2, 0, 0, 0, 0, 0, 0, 0],
+                ..ControllerCounts::default()
+            },
+        }],
+        poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
         store: Some(StoreStatus {

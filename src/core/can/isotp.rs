@@ -1,0 +1,279 @@
+//! ISO-TP (ISO 15765-2): messages of up to 65,535 bytes from single, first and consecutive frames, and back.
+//!
+//! In: payloads of one sender's frames with their times. Out: whole messages, and a fault for each one that is lost. Classic
+//! frames and CAN FD (escapes of length), normal and extended addressing. A [`Receiver`] only listens: flow control is the
+//! business of whoever asked. It keeps one message and never more memory than has arrived.
+
+use crate::quantity::Timestamp;
+
+/// Longest silence between two frames of one message, ns (N_Cr of ISO 15765-2, 1 s).
+pub const FRAME_TIMEOUT_NS: i64 = 1_000_000_000;
+
+/// Longest message: lengths beyond 4,095 (the escape of 2016) are accepted up to here.
+pub const MAX_MESSAGE: usize = 65_535;
+
+/// Longest classic payload, bytes.
+const CLASSIC: usize = 8;
+
+/// Why a message is lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IsoTpFault {
+    /// A consecutive frame has another number than the next one: a frame is missing, doubled or out of order.
+    WrongSequence,
+    /// No consecutive frame within a second.
+    Timeout,
+    /// Another message began before the last one ended: two senders, or one that gave up.
+    Overlap,
+    /// The asking side refused it by flow control (buffer overflow, reserved state).
+    Refused,
+    /// A length that its frame type cannot have: 0, beyond the frame, or a first frame of what fits into one frame.
+    WrongLength,
+    /// Longer than [`MAX_MESSAGE`].
+    TooLong,
+    /// A frame shorter than the first one promised.
+    ShortFrame,
+    /// A consecutive frame although no message has begun.
+    NotBegun,
+}
+
+impl IsoTpFault {
+    /// Every fault, in the order of counts.
+    pub const ALL: [Self; 8] = [
+        Self::WrongSequence,
+        Self::Timeout,
+        Self::Overlap,
+        Self::Refused,
+        Self::WrongLength,
+        Self::TooLong,
+        Self::ShortFrame,
+        Self::NotBegun,
+    ];
+
+    /// In words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::WrongSequence => "wrong sequence",
+            Self::Timeout => "consecutive frame missing",
+            Self::Overlap => "interrupted by another message",
+            Self::Refused => "refused by flow control",
+            Self::WrongLength => "impossible length",
+            Self::TooLong => "too long",
+            Self::ShortFrame => "short frame",
+            Self::NotBegun => "consecutive frame without a first one",
+        }
+    }
+}
+
+/// Outcome of a frame; both may be there: a message that ends another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Received {
+    /// A message was lost.
+    pub fault: Option<IsoTpFault>,
+    /// What the frame did for the message it belongs to.
+    pub progress: Progress,
+}
+
+/// What a frame did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Progress {
+    /// Nothing: no frame of a message, or a lost one.
+    #[default]
+    None,
+    /// It began a message of several frames.
+    Begun,
+    /// It continued one.
+    Continued,
+    /// It completed one: [`Receiver::message`].
+    Complete,
+}
+
+/// Reassembles the messages of one sender.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Receiver {
+    /// First data byte of every frame with extended addressing.
+    extension: Option<u8>,
+    message: Vec<u8>,
+    /// Length of the message under way; 0 = none is.
+    length: usize,
+    /// Number of the next consecutive frame, 0 to 15.
+    next: u8,
+    /// Payload length of its first frame (RX_DL), without the extension.
+    frame_len: usize,
+    latest: Timestamp,
+    /// The message under way is lost, and known to be: its further frames are no further fault.
+    is_discarding: bool,
+}
+
+impl Receiver {
+    /// A receiver before its first frame.
+    pub fn new(extension: Option<u8>) -> Self {
+        let latest = Timestamp::from_nanos(0);
+        Self { extension, message: Vec::new(), length: 0, next: 0, frame_len: 0, latest, is_discarding: false }
+    }
+
+    /// The message that the latest frame completed.
+    pub fn message(&self) -> &[u8] {
+        &self.message
+    }
+
+    /// Whether a message is under way.
+    pub fn is_receiving(&self) -> bool {
+        self.length > 0
+    }
+
+    /// Takes a payload of the sender.
+    pub fn handle(&mut self, now: Timestamp, payload: &[u8]) -> Received {
+        let late = self.poll(now);
+        let Some(data) = without_extension(self.extension, payload) else { return Received::lost(late) };
+        let received = match data {
+            [control, ..] => match control >> 4 {
+                0x0 => self.single(data),
+                0x1 => self.first(now, data),
+                0x2 => self.consecutive(now, control & 0xF, &data[1..]),
+                _ => Received::default(), // flow control and reserved types are no part of a message
+            },
+            [] => Received::default(),
+        };
+        Received { fault: late.or(received.fault), ..received }
+    }
+
+    /// Takes a flow control of the asking side: one that refuses ends the message under way.
+    pub fn handle_flow_control(&mut self, extension: Option<u8>, payload: &[u8]) -> Option<IsoTpFault> {
+        let control = *without_extension(extension, payload)?.first()?;
+        let is_refusal = control >> 4 == 0x3 && !matches!(control & 0xF, 0 | 1);
+        (is_refusal && self.is_receiving()).then(|| self.drop_message(IsoTpFault::Refused))
+    }
+
+    /// Gives up a message whose next frame is overdue.
+    pub fn poll(&mut self, now: Timestamp) -> Option<IsoTpFault> {
+        let is_late = self.is_receiving() && now.nanos().saturating_sub(self.latest.nanos()) > FRAME_TIMEOUT_NS;
+        is_late.then(|| self.drop_message(IsoTpFault::Timeout))
+    }
+
+    /// Forgets a message under way, without a fault: time passed unseen.
+    pub fn restart(&mut self) {
+        (self.length, self.is_discarding) = (0, true);
+    }
+
+    fn drop_message(&mut self, fault: IsoTpFault) -> IsoTpFault {
+        (self.length, self.is_discarding) = (0, true);
+        fault
+    }
+
+    /// A frame that begins a message: the fault of the one it interrupts.
+    fn begin(&mut self) -> Option<IsoTpFault> {
+        let overlap = self.is_receiving().then_some(IsoTpFault::Overlap);
+        (self.length, self.is_discarding) = (0, false);
+        overlap
+    }
+
+    fn single(&mut self, data: &[u8]) -> Received {
+        let overlap = self.begin();
+        // Frames of more than 8 bytes carry their length in the second byte.
+        let (length, body) = match (data[0] & 0xF, data) {
+            (0, [_, length, body @ ..]) if body.len() + 2 > self.classic_len() => (usize::from(*length), body),
+            (length, [_, body @ ..]) => (usize::from(length), body),
+            (_, []) => (0, data),
+        };
+        match body.get(..length).filter(|body| !body.is_empty()) {
+            Some(body) => {
+                self.message.clear();
+                self.message.extend_from_slice(body);
+                Received { fault: overlap, progress: Progress::Complete }
+            }
+            None => Received::lost(overlap.or(Some(IsoTpFault::WrongLength))),
+        }
+    }
+
+    fn first(&mut self, now: Timestamp, data: &[u8]) -> Received {
+        let overlap = self.begin();
+        let (length, body) = match *data {
+            [0x10, 0, a, b, c, d, ref body @ ..] => (u32::from_be_bytes([a, b, c, d]), body),
+            [high, low, ref body @ ..] => (u32::from(high & 0xF) << 8 | u32::from(low), body),
+            _ => (0, data),
+        };
+        let length = usize::try_from(length).unwrap_or(usize::MAX);
+        // What fits into one frame needs no first frame, and a first frame is full.
+        let fault = if length <= body.len() || data.len() < self.classic_len() {
+            Some(IsoTpFault::WrongLength)
+        } else {
+            (length > MAX_MESSAGE).then_some(IsoTpFault::TooLong)
+        };
+        if fault.is_some() {
+            self.is_discarding = true;
+            return Received::lost(overlap.or(fault));
+        }
+        self.message.clear();
+        self.message.extend_from_slice(body);
+        (self.length, self.next, self.frame_len, self.latest) = (length, 1, data.len(), now);
+        Received { fault: overlap, progress: Progress::Begun }
+    }
+
+    fn consecutive(&mut self, now: Timestamp, number: u8, body: &[u8]) -> Received {
+        if !self.is_receiving() {
+            let is_known = std::mem::replace(&mut self.is_discarding, true);
+            return Received::lost((!is_known).then_some(IsoTpFault::NotBegun));
+        }
+        if number != self.next {
+            return Received::lost(Some(self.drop_message(IsoTpFault::WrongSequence)));
+        }
+        let wanted = (self.length - self.message.len()).min(self.frame_len - 1);
+        let Some(body) = body.get(..wanted) else {
+            return Received::lost(Some(self.drop_message(IsoTpFault::ShortFrame)));
+        };
+        self.message.extend_from_slice(body);
+        (self.next, self.latest) = ((self.next + 1) % 16, now);
+        if self.message.len() < self.length {
+            return Received { fault: None, progress: Progress::Continued };
+        }
+        self.length = 0;
+        Received { fault: None, progress: Progress::Complete }
+    }
+
+    /// Payload length of a full classic frame, without the extension.
+    fn classic_len(&self) -> usize {
+        CLASSIC - usize::from(self.extension.is_some())
+    }
+}
+
+impl Received {
+    fn lost(fault: Option<IsoTpFault>) -> Self {
+        Self { fault, progress: Progress::None }
+    }
+}
+
+/// The payload behind the extension; `None` = for another address.
+fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
+    match extension {
+        None => Some(payload),
+        Some(extension) => payload.split_first().filter(|(first, _)| **first == extension).map(|(_, data)| data),
+    }
+}
+
+/// The payloads that carry a message in classic frames, filled up with `padding` (ISO 15765-2 asks for 0xCC, cars send 0x00,
+/// 0x55 and 0xAA too): one single frame, or a first and consecutive ones. Empty for a message without a byte or longer than 4,095.
+pub fn segment(extension: Option<u8>, message: &[u8], padding: u8) -> Vec<[u8; CLASSIC]> {
+    let room = CLASSIC - usize::from(extension.is_some());
+    let Ok(length) = u16::try_from(message.len()) else { return Vec::new() };
+    let frame = |control: &[u8], body: &[u8]| {
+        let mut payload = [padding; CLASSIC];
+        let bytes = extension.iter().chain(control).chain(body);
+        payload.iter_mut().zip(bytes).for_each(|(place, byte)| *place = *byte);
+        payload
+    };
+    match length {
+        0 | 4096.. => Vec::new(),
+        _ if message.len() < room => vec![frame(&[length.to_le_bytes()[0]], message)],
+        _ => {
+            let [high, low] = length.to_be_bytes();
+            let (begin, rest) = message.split_at(room - 2);
+            let numbers = (1..=15_u8).chain([0]).cycle();
+            let consecutive = rest.chunks(room - 1).zip(numbers).map(|(body, number)| frame(&[0x20 | number], body));
+            std::iter::once(frame(&[0x10 | high, low], begin)).chain(consecutive).collect()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

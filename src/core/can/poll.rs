@@ -1,0 +1,440 @@
+//! Asks controllers for diagnostic answers, and stops at every sign that it could disturb.
+//!
+//! In: frames, answers, what the car does, the supply voltage, the time. Out: request and flow control frames, and a
+//! [`PollChange`] each time it falls silent or goes on. One request is outstanding at a time. It is silent while another tester
+//! is at work, while the bus sleeps, while the supply is low or not known, and on standby.
+//!
+//! Only questions of a [`Service`](super::diagnostic::Service) can be sent: there is no way to express a write, a session or a
+//! routine. Pure: no clock, no socket.
+
+use serde::{Deserialize, Serialize};
+
+use super::diagnostic::{Controller, PENDING, Question, Refusal};
+use super::isotp::segment;
+use super::{CanId, Frame};
+use crate::quantity::{BusIndex, Timestamp};
+
+/// Silence after another tester's request, ns: longer than the pause between the requests of a workshop tester.
+pub const FOREIGN_SILENCE_NS: i64 = 60_000_000_000;
+/// A bus without a frame of others for this long sleeps, ns: broadcasts of a running car come many times a second.
+pub const ASLEEP_AFTER_NS: i64 = 2_000_000_000;
+/// Longest wait for the next sign of an answer, ns (P2 is 50 ms, N_Cr 1 s).
+const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
+/// Longest wait after "wait", ns (P2*).
+const PENDING_WITHIN_NS: i64 = 5_000_000_000;
+/// Longest wait in all, ns: a gateway may say "wait" for ever.
+const GIVE_UP_AFTER_NS: i64 = 30_000_000_000;
+/// Longest pause of a question that fails, s.
+const LONGEST_PAUSE_S: f64 = 600.0;
+/// Refusals that will not change: service not supported, request out of range, security access denied.
+const NEVER_AGAIN: [u8; 3] = [0x11, 0x31, 0x33];
+/// Flow control: everything at once, without a pause.
+const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
+
+/// What the car does, as far as the pack's current says it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub enum CarState {
+    /// The pack is discharged.
+    Drive,
+    /// The pack is charged.
+    Charge,
+    /// No current flows, or it is not known.
+    #[default]
+    Parked,
+}
+
+/// One question and how often it is asked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PollRequest {
+    /// The question.
+    pub question: Question,
+    /// Period in each [`CarState`], s; `None` = not asked then.
+    pub every_s: [Option<f64>; 3],
+    /// The answer has the pack current.
+    pub has_current: bool,
+    /// The answer has voltages: the current is asked for right before.
+    pub has_voltages: bool,
+}
+
+/// The questions.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PollConfig {
+    /// In the order in which they are asked when several are due.
+    pub requests: Vec<PollRequest>,
+    /// Most requests in a second, of all questions.
+    pub max_requests_per_s: f64,
+    /// Whether a supply voltage is watched: without a good reading nothing is sent.
+    pub watches_supply: bool,
+}
+
+/// Reason why nothing is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PollSilence {
+    /// By command.
+    Standby,
+    /// Another tester's request was heard less than a minute ago.
+    OtherTester,
+    /// The supply voltage is low, or not known.
+    LowSupply,
+    /// No frame of others: the bus sleeps.
+    BusAsleep,
+}
+
+impl PollSilence {
+    /// In words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Standby => "on standby",
+            Self::OtherTester => "another tester is at work",
+            Self::LowSupply => "the supply voltage is low or not known",
+            Self::BusAsleep => "the bus sleeps",
+        }
+    }
+}
+
+/// Something worth a line in a log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "poll")]
+pub enum PollChange {
+    /// It fell silent.
+    Silent {
+        /// Why.
+        reason: PollSilence,
+    },
+    /// It asks again.
+    Asking,
+    /// A question is never asked again.
+    Refused {
+        /// Controller, by the identifier of its answers.
+        id: CanId,
+        /// Service.
+        service: u8,
+        /// Identifier of the values.
+        identifier: u16,
+        /// Code of the refusal.
+        code: u8,
+    },
+}
+
+/// Outputs; the caller empties them.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PollOutputs {
+    /// Frames to send, in this order.
+    pub frames: Vec<(BusIndex, Frame)>,
+    /// What changed.
+    pub changes: Vec<PollChange>,
+}
+
+/// A question's state.
+#[derive(Debug, Clone, Copy)]
+struct Item {
+    due: Timestamp,
+    /// Failures in a row.
+    failures: u32,
+    /// Never asked again.
+    is_refused: bool,
+}
+
+/// The question that waits for its answer.
+#[derive(Debug, Clone, Copy)]
+struct Outstanding {
+    index: usize,
+    sent: Timestamp,
+    deadline: Timestamp,
+}
+
+/// Asks.
+#[derive(Debug, Clone)]
+pub struct Poller {
+    config: PollConfig,
+    items: Vec<Item>,
+    outstanding: Option<Outstanding>,
+    /// The latest question, asked or answered.
+    latest: Option<usize>,
+    /// When the rate allows the next request.
+    rate_allows_at: Timestamp,
+    state: CarState,
+    is_standby: bool,
+    /// Until when the latest good reading of the supply holds.
+    supply_good_until: Timestamp,
+    foreign_until: Timestamp,
+    /// Latest frame of others on each polled bus.
+    heard: Vec<(BusIndex, Timestamp)>,
+    /// As last reported.
+    silence: Option<PollSilence>,
+}
+
+const LONG_AGO: Timestamp = Timestamp::from_nanos(i64::MIN);
+
+impl Poller {
+    /// A poller that has heard nothing yet: silent.
+    pub fn new(config: &PollConfig) -> Self {
+        let item = Item { due: LONG_AGO, failures: 0, is_refused: false };
+        let mut buses: Vec<BusIndex> = config.requests.iter().map(|request| request.question.controller.bus).collect();
+        buses.sort_unstable();
+        buses.dedup();
+        Self {
+            items: vec![item; config.requests.len()],
+            config: config.clone(),
+            outstanding: None,
+            latest: None,
+            rate_allows_at: LONG_AGO,
+            state: CarState::default(),
+            is_standby: false,
+            supply_good_until: LONG_AGO,
+            foreign_until: LONG_AGO,
+            heard: buses.into_iter().map(|bus| (bus, LONG_AGO)).collect(),
+            silence: Some(PollSilence::BusAsleep),
+        }
+    }
+
+    /// Whether it sends on a bus, and so has to hear every frame of it.
+    pub fn is_on(&self, bus: BusIndex) -> bool {
+        self.heard.iter().any(|(other, _)| *other == bus)
+    }
+
+    /// Why nothing is sent; `None` = it asks.
+    pub fn silence(&self) -> Option<PollSilence> {
+        self.silence
+    }
+
+    /// Questions that are never asked again.
+    pub fn refused(&self) -> usize {
+        self.items.iter().filter(|item| item.is_refused).count()
+    }
+
+    /// Another period may hold from here on.
+    pub fn set_state(&mut self, now: Timestamp, state: CarState) {
+        if state == self.state {
+            return;
+        }
+        self.state = state;
+        for index in 0..self.items.len() {
+            // A shorter period begins now, not when the longer one is over.
+            if let Some(period_s) = self.period_s(index) {
+                self.items[index].due = self.items[index].due.min(now.plus_secs(period_s));
+            }
+        }
+    }
+
+    /// Takes a reading of the supply voltage: until when it may be counted on, `None` = it is low or bad.
+    pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
+        self.supply_good_until = good_until.unwrap_or(LONG_AGO);
+    }
+
+    /// Sets or ends the standby.
+    pub fn set_standby(&mut self, is_standby: bool) {
+        self.is_standby = is_standby;
+    }
+
+    /// Begins again after time without the buses: nothing was heard.
+    pub fn restart(&mut self) {
+        self.outstanding = None;
+        self.heard.iter_mut().for_each(|(_, at)| *at = LONG_AGO);
+    }
+
+    /// Takes a frame of others; those of [`Self::poll`] do not come back.
+    pub fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut PollOutputs) {
+        let Some(heard) = self.heard.iter_mut().find(|(other, _)| *other == bus) else { return };
+        let of_polled = |wanted: fn(&Controller) -> CanId| {
+            let same = |request: &PollRequest| request.question.controller.bus == bus;
+            self.config
+                .requests
+                .iter()
+                .filter(|request| same(request))
+                .any(|request| wanted(&request.question.controller) == frame.id())
+        };
+        if of_polled(|controller| controller.request) || is_tester(frame.id()) {
+            self.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
+            self.outstanding = None;
+        } else if !of_polled(|controller| controller.response) {
+            // An answer to a question of ours does not say that the car is awake by itself.
+            heard.1 = now;
+        }
+        self.poll(now, out);
+    }
+
+    /// The answer of several frames to the outstanding question begins: it may go on.
+    pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
+        let Some(question) = self.outstanding_of(controller) else { return };
+        self.extend_wait(now, ANSWER_WITHIN_NS);
+        let Controller { bus, request, request_extension, .. } = question.controller;
+        let mut payload = [0; 8];
+        let bytes = request_extension.iter().chain(&FLOW_CONTROL);
+        payload.iter_mut().zip(bytes).for_each(|(place, byte)| *place = *byte);
+        out.frames.extend(Frame::classic(request, &payload).map(|frame| (bus, frame)));
+    }
+
+    /// The answer goes on.
+    pub fn handle_continued(&mut self, now: Timestamp, controller: &Controller) {
+        if self.outstanding_of(controller).is_some() {
+            self.extend_wait(now, ANSWER_WITHIN_NS);
+        }
+    }
+
+    /// A whole answer.
+    pub fn handle_answer(&mut self, now: Timestamp, question: &Question, out: &mut PollOutputs) {
+        if let Some(Outstanding { index, .. }) = self.outstanding
+            && self.config.requests[index].question == *question
+        {
+            self.items[index].failures = 0;
+            self.outstanding = None;
+            self.poll(now, out);
+        }
+    }
+
+    /// A refusal.
+    pub fn handle_refusal(&mut self, now: Timestamp, controller: &Controller, refusal: Refusal, out: &mut PollOutputs) {
+        let Refusal { service, code } = refusal;
+        let Some(question) = self.outstanding_of(controller).filter(|question| question.service as u8 == service)
+        else {
+            return;
+        };
+        if code == PENDING {
+            return self.extend_wait(now, PENDING_WITHIN_NS);
+        }
+        let Some(Outstanding { index, .. }) = self.outstanding.take() else { return };
+        if NEVER_AGAIN.contains(&code) {
+            self.items[index].is_refused = true;
+            let (id, service) = (controller.response, question.service as u8);
+            out.changes.push(PollChange::Refused { id, service, identifier: question.identifier, code });
+        } else {
+            self.fail(now, index);
+        }
+        self.poll(now, out);
+    }
+
+    /// Sends the request that is due.
+    pub fn poll(&mut self, now: Timestamp, out: &mut PollOutputs) {
+        let silence = self.silence_at(now);
+        if silence != self.silence {
+            self.silence = silence;
+            out.changes.push(silence.map_or(PollChange::Asking, |reason| PollChange::Silent { reason }));
+        }
+        if silence.is_some() {
+            self.outstanding = None;
+            return;
+        }
+        if let Some(Outstanding { index, deadline, .. }) = self.outstanding {
+            if now < deadline {
+                return;
+            }
+            self.outstanding = None;
+            self.fail(now, index);
+        }
+        if now < self.rate_allows_at {
+            return;
+        }
+        if let Some((index, due)) = self.next()
+            && due <= now
+        {
+            self.send(now, self.with_current_before(index), out);
+        }
+    }
+
+    /// When [`poll`](Self::poll) has something to do; `None` = only a frame, a command or a reading can change that.
+    pub fn next_due(&self) -> Option<Timestamp> {
+        match self.silence {
+            Some(PollSilence::OtherTester) => return Some(self.foreign_until),
+            Some(_) => return None,
+            None => {}
+        }
+        let asleep = self.heard.iter().map(|(_, at)| at.plus_nanos(ASLEEP_AFTER_NS)).min();
+        let request = match self.outstanding {
+            Some(outstanding) => Some(outstanding.deadline),
+            None => self.next().map(|(_, due)| due.max(self.rate_allows_at)),
+        };
+        let supply = self.config.watches_supply.then_some(self.supply_good_until);
+        asleep.into_iter().chain(supply).chain(request).min()
+    }
+
+    fn silence_at(&self, now: Timestamp) -> Option<PollSilence> {
+        let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
+        if self.is_standby {
+            Some(PollSilence::Standby)
+        } else if now < self.foreign_until {
+            Some(PollSilence::OtherTester)
+        } else if self.config.watches_supply && now >= self.supply_good_until {
+            Some(PollSilence::LowSupply)
+        } else {
+            self.heard.iter().any(is_asleep).then_some(PollSilence::BusAsleep)
+        }
+    }
+
+    /// The question to ask next and when.
+    fn next(&self) -> Option<(usize, Timestamp)> {
+        let waiting =
+            self.items.iter().enumerate().filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
+        waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
+    }
+
+    fn period_s(&self, index: usize) -> Option<f64> {
+        self.config.requests[index].every_s[self.state as usize]
+    }
+
+    /// The question to ask before this one: that for the current before one for voltages.
+    fn with_current_before(&self, index: usize) -> usize {
+        let wanted = &self.config.requests[index];
+        if !wanted.has_voltages || wanted.has_current {
+            return index;
+        }
+        let current = self
+            .config
+            .requests
+            .iter()
+            .zip(&self.items)
+            .position(|(request, item)| request.has_current && !item.is_refused && item.failures == 0);
+        current.filter(|current| self.latest != Some(*current)).unwrap_or(index)
+    }
+
+    fn send(&mut self, now: Timestamp, index: usize, out: &mut PollOutputs) {
+        let Question { controller: Controller { bus, request, request_extension, .. }, .. } =
+            self.config.requests[index].question;
+        let message = self.config.requests[index].question.request();
+        let payload = segment(request_extension, &message, 0);
+        out.frames
+            .extend(payload.first().and_then(|payload| Frame::classic(request, payload)).map(|frame| (bus, frame)));
+        self.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
+        self.latest = Some(index);
+        self.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
+        // Without a period in this state it is asked for the sake of another one.
+        let period_s = self.period_s(index).unwrap_or(0.0);
+        let item = &mut self.items[index];
+        let next = item.due.plus_secs(period_s);
+        // On time, the next one keeps the rhythm.
+        item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
+    }
+
+    /// Waits longer, but not for ever.
+    fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
+        if let Some(outstanding) = &mut self.outstanding {
+            outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(GIVE_UP_AFTER_NS));
+        }
+    }
+
+    /// Asks a question that failed less often.
+    fn fail(&mut self, now: Timestamp, index: usize) {
+        let period_s = self.period_s(index).unwrap_or(1.0);
+        let item = &mut self.items[index];
+        item.failures = item.failures.saturating_add(1);
+        let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
+        item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(LONGEST_PAUSE_S))));
+    }
+
+    fn outstanding_of(&self, controller: &Controller) -> Option<Question> {
+        let question = self.config.requests[self.outstanding?.index].question;
+        (question.controller == *controller).then_some(question)
+    }
+}
+
+/// Whether an identifier is used by testers alone: the requests of ISO 15765-4, physical and to all.
+fn is_tester(id: CanId) -> bool {
+    match id {
+        CanId::Standard(raw) => raw == 0x7DF || (0x7E0..=0x7E7).contains(&raw),
+        CanId::Extended(raw) => matches!(raw & 0x1FFF_00FF, 0x18DA_00F1 | 0x18DB_00F1),
+    }
+}
+
+#[cfg(test)]
+mod tests;
