@@ -1,7 +1,7 @@
 //! `packwatch check`: checks a configuration and describes it.
 //!
-//! Opens everything the configuration names. Good: the meaning on standard output, exit 0. Bad: every fault,
-//! one a line, on standard error, exit 78.
+//! Opens everything the configuration names. Good: the meaning on standard output, after the warnings, exit 0. Bad: every
+//! fault, one a line, on standard error, exit 78.
 
 use std::path::PathBuf;
 
@@ -39,7 +39,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn show(description: &Description, page: &mut String) {
-    page.push_str(&format!("{}: good\n", description.file));
+    page.push_str(&format!("{}: {}\n", description.file, verdict(description.warnings.len())));
+    if !description.warnings.is_empty() {
+        list("warnings", &description.warnings, "", page);
+    }
     page.push_str(&format!("\ncell\n  {}\n", description.cell));
     list("pack", &description.pack, "", page);
     page.push_str("\ninterfaces\n");
@@ -59,6 +62,15 @@ fn show(description: &Description, page: &mut String) {
     list("alarms", &description.alarms, "none", page);
     if !description.j1939.is_empty() {
         list("j1939", &description.j1939, "", page);
+    }
+}
+
+/// The first line's words.
+fn verdict(warnings: usize) -> String {
+    match warnings {
+        0 => "good".to_owned(),
+        1 => "usable, 1 warning".to_owned(),
+        _ => format!("usable, {warnings} warnings"),
     }
 }
 

@@ -137,12 +137,36 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     result.map_err(|error| Failure::new(error.to_string()))
 }
 
-/// Adds the configuration's own faults, and to every change its line.
+/// The faults of the configuration as one finding; `None` = there is none.
+fn invalid(faults: &[String]) -> Option<Finding> {
+    let (first, others) = faults.split_first()?;
+    let title = match others.len() {
+        0 => "the configuration is invalid".to_owned(),
+        _ => format!("the configuration is invalid: {} faults", faults.len()),
+    };
+    let mut finding = Finding::new(Severity::Error, Topic::Configuration, title);
+    finding.seen.clone_from(first);
+    finding.why = "packwatch run does not start with it; the parts that can be read are judged below".to_owned();
+    finding.advice = Some("packwatch check shows every fault".to_owned()).filter(|_| !others.is_empty());
+    finding.consequences = others.to_vec();
+    Some(finding)
+}
+
+/// Adds the configuration's own faults and warnings, and to every change its line.
 fn complete(report: &mut Report, survey: &Survey) {
-    for fault in &survey.faults {
-        let mut finding = Finding::new(Severity::Error, Topic::Configuration, "the configuration is invalid");
-        finding.seen.clone_from(fault);
-        finding.why = "packwatch run does not start with it; the parts that can be read are judged below".to_owned();
+    if let Some(finding) = invalid(&survey.faults) {
+        report.add(finding);
+        // A wrong layout in the DBC is the cause of faults, not their effect.
+        if let Some(layout) =
+            report.findings.iter().position(|f| (f.severity, f.topic) == (Severity::Error, Topic::Layout))
+        {
+            report.findings[..=layout].rotate_right(1);
+        }
+    }
+    for warning in survey.config.iter().flat_map(|config| &config.warnings) {
+        let mut finding = Finding::new(Severity::Warning, Topic::Configuration, "the configuration is unlikely");
+        finding.seen.clone_from(warning);
+        finding.why = "packwatch run starts with it; packwatch check reports it too".to_owned();
         report.add(finding);
     }
     for change in report.findings.iter_mut().flat_map(|finding| &mut finding.changes) {

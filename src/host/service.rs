@@ -144,6 +144,7 @@ impl Service {
             left_out_reported: Instant::now(),
             status_publisher,
         };
+        self.config.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::log_kernel_stack();

@@ -114,3 +114,22 @@ fn the_reference_page_is_printed() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/REFERENCE.md")).unwrap();
     assert_eq!(good(&["check", "--reference"]), page);
 }
+
+#[test]
+fn a_file_with_a_warning_is_usable_and_not_called_good() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    std::fs::create_dir(folder.path().join("cells")).unwrap();
+    for name in ["pack96.dbc", "cells/example_nmc_2600.toml"] {
+        std::fs::copy(config.join(name), folder.path().join(name)).unwrap();
+    }
+    let text = std::fs::read_to_string(config.join("example.toml")).unwrap();
+    let file = folder.path().join("pack.toml");
+    std::fs::write(&file, text.replace("strings = 1", "strings = 1\nrated_capacity_ah = 5.2")).unwrap();
+    let said = good(&["check", file.to_str().unwrap()]);
+    assert!(
+        said.starts_with(&format!("{}: usable, 1 warning\n\nwarnings\n  {}", file.display(), file.display())),
+        "{said}"
+    );
+    assert!(said.contains("2 cells in parallel are strings = 2 without this key"), "{said}");
+}

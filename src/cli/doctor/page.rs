@@ -98,6 +98,19 @@ fn show(finding: &Finding, width: usize, paint: Paint, page: &mut String) {
         }
     }
     changes(&finding.changes, paint, page);
+    consequences(&finding.consequences, width, paint, page);
+}
+
+/// Findings below a finding; of many the first few.
+fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String) {
+    const SHOWN: usize = 4;
+    let shown = titles.iter().take(SHOWN).map(String::as_str).collect::<Vec<_>>().join("; ");
+    let text = match titles.len() {
+        0 => return,
+        n if n > SHOWN => format!("{shown}; and {} more", n - SHOWN),
+        _ => shown,
+    };
+    page.push_str(&format!("{}{}\n", paint.dim(&format!("  {:8}", "below")), wrapped(&text, width, INDENT)));
 }
 
 /// Lines to change; of many the first few.
@@ -169,6 +182,17 @@ mod tests {
         assert!(lines.lines().all(|line| line.chars().count() <= 14), "{lines}");
         assert_eq!(lines.split_whitespace().collect::<Vec<_>>().join(" "), text);
         assert_eq!(wrapped("unbreakablyLong", 5, 2), "unbreakablyLong");
+    }
+
+    #[test]
+    fn of_many_consequences_the_first_are_shown_and_the_rest_counted() {
+        let mut report = Report::default();
+        let mut finding = Finding::new(Severity::Error, Topic::Layout, "off");
+        finding.consequences = (1..=30).map(|n| format!("cell {n} is odd")).collect();
+        report.add(finding);
+        let page = render(&report, Path::new("pack.toml"), "can0", 80, Paint(false));
+        let words = page.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(words.contains("below cell 1 is odd; cell 2") && words.contains("odd; and 26 more"), "{page}");
     }
 
     #[test]

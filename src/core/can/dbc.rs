@@ -132,11 +132,18 @@ impl Database {
         Ok(database)
     }
 
-    /// Reads a DBC file's bytes: UTF-8, or Latin-1 where they are not UTF-8 (a DBC does not state its encoding).
+    /// Reads a DBC file's bytes: UTF-8 (with or without a byte-order mark), or Latin-1 where they are not UTF-8 (a DBC does
+    /// not state its encoding).
     ///
     /// # Errors
-    /// As [`Self::parse`].
+    /// As [`Self::parse`], and for UTF-16 text.
     pub fn parse_bytes(bytes: &[u8]) -> Result<Self, DbcError> {
+        if is_utf_16(bytes) {
+            let what = "is UTF-16 text, must be UTF-8 or Latin-1: save it in that encoding";
+            return Err(DbcError { line: 1, what: what.to_owned() });
+        }
+        // Some editors put the mark before Latin-1 text too.
+        let bytes = bytes.strip_prefix(UTF_8_MARK).unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
             Err(_) => Self::parse(&bytes.iter().copied().map(char::from).collect::<String>()),
@@ -170,6 +177,14 @@ impl Database {
         }
         Ok(())
     }
+}
+
+/// The byte-order mark U+FEFF in UTF-8.
+const UTF_8_MARK: &[u8] = b"\xEF\xBB\xBF";
+
+/// Whether the bytes begin with a byte-order mark of UTF-16, or with a Latin letter in UTF-16.
+fn is_utf_16(bytes: &[u8]) -> bool {
+    matches!(bytes, [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..] | [0, _, ..] | [_, 0, ..])
 }
 
 impl Message {

@@ -17,5 +17,6 @@ pub mod isotp;
 pub mod j1939;
 pub mod poll;
 pub mod signal;
+pub mod unit;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

@@ -133,7 +133,35 @@ impl SignalLayout {
             ByteOrder::LittleEndian => start,
             ByteOrder::BigEndian => start - start % 8 + (7 - start % 8),
         };
-        (first, first + u32::from(self.length_bits) - 1)
+        (first, first + u32::from(self.length_bits.max(1)) - 1)
+    }
+
+    /// Payload bytes up to the signal's end.
+    pub fn end_byte(&self) -> u32 {
+        self.span().1 / 8 + 1
+    }
+
+    /// Smallest and largest physical value its bits can hold, whatever range is stated; infinite for floats.
+    pub fn extent(&self) -> (f64, f64) {
+        if matches!(self.value_type, ValueType::Float32 | ValueType::Float64) || !(1..=64).contains(&self.length_bits) {
+            return (f64::NEG_INFINITY, f64::INFINITY);
+        }
+        let (lowest, highest) = self.representable();
+        let [a, b] = [lowest, highest].map(|code| code as f64 * self.factor + self.offset);
+        (a.min(b), a.max(b))
+    }
+
+    /// Whether both have a bit of the payload.
+    pub fn overlaps(&self, other: &Self) -> bool {
+        let theirs: Vec<u32> = other.bits().collect();
+        self.bits().any(|bit| theirs.contains(&bit))
+    }
+
+    /// Its bits in the DBC's numbering.
+    fn bits(&self) -> impl Iterator<Item = u32> + use<> {
+        let (first, last) = self.span();
+        let is_little = self.byte_order == ByteOrder::LittleEndian;
+        (first..=last).map(move |bit| if is_little { bit } else { bit - bit % 8 + (7 - bit % 8) })
     }
 
     /// Whether minimum and maximum are stated (`[0|0]` is no range).

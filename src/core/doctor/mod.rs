@@ -10,6 +10,9 @@
 //! | --- | --- |
 //! | `plan` | what is expected |
 //! | `series` | one signal: counts, periods, extent, roughness, and the same bits read with another layout |
+//! | `loss` | frames missing from a cyclic signal |
+//! | `equal_cells` | cells that always have the same voltage |
+//! | `other_current` | the current's message on another interface |
 //! | `response` | how the voltages follow the current: steps, steady runs, rests |
 //! | `watch` | [`Doctor`]: takes frames |
 //! | `judge` | turns everything received into a [`Report`] |
@@ -17,7 +20,10 @@
 //! A finding is an error (estimates will be wrong or missing), a warning (check it) or a note. A quantity that hardly
 //! moves is not judged: the report lists it with what to do.
 
+mod equal_cells;
 mod judge;
+mod loss;
+mod other_current;
 mod plan;
 mod report;
 mod response;

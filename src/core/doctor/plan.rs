@@ -14,8 +14,13 @@ pub struct Plan {
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
+    /// Configured signals in diagnostic answers, which the doctor does not read.
+    pub diagnostic_inputs: usize,
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
     pub more_cells: Vec<SignalPlan>,
+    /// Signals of the DBC that are not configured and look like the pack's voltage (beside cell voltages) or a state of charge,
+    /// by their channel; one for each interface.
+    pub beside: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
     /// Age from which a current, voltage and temperature is stale, s; `None` = never.

@@ -46,6 +46,8 @@ pub enum Topic {
     CurrentSign,
     /// Never moves.
     Frozen,
+    /// The cells do not add up to the pack's voltage.
+    PackVoltage,
     /// Outside the configured limits.
     Range,
     /// One cell is unlike the others.
@@ -58,6 +60,8 @@ pub enum Topic {
     CurrentOffset,
     /// Noisier than configured.
     Noise,
+    /// Two states of charge on the buses disagree.
+    ReportedSoc,
 }
 
 /// A line of the configuration to change.
@@ -92,6 +96,8 @@ pub struct Finding {
     pub changes: Vec<Change>,
     /// What to do in addition, or where no line of the configuration helps.
     pub advice: Option<String>,
+    /// Titles of findings that are probably its consequences, and are not reported by themselves.
+    pub consequences: Vec<String>,
 }
 
 /// Result of a diagnosis.
@@ -113,7 +119,8 @@ impl Finding {
     /// A finding without lines to change.
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
-        Self { severity, topic, title: title.into(), seen, why, changes: Vec::new(), advice: None }
+        let (changes, consequences) = (Vec::new(), Vec::new());
+        Self { severity, topic, title: title.into(), seen, why, changes, advice: None, consequences }
     }
 
     pub(super) fn seen(&mut self, seen: impl Into<String>) -> &mut Self {
@@ -151,6 +158,22 @@ impl Report {
         &mut self.findings[at]
     }
 
+    /// Moves further findings of a topic, and its consequences, below its first finding, by their titles. What the further
+    /// ones advise is added to its advice.
+    pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&Finding) -> bool) {
+        let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
+        let is_moved = |finding: &mut Finding| finding.topic == cause || is_consequence(finding);
+        let moved: Vec<Finding> = self.findings.extract_if(first + 1.., is_moved).collect();
+        let before: Vec<Finding> = self.findings.extract_if(..first, |finding| is_consequence(finding)).collect();
+        let Some(finding) = self.findings.iter_mut().find(|finding| finding.topic == cause) else { return };
+        for other in before.into_iter().chain(moved) {
+            let advice = other.advice.filter(|_| other.topic == cause);
+            finding.advice =
+                finding.advice.take().into_iter().chain(advice).reduce(|all, more| format!("{all}; {more}"));
+            finding.consequences.push(other.title);
+        }
+    }
+
     /// Whether there is an error or a warning.
     pub fn has_findings(&self) -> bool {
         self.findings.iter().any(|finding| finding.severity != Severity::Note)
@@ -160,6 +183,24 @@ impl Report {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn consequences_and_further_findings_of_a_cause_are_below_its_first() {
+        let mut report = Report::default();
+        let mut add = |topic, title: &str, advice: &str| {
+            report.add(Finding::new(Severity::Error, topic, title)).advice(advice);
+        };
+        add(Topic::Interface, "other", "");
+        add(Topic::CellCount, "count", "not this");
+        add(Topic::Layout, "cells", "a");
+        add(Topic::Layout, "current", "b");
+        add(Topic::Cell, "cell 4", "nor this");
+        report.fold(Topic::Layout, |finding| [Topic::CellCount, Topic::Cell].contains(&finding.topic));
+        let titles: Vec<&str> = report.findings.iter().map(|finding| finding.title.as_str()).collect();
+        assert_eq!(titles, ["other", "cells"]);
+        assert_eq!(report.findings[1].consequences, ["count", "current", "cell 4"]);
+        assert_eq!(report.findings[1].advice.as_deref(), Some("a; b"));
+    }
 
     #[test]
     fn findings_are_sorted_by_severity_then_cause_before_effect() {

@@ -8,6 +8,7 @@
 //!
 //! The largest steps and longest runs are kept: a choice by current or time alone does not bias the slope.
 
+use super::equal_cells::EqualCells;
 use super::series::median;
 use crate::quantity::Timestamp;
 
@@ -211,6 +212,15 @@ pub(crate) struct VoltageResponse {
     steps: Vec<CurrentStep>,
     pub(crate) runs: Vec<SteadyRun>,
     pub(crate) rests: Vec<SteadyRun>,
+    pub(crate) equal_cells: EqualCells,
+}
+
+/// The response whose slope is determined better.
+pub(crate) fn best_response([fast, slow]: &[VoltageResponse; 2]) -> &VoltageResponse {
+    let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
+    // The short blocks where they suffice: they contain the load and nothing slower.
+    let fast_certainty = certainty(fast);
+    if fast_certainty >= 1.0 || fast_certainty >= certainty(slow) { fast } else { slow }
 }
 
 impl VoltageResponse {
@@ -254,6 +264,7 @@ impl VoltageResponse {
         self.block.cells.iter_mut().for_each(|cell| *cell = (0.0, 0));
         let current_a = std::mem::take(&mut self.block.current_sum) / f64::from(self.block.readings.max(1));
         self.block.readings = 0;
+        self.equal_cells.push(&cells_v);
         let Some(voltage_v) = median(cells_v.iter().copied()) else { return };
         let mean = BlockMean { time: from, current_a, voltage_v, cells_v };
         let near = self.previous.take().filter(|before| (0.0..=MAX_GAP_S).contains(&mean.time.since(before.time)));
@@ -304,6 +315,11 @@ impl VoltageResponse {
         {
             *shortest = run;
         }
+    }
+
+    /// Time over which readings are averaged, s.
+    pub(crate) fn block_s(&self) -> f64 {
+        self.block_s
     }
 
     /// The pack's slope over the largest steps.

@@ -3,6 +3,7 @@
 //! In: payloads with their time. Values are in the program's unit after the configured scale and offset; no limit is
 //! applied. Memory is bounded: gaps and values are kept as a thinned sample.
 
+use super::loss::LossCounter;
 use crate::can::decode::Binding;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
 use crate::quantity::{Fault, Timestamp};
@@ -58,6 +59,11 @@ impl ThinnedSample {
         self.quantile(0.5)
     }
 
+    /// Share of the values with a property, 0 without a value.
+    pub(crate) fn share(&self, has: impl Fn(f64) -> bool) -> f64 {
+        self.values.iter().filter(|value| has(**value)).count() as f64 / self.values.len().max(1) as f64
+    }
+
     /// The 2 % and 98 % quantiles.
     pub(crate) fn bulk(&self) -> Option<(f64, f64)> {
         Some((self.quantile(0.02)?, self.quantile(0.98)?))
@@ -111,8 +117,13 @@ impl Extent {
 }
 
 /// Faults of a layout that are looked for, in the order of the alternatives.
-pub(crate) const LAYOUT_FAULTS: [&str; 3] =
-    ["wrong byte order", "signed and unsigned exchanged", "wrong byte order and sign of the number"];
+pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
+    "wrong byte order",
+    "signed and unsigned exchanged",
+    "wrong byte order and sign of the number",
+    "wrong byte order (the start bit is right)",
+    "wrong byte order and sign of the number (the start bit is right)",
+];
 
 /// The same bits read with another layout.
 #[derive(Debug, Clone)]
@@ -145,6 +156,7 @@ pub(crate) struct Series {
     pub(crate) values: ThinnedSample,
     /// Time between two readings, s.
     pub(crate) gaps: ThinnedSample,
+    pub(crate) loss: LossCounter,
     pub(crate) longest_gap_s: f64,
     /// Gaps above the age from which a reading is stale.
     pub(crate) stale_gaps: u64,
@@ -168,12 +180,7 @@ impl Series {
         let value = match self.value(payload, binding) {
             Ok(value) => value?,
             Err(fault) => {
-                let count = match fault {
-                    Fault::NotAvailable => &mut self.unusable.not_available,
-                    Fault::NotFinite => &mut self.unusable.not_finite,
-                    _ => &mut self.unusable.short,
-                };
-                *count += 1;
+                self.note_unusable(fault, payload, binding);
                 return None;
             }
         };
@@ -186,12 +193,30 @@ impl Series {
         self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
         self.extent.push(value);
         self.values.push(value);
+        self.read_otherwise(payload, binding);
+        Some(value)
+    }
+
+    fn note_unusable(&mut self, fault: Fault, payload: &[u8], binding: &Binding) {
+        let count = match fault {
+            Fault::NotAvailable => &mut self.unusable.not_available,
+            Fault::NotFinite => &mut self.unusable.not_finite,
+            _ => &mut self.unusable.short,
+        };
+        *count += 1;
+        // With another layout the payload may be long enough.
+        if fault == Fault::ShortFrame && binding.holds(payload) == Ok(true) {
+            self.read_otherwise(payload, binding);
+        }
+    }
+
+    /// Reads the bits with the other layouts.
+    fn read_otherwise(&mut self, payload: &[u8], binding: &Binding) {
         for other in &mut self.alternatives {
             if let Ok(physical) = other.plan.physical(payload) {
                 other.extent.push(physical * binding.scale + binding.offset);
             }
         }
-        Some(value)
     }
 
     /// The value without the DBC's range; `Ok(None)` = the payload does not carry the signal.
@@ -212,6 +237,7 @@ impl Series {
         let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
         if let Some(gap_s) = gap_s {
             self.gaps.push(gap_s);
+            self.loss.push(gap_s);
             self.longest_gap_s = self.longest_gap_s.max(gap_s);
             self.stale_gaps += u64::from(gap_s > max_age_s);
         }
@@ -259,13 +285,23 @@ fn alternatives(layout: &SignalLayout) -> Vec<AlternativeReading> {
         ValueType::Float32 | ValueType::Float64 => None,
     };
     let swapped = byte_swapped(layout);
-    let others = [swapped, other_sign(*layout), swapped.and_then(other_sign)];
+    let flipped = order_flipped(layout);
+    let others = [swapped, other_sign(*layout), swapped.and_then(other_sign), flipped, flipped.and_then(other_sign)];
     let reading = |(fault, layout): (&'static str, Option<SignalLayout>)| {
         // The stated range belongs to the stated layout.
         let plan = SignalLayout { minimum: 0.0, maximum: 0.0, ..layout? }.plan().ok()?;
         Some(AlternativeReading { fault, layout: layout?, plan, extent: Extent::default() })
     };
     LAYOUT_FAULTS.into_iter().zip(others).filter_map(reading).collect()
+}
+
+/// The same start bit with the other byte order: `@0` for `@1` in the DBC; `None` = the signal is within a byte.
+fn order_flipped(layout: &SignalLayout) -> Option<SignalLayout> {
+    let byte_order = match layout.byte_order {
+        ByteOrder::LittleEndian => ByteOrder::BigEndian,
+        ByteOrder::BigEndian => ByteOrder::LittleEndian,
+    };
+    (layout.length_bits > 8).then_some(SignalLayout { byte_order, ..*layout })
 }
 
 /// The same whole bytes in the other order; `None` = the signal does not fill whole bytes, or only one.

@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use super::other_current::OtherCurrent;
+use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan};
-use super::response::{BLOCKS_S, Slope, VoltageResponse};
+use super::response::{BLOCKS_S, Slope, VoltageResponse, best_response};
 use super::series::Series;
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
@@ -58,6 +60,14 @@ pub(crate) struct EstimatorStats {
     pub(crate) innovation_sum: f64,
 }
 
+/// A list of signals in the plan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum SignalList {
+    Configured,
+    MoreCells,
+    Beside,
+}
+
 /// Collects frames, events and estimates; [`Doctor::finish`] judges them.
 #[derive(Debug)]
 pub struct Doctor {
@@ -67,8 +77,12 @@ pub struct Doctor {
     pub(crate) series: Vec<Series>,
     /// As `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
-    /// Indices into `series` (`false`) or `more_cells` (`true`) by message.
-    by_id: BTreeMap<(BusIndex, CanId), Vec<(bool, usize)>>,
+    /// As `plan.beside`.
+    pub(crate) beside: Vec<Series>,
+    /// Signals by message.
+    by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
+    /// The current's message on other interfaces.
+    pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
     /// Over short and long blocks.
@@ -86,23 +100,29 @@ pub struct Doctor {
 impl Doctor {
     /// A doctor without any frame.
     pub fn new(plan: Plan) -> Self {
-        let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(bool, usize)>> = BTreeMap::new();
-        for (is_more, list) in [(false, &plan.signals), (true, &plan.more_cells)] {
+        let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>> = BTreeMap::new();
+        let lists = [
+            (SignalList::Configured, &plan.signals),
+            (SignalList::MoreCells, &plan.more_cells),
+            (SignalList::Beside, &plan.beside),
+        ];
+        for (name, list) in lists {
             // In the order of channels: the current of a frame before its voltages.
             let mut order: Vec<usize> = (0..list.len()).collect();
             order.sort_by_key(|&index| list[index].binding.channel);
             for index in order {
-                by_id.entry((list[index].binding.bus, list[index].binding.id)).or_default().push((is_more, index));
+                by_id.entry((list[index].binding.bus, list[index].binding.id)).or_default().push((name, index));
             }
         }
-        let cells = if plan.pack.is_total { 1 } else { usize::from(plan.pack.cells) };
-        let tolerance_a = 0.01 * (plan.pack.capacity_ah * f64::from(plan.pack.strings.max(1)));
+        let (cells, tolerance_a) = response_settings(&plan);
         let bus = |interface: &InterfacePlan| BusStats { name: interface.name.clone(), ..BusStats::default() };
         let signals = plan.signals.iter();
         Self {
             buses: plan.interfaces.iter().map(bus).collect(),
             series: signals.map(|s| Series::new(&s.layout, plan.plausible(s.binding.channel))).collect(),
             more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
+            beside: plan.beside.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
+            other_currents: BTreeMap::new(),
             by_id,
             guards: Guards::new(plan.guards.clone()),
             protected: BTreeMap::new(),
@@ -136,7 +156,20 @@ impl Doctor {
         if frame.kind() != FrameKind::Remote {
             self.check_protection(time, bus, frame);
             self.read(time, bus, frame);
+            self.read_other_current(time, bus, frame);
         }
+    }
+
+    /// Reads the configured current's message where it comes on another interface.
+    fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
+        let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
+        if signal.binding.id != frame.id() || signal.binding.bus == bus {
+            return;
+        }
+        let (cells, tolerance_a) = response_settings(&self.plan);
+        let new = || OtherCurrent::new(&signal.layout, cells, tolerance_a);
+        self.other_currents.entry(bus).or_insert_with(new).handle(time, frame.data(), &signal.binding);
     }
 
     fn check_protection(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
@@ -152,35 +185,42 @@ impl Doctor {
     }
 
     fn read(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let Self { plan, series, more_cells, by_id, responses, .. } = self;
+        let Self { plan, series, more_cells, beside, by_id, responses, other_currents, .. } = self;
         let cells = f64::from(plan.pack.cells.max(1));
-        for &(is_more, index) in by_id.get(&(bus, frame.id())).into_iter().flatten() {
-            if is_more {
-                more_cells[index].handle(time, frame.data(), &plan.more_cells[index].binding, f64::INFINITY);
-                continue;
-            }
-            let binding = &plan.signals[index].binding;
-            let max_age_s = plan.max_age_s(binding.channel);
-            let Some(value) = series[index].handle(time, frame.data(), binding, max_age_s) else { continue };
-            for response in responses.iter_mut() {
-                match binding.channel {
-                    Channel::Current => response.handle_current(time, value),
-                    Channel::PackVoltage => response.handle_voltage(time, 0, value / cells),
-                    Channel::CellVoltage(cell) => response.handle_voltage(time, cell.index(), value),
-                    Channel::Temperature(_)
-                    | Channel::ReportedSoc
-                    | Channel::ReportedSoh
-                    | Channel::SupplyVoltage
-                    | Channel::PackIdentity
-                    | Channel::Contactor => {}
+        for &(list, index) in by_id.get(&(bus, frame.id())).into_iter().flatten() {
+            let (signals, series) = match list {
+                SignalList::Configured => (&plan.signals, &mut *series),
+                SignalList::MoreCells => (&plan.more_cells, &mut *more_cells),
+                SignalList::Beside => (&plan.beside, &mut *beside),
+            };
+            let binding = &signals[index].binding;
+            let is_configured = list == SignalList::Configured;
+            let max_age_s = if is_configured { plan.max_age_s(binding.channel) } else { f64::INFINITY };
+            let value = series[index].handle(time, frame.data(), binding, max_age_s);
+            let Some(value) = value.filter(|_| is_configured) else { continue };
+            let (cell, voltage_v) = match binding.channel {
+                Channel::Current => {
+                    responses.iter_mut().for_each(|response| response.handle_current(time, value));
+                    continue;
                 }
-            }
+                Channel::PackVoltage => (0, value / cells),
+                Channel::CellVoltage(cell) => (cell.index(), value),
+                Channel::Temperature(_)
+                | Channel::ReportedSoc
+                | Channel::ReportedSoh
+                | Channel::SupplyVoltage
+                | Channel::PackIdentity
+                | Channel::Contactor => continue,
+            };
+            let others = other_currents.values_mut().flat_map(OtherCurrent::responses_mut);
+            responses.iter_mut().chain(others).for_each(|response| response.handle_voltage(time, cell, voltage_v));
         }
     }
 
     /// Ends the blocks and runs of both responses.
     pub(super) fn end_blocks(&mut self) {
         self.responses.iter_mut().for_each(VoltageResponse::pause);
+        self.other_currents.values_mut().for_each(OtherCurrent::pause);
     }
 
     /// The response over short blocks.
@@ -190,20 +230,22 @@ impl Doctor {
 
     /// Slope of the pack's voltage over its current, from the blocks that determine it best.
     pub(super) fn slope(&self) -> Option<Slope> {
-        self.best_response().slope()
+        best_response(&self.responses).slope()
     }
 
     /// The slope of one cell, from the same blocks.
     pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
-        self.best_response().slope_of(cell)
+        best_response(&self.responses).slope_of(cell)
     }
 
-    fn best_response(&self) -> &VoltageResponse {
-        let [fast, slow] = &self.responses;
-        let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
-        // The short blocks where they suffice: they contain the load and nothing slower.
-        let fast_certainty = certainty(fast);
-        if fast_certainty >= 1.0 || fast_certainty >= certainty(slow) { fast } else { slow }
+    /// Length of those blocks, s.
+    pub(super) fn slope_block_s(&self) -> f64 {
+        best_response(&self.responses).block_s()
+    }
+
+    /// The responses over short and long blocks.
+    pub(super) fn responses(&self) -> &[VoltageResponse; 2] {
+        &self.responses
     }
 
     fn note_time(&mut self, time: Timestamp) {
@@ -219,7 +261,8 @@ impl Doctor {
 
     /// Takes a time of unknown length without listening.
     pub fn handle_gap(&mut self) {
-        self.series.iter_mut().chain(&mut self.more_cells).for_each(Series::pause);
+        let Self { series, more_cells, beside, .. } = self;
+        series.iter_mut().chain(more_cells).chain(beside).for_each(Series::pause);
         self.end_blocks();
         self.guards.restart();
     }
@@ -263,4 +306,10 @@ impl Doctor {
     pub fn frames(&self) -> u64 {
         self.frames
     }
+}
+
+/// Cells with a voltage of their own, and the change of the current that is no change of load, A.
+fn response_settings(plan: &Plan) -> (usize, f64) {
+    let cells = if plan.pack.is_total { 1 } else { usize::from(plan.pack.cells) };
+    (cells, 0.01 * (plan.pack.capacity_ah * f64::from(plan.pack.strings.max(1))))
 }

@@ -45,20 +45,6 @@ fn interfaces(raw: &RawTables, faults: &mut Faults) {
             interface.place.fault(faults, "name", &what);
         }
     }
-    if !raw.has_all_interfaces() {
-        return;
-    }
-    let signals = raw.sources().map(|(_, source)| (source.interface, source.place));
-    let protected = raw.protected.iter().map(|protected| (protected.interface.as_deref(), &protected.place));
-    for (interface, place) in signals.chain(protected) {
-        match interface {
-            Some(name) => known_interface(name, place, "interface", raw, faults),
-            None if raw.interfaces.len() > 1 => {
-                place.fault(faults, "interface", &format!("must be {}", raw.interface_names()));
-            }
-            None => {}
-        }
-    }
 }
 
 fn known_interface(name: &str, place: &TablePlace, key: &str, raw: &RawTables, faults: &mut Faults) {

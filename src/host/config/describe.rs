@@ -18,6 +18,8 @@ use crate::sample::VoltageSource;
 pub struct Description {
     /// The configuration file.
     pub file: String,
+    /// What is allowed and unlikely, one line each.
+    pub warnings: Vec<String>,
     /// The cell model.
     pub cell: String,
     /// Assumptions about the pack, in sentences.
@@ -134,6 +136,7 @@ pub(super) fn describe(
     );
     Description {
         file: config.path.display().to_string(),
+        warnings: config.warnings.clone(),
         cell,
         pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),

@@ -13,10 +13,11 @@ const MAX_QUOTE: usize = 48;
 /// Faults of syntax listed one by one; a file with more is of another kind.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
-/// Faults found so far, in files of any kind.
+/// Faults and warnings found so far, in files of any kind.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     list: Vec<(String, usize, String)>,
+    warnings: Vec<(String, usize, String)>,
 }
 
 impl Faults {
@@ -25,6 +26,14 @@ impl Faults {
         let fault = (file.to_owned(), line, text.into());
         if !self.list.contains(&fault) {
             self.list.push(fault);
+        }
+    }
+
+    /// Notes what is unlikely and may be meant; it does not make the configuration bad.
+    fn warn(&mut self, file: &str, line: usize, text: String) {
+        let warning = (file.to_owned(), line, text);
+        if !self.warnings.contains(&warning) {
+            self.warnings.push(warning);
         }
     }
 
@@ -38,15 +47,24 @@ impl Faults {
         self.list.is_empty()
     }
 
-    /// One line each: the files in the order in which they first failed, each by line.
+    /// The faults, one line each: the files in the order in which they first failed, each by line.
     pub(crate) fn into_lines(self) -> Vec<String> {
+        Self::lines(&self.list)
+    }
+
+    /// The warnings, in the same form.
+    pub(crate) fn warning_lines(&self) -> Vec<String> {
+        Self::lines(&self.warnings)
+    }
+
+    fn lines(list: &[(String, usize, String)]) -> Vec<String> {
         let mut files: Vec<&str> = Vec::new();
-        for (file, _, _) in &self.list {
+        for (file, _, _) in list {
             if !files.contains(&file.as_str()) {
                 files.push(file);
             }
         }
-        let mut sorted: Vec<_> = self.list.iter().collect();
+        let mut sorted: Vec<_> = list.iter().collect();
         sorted.sort_by_key(|(file, line, _)| (files.iter().position(|f| f == file), *line));
         let show = |(file, line, text): &&(String, usize, String)| match line {
             0 => format!("{file}: {text}"),
@@ -187,12 +205,20 @@ impl TablePlace {
 
     /// Notes `KEY = FOUND, WHAT`.
     pub(crate) fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
+        faults.add(&self.file, self.line_of(key), self.sentence(key, what));
+    }
+
+    /// Notes `KEY = FOUND, WHAT` as a warning.
+    pub(crate) fn warn(&self, faults: &mut Faults, key: &str, what: &str) {
+        faults.warn(&self.file, self.line_of(key), self.sentence(key, what));
+    }
+
+    fn sentence(&self, key: &str, what: &str) -> String {
         let name = self.key(key);
-        let text = match self.spots.get(key) {
+        match self.spots.get(key) {
             Some(spot) => format!("{name} = {}, {what}", spot.found),
             None => format!("{name} is not set, {what}"),
-        };
-        faults.add(&self.file, self.line_of(key), text);
+        }
     }
 
     /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.

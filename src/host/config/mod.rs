@@ -12,6 +12,7 @@
 //! | `tables` | every table of the file |
 //! | `resolve`, `pattern` | signals looked up in the DBC files |
 //! | `cross`, `alarm`, `output`, `commands`, `j1939`, `protect` | what concerns several keys |
+//! | `input_tables`, `plausible` | faulty tables checked as far as they go; what cannot be meant |
 //! | `convert` | the settings of the core |
 //! | `cell_model` | cell model files, by the same mechanism |
 //! | `describe`, `reference`, `manual` | the configuration in words |
@@ -41,12 +42,14 @@ mod cross;
 mod describe;
 mod diagnostic;
 mod document;
+mod input_tables;
 mod j1939;
 mod keys;
 mod manual;
 mod output;
 mod partial;
 mod pattern;
+mod plausible;
 mod protect;
 mod reference;
 mod resolve;
@@ -81,6 +84,8 @@ pub struct Config {
     pub output_layout: Option<Database>,
     /// How state and history are kept.
     pub store: StoreConfig,
+    /// What is allowed and unlikely, one line each, in the form of the faults.
+    pub warnings: Vec<String>,
 }
 
 impl Config {
@@ -158,10 +163,17 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let raw = RawTables::read(&document, faults);
     let model = read_model(path, &document, read, faults);
     cross::check(&raw, model.as_ref(), faults);
+    input_tables::interfaces(&document, &raw, faults);
+    plausible::rated_capacity(&raw, model.as_ref(), faults);
     let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
+    if let Some(databases) = &databases {
+        input_tables::signals(&document, &raw, databases, faults);
+    }
+    plausible::signals(&raw, &found, model.as_ref(), faults);
+    plausible::ranges(&raw, &found, model.as_ref(), faults);
     let checks = &mut Checks { raw: &raw, found: &found, faults };
     let mut guards = protect::guards(checks, inputs_whole);
     let laid_out = output::output(checks, path, model.as_ref(), read);
@@ -184,7 +196,8 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
-    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };
+    let warnings = faults.warning_lines();
+    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store, warnings };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
 }

@@ -142,6 +142,13 @@ pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
     search.found
 }
 
+/// Notes a signal that is in none of the files.
+pub(super) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>, faults: &mut Faults) {
+    if !databases.signals().any(|signal| signal.is_named(source.signal)) {
+        Search { raw, databases, faults, found: Vec::new() }.not_found(source);
+    }
+}
+
 /// Factor from the bus's sign of the current to ours.
 fn current_sign(raw: &RawTables) -> f64 {
     match raw.current.as_ref().map(|keys| keys.positive) {
@@ -224,9 +231,6 @@ impl<'d> Search<'_, 'd> {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = named.full_name();
-        if let Err(error) = Binding::new(bus, message, signal, channel) {
-            source.place.fault(self.faults, "signal", &format!("{full_name} in {file} cannot be read: {error}"));
-        }
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
         if message.len_bytes > 8 && !fd && answer.is_none() {
             let what = format!(

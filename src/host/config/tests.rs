@@ -11,6 +11,7 @@ mod alarms;
 mod cell_model;
 mod diagnostic;
 mod j1939;
+mod plausible;
 mod protect;
 
 use super::*;
@@ -225,8 +226,9 @@ fn an_own_output_dbc_is_not_moved_for_a_longer_header() {
 
 #[test]
 fn steps_in_ah_are_those_of_the_configured_cell() {
-    let pack = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 100");
-    let layout = good(&format!("{pack}[output]\n")).output_layout.unwrap();
+    let cell = CELL.replace("rated_capacity_ah = 2.0", "rated_capacity_ah = 100.0");
+    let (config, _) = read_texts(&format!("{PACK}[output]\n"), &cell, DBC).unwrap();
+    let layout = config.output_layout.unwrap();
     assert_eq!(layout.signal("PACKWATCH_Alarm.Value_CapacityLow").unwrap().1.layout.factor, 0.05);
 }
 
@@ -326,9 +328,9 @@ fn single_faults_of_signals_name_what_the_dbc_has() {
             "pack.toml:9: input.current.signal = \"Long.Current\", message Long has 12 bytes, must have fd = true on its interface",
         ),
         (
-            "Status.Current",
-            "Status.Temperature",
-            "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", must not be used twice, is also pack current",
+            "Status.Temperature\"",
+            "Status.Current\"\nscale = 1.0",
+            "pack.toml:14: input.temperature[1].signal = \"Status.Current\", must not be used twice, is also pack current",
         ),
         (
             "CellVoltage{n}",

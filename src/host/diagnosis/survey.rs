@@ -3,6 +3,8 @@
 //! In: the configuration file. Out: the plan, every fault as [`config::load`](crate::config::load) reports it, and where
 //! each key stands. A configuration of which no signal can be found in a DBC file is refused.
 
+mod beside;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -63,7 +65,9 @@ pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
 fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     let PartialConfig { config, raw, model, databases, .. } = partial;
     let (pack, config, model) = (raw.pack.as_ref(), config.as_ref(), model.as_ref());
-    let signals: Vec<SignalPlan> = found.iter().filter_map(|resolved| signal(raw, resolved)).collect();
+    // The doctor reads frames, not the answers that several of them make.
+    let in_frames: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.answer.is_none()).cloned().collect();
+    let signals: Vec<SignalPlan> = in_frames.iter().filter_map(|resolved| signal(raw, resolved)).collect();
     let strings = pack.map_or(1, |pack| pack.strings);
     let pack_ah = model.map_or(USUAL_AH, |model| model.rated_capacity_ah) * f64::from(strings);
     let pack_plan = PackPlan {
@@ -79,8 +83,10 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     Plan {
         interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
         more_cells: more_cells(raw, databases),
-        messages: messages(found, &signals),
+        beside: beside::signals(raw, databases, found),
+        messages: messages(&in_frames, &signals),
         signals,
+        diagnostic_inputs: found.len() - in_frames.len(),
         pack: pack_plan,
         limits: config.map(limits).unwrap_or_default(),
         max_ages_s: max_ages_s(raw),

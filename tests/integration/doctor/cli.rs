@@ -79,3 +79,19 @@ fn a_part_of_a_log_is_judged_and_another_interface_named() {
     assert_eq!(status, 0, "{page}");
     assert!(page.contains(": 20 s, "), "{page}");
 }
+
+#[test]
+fn a_wrong_byte_order_comes_first_and_the_rest_is_below_it() {
+    let mut broken = Broken::of(Bench::Pack96, 1);
+    broken.dbc("|16@1", "|16@0");
+    let (status, page, _) = doctor(&broken, &[]);
+    let first = page.lines().find(|line| line.starts_with("ERROR")).unwrap();
+    assert!(first.contains("cell voltages: wrong byte order"), "{page}");
+    assert_eq!((status, page.matches("ERROR").count()), (78, 2), "{page}");
+    assert!(page.contains("ends in byte 9") || page.contains("end in byte 9"), "{page}");
+    assert!(page.lines().count() < 60, "{page}");
+    for below in ["temperatures: wrong byte order", "16|16@1+; in the DBC: "] {
+        let words = page.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(words.contains(below), "{below}: {page}");
+    }
+}

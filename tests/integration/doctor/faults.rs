@@ -17,7 +17,7 @@ pub(crate) struct Fault {
     pub(crate) seeds: u64,
 }
 
-const fn fault(
+pub(crate) const fn fault(
     name: &'static str,
     breaks: fn(&mut Broken),
     expected: &'static [Topic],

@@ -7,9 +7,11 @@
 mod bench;
 mod cli;
 mod faults;
+mod missed;
 
 use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
+use missed::MISSED;
 use packwatch::doctor::{Report, Severity, Topic};
 
 /// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
@@ -49,6 +51,15 @@ fn nothing_is_found_on_healthy_packs() {
             if !found.is_empty() {
                 wrong.push(format!("{bench:?} seed {seed}: {}", found.join("; ")));
             }
+        }
+    }
+    for (name, change) in missed::HEALTHY {
+        let mut broken = Broken::of(Bench::Pack12, first_seed());
+        change(&mut broken);
+        let found = findings(&broken.report());
+        logs += 1;
+        if !found.is_empty() {
+            wrong.push(format!("{name}: {}", found.join("; ")));
         }
     }
     eprintln!("{logs} healthy logs, {} with a finding", wrong.len());
@@ -117,7 +128,7 @@ fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
 #[test]
 fn each_fault_made_on_purpose_is_found_first() {
     let mut tally = Tally::default();
-    for fault in FAULTS {
+    for fault in FAULTS.iter().chain(MISSED) {
         for bench in fault.benches {
             for seed in first_seed()..first_seed() + fault.seeds {
                 try_fault(fault, *bench, seed, &mut tally);
@@ -127,11 +138,28 @@ fn each_fault_made_on_purpose_is_found_first() {
     let all = tally.first + tally.later + tally.missed;
     eprintln!(
         "{all} broken cases of {} faults: {} named first, {} named after another, {} missed",
-        FAULTS.len(),
+        FAULTS.len() + MISSED.len(),
         tally.first,
         tally.later,
         tally.missed
     );
     assert!(tally.reported.is_empty(), "{}", tally.reported.join("\n"));
     assert!(all >= 200, "only {all} cases");
+}
+
+#[test]
+fn inputs_in_diagnostic_answers_are_not_judged_and_that_is_said() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.config("\"CellVoltages.CellVoltage{n}\"", "\"Car.Cell{n}\"");
+    broken.config.push_str(
+        "\n[[input.diagnostic]]\nname = \"Car\"\nrequest = 0x7E4\nresponse = 0x7EC\nservice = 0x22\nidentifier = 1\n\
+         signals = [{ name = \"Cell{n}\", numbers = \"1-12\", bit = 32, length = 16, factor = 0.0001 }]\n",
+    );
+    let report = broken.report();
+    assert!(findings(&report).is_empty(), "{:?}", findings(&report));
+    assert!(
+        report.unjudged.iter().any(|line| line.starts_with("12 inputs in diagnostic answers")),
+        "{:?}",
+        report.unjudged
+    );
 }

@@ -129,3 +129,15 @@ fn any_text_never_panics() {
         let _ = Database::parse(bad);
     }
 }
+
+#[test]
+fn a_byte_order_mark_of_utf_8_is_read_over_and_utf_16_is_refused() {
+    let text = format!("{HEAD}BO_ 256 M: 8 X\n SG_ T : 0|8@1+ (1,0) [0|0] \"\u{b0}C\" X\n");
+    let marked = |bytes: Vec<u8>| Database::parse_bytes(&[b"\xEF\xBB\xBF", bytes.as_slice()].concat());
+    let unit = |read: Result<Database, DbcError>| read.unwrap().signal("M.T").unwrap().1.unit.clone();
+    let latin_1 = text.chars().map(|c| u8::try_from(u32::from(c)).unwrap()).collect();
+    assert_eq!((unit(marked(text.clone().into_bytes())), unit(marked(latin_1))), ("\u{b0}C".into(), "\u{b0}C".into()));
+    let utf_16: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
+    let error = Database::parse_bytes(&utf_16).unwrap_err();
+    assert!(error.line == 1 && error.what.starts_with("is UTF-16 text"), "{error}");
+}

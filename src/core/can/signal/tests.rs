@@ -261,3 +261,26 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn bits_are_shared_whatever_the_byte_order() {
+    let layout = |start_bit, length_bits, byte_order| SignalLayout {
+        start_bit,
+        length_bits,
+        byte_order,
+        value_type: ValueType::Signed,
+        factor: -0.5,
+        offset: 1.0,
+        minimum: 0.0,
+        maximum: 0.0,
+    };
+    let little = layout(4, 8, ByteOrder::LittleEndian);
+    // Bits 11 to 8 and 23 to 20.
+    let big = layout(11, 8, ByteOrder::BigEndian);
+    assert!(little.overlaps(&big) && big.overlaps(&little));
+    assert!(
+        !layout(12, 8, ByteOrder::LittleEndian).overlaps(&big) && layout(20, 4, ByteOrder::LittleEndian).overlaps(&big)
+    );
+    assert_eq!((little.end_byte(), big.end_byte()), (2, 3));
+    assert_eq!(little.extent(), (-62.5, 65.0));
+}

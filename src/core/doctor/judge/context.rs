@@ -33,6 +33,8 @@ pub(super) struct Judge<'d> {
     pub(super) current_factor: f64,
     /// A current or voltage is not the configured quantity: how voltages follow the current cannot be judged.
     pub(super) is_mixed_up: bool,
+    /// Quantities whose bits the DBC places wrongly.
+    pub(super) wrong_layouts: Vec<Kind>,
 }
 
 /// Adds an error; its texts follow.
@@ -71,6 +73,7 @@ impl<'d> Judge<'d> {
             voltage_factor: 1.0,
             current_factor: 1.0,
             is_mixed_up: false,
+            wrong_layouts: Vec::new(),
         }
     }
 
@@ -129,12 +132,33 @@ impl<'d> Judge<'d> {
         median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
     }
 
-    /// The model's resistance for a step of about a second and for one that has settled, ohm.
-    pub(super) fn model_ohm(&self, model: &CellModel) -> (f64, f64) {
+    /// The model's resistance over the SOC and temperatures of the log, ohm: the lowest at once, the highest at the end of a
+    /// block of `block_s` after a step.
+    pub(super) fn model_ohm(&self, model: &CellModel, block_s: f64) -> (f64, f64) {
+        let spread = |kind, per: f64, middle: f64| {
+            let at = |q| self.median_of(kind, |series| series.values.quantile(q)).map_or(middle, |value| value * per);
+            [0.1, 0.5, 0.9].map(at)
+        };
+        let voltages_v = spread(Kind::Voltage, self.voltage_factor / self.cells_per_reading(), f64::NAN);
+        let middle_c = self.temperature_c();
+        let temperatures_c =
+            spread(Kind::Temperature, 1.0, middle_c).map(|c| c.clamp(middle_c - 15.0, middle_c + 15.0));
+        let places = voltages_v.into_iter().flat_map(|v| temperatures_c.map(|c| (model.soc_of_ocv(v, c), c)));
+        let places = places.map(|(soc, c)| model.grid_position(soc.clamp(0.05, 0.95), c));
+        places.fold((f64::INFINITY, 0.0_f64), |(low, high), place| {
+            let branch = |i| model.branch_r_ohm(i, &place) * -(-block_s / model.branch_tau_s(i, &place)).exp_m1();
+            let r0_ohm = model.r0_ohm(&place);
+            let slow_ohm = (0..model.branches.len()).map(branch).sum::<f64>() + r0_ohm;
+            (low.min(r0_ohm), high.max(slow_ohm))
+        })
+    }
+
+    /// The model's resistance once every branch has settled, at the middle of the log, ohm.
+    pub(super) fn settled_ohm(&self, model: &CellModel) -> f64 {
         let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
         let temperature_c = self.temperature_c();
-        let place = model.grid_position(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.05, 0.95), temperature_c);
-        (model.r0_ohm(&place), model.settled_ohm(&place))
+        let soc = model.soc_of_ocv(voltage_v, temperature_c).clamp(0.05, 0.95);
+        model.settled_ohm(&model.grid_position(soc, temperature_c))
     }
 
     pub(super) fn bus(&self, bus: BusIndex) -> Option<&'d BusStats> {

@@ -57,7 +57,7 @@ impl Drift {
 fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &SteadyRun) -> f64 {
     let temperature_c = judge.temperature_c();
     let cell_a = run.current_a * judge.current_factor / f64::from(judge.plan.pack.strings.max(1));
-    let (_, settled) = judge.model_ohm(model);
+    let settled = judge.settled_ohm(model);
     let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
     let moved = -cell_a * run.seconds / 3600.0 / judge.plan.pack.capacity_ah;
     let end = model.grid_position((soc + moved).clamp(0.0, 1.0), temperature_c);

@@ -15,6 +15,8 @@ const SMALLEST_STEP: f64 = 0.02;
 const UNIT_RATIO: f64 = 6.0;
 /// A resistance this many times the model's is a finding.
 const ODD_RATIO: f64 = 2.5;
+/// The same where several strings are configured and fewer would explain it.
+const FEWER_STRINGS_RATIO: f64 = 2.0;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     if judge.doctor.frames == 0 || judge.is_mixed_up {
@@ -95,35 +97,48 @@ fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str)
 
 fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     let Some(model) = &judge.plan.pack.model else { return };
-    let (fast, settled) = judge.model_ohm(model);
+    let (fast, slow) = judge.model_ohm(model, judge.doctor.slope_block_s());
     let ohm = slope.ohm.abs();
-    let is_large = slope.largest_a >= SMALLEST_STEP * judge.pack_ah() || ohm > settled;
+    let is_large = slope.largest_a >= SMALLEST_STEP * judge.pack_ah() || ohm > slow;
     if slope.r2 < EXPLAINED || !is_large {
         judge.unjudged("resistance: the steps of the current are small against the noise; drive for a minute");
         return;
     }
-    let (measured, from, to, points) = (milli(ohm), milli(fast), milli(settled), slope.points);
+    let (measured, from, to, points) = (milli(ohm), milli(fast), milli(slow), slope.points);
     let seen = format!(
         "a cell's voltage moves {measured} mV per ampere over {points} steps; the model says {from} to {to} at {} degrees C",
         number(judge.temperature_c())
     );
-    let (ratio, direction, why) = if ohm > settled {
-        (ohm / settled, "higher", "another cell, an old or very cold one, or cells in parallel counted wrongly")
+    let (ratio, direction, why) = if ohm > slow {
+        (ohm / slow, "higher", "another cell, an old or very cold one, or cells in parallel counted wrongly")
     } else {
         (fast / ohm, "lower", "another cell, or several in parallel behind one voltage tap")
     };
+    let configured = judge.plan.pack.strings;
+    let strings = likely_strings(configured, ohm, (fast, slow));
     if ratio >= UNIT_RATIO {
-        current_unit(judge, seen, power_of_ten(ohm / (fast * settled).sqrt()), ratio);
-    } else if ratio >= ODD_RATIO {
+        current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
+    } else if ratio >= ODD_RATIO || ratio >= FEWER_STRINGS_RATIO && strings.is_some_and(|n| n < configured) {
         let title = format!("resistance {} times {direction} than the cell model's", number(ratio));
-        warning(judge, Topic::CellModel, title)
-            .seen(seen)
-            .why(why)
-            .change_cell_model()
-            .advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
+        let finding = warning(judge, Topic::CellModel, title).seen(seen).why(why);
+        if let Some(strings) = strings {
+            finding.change("pack", "strings", strings.to_string());
+        }
+        finding.change_cell_model().advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
     } else if slope.ohm > 0.0 {
         judge.fine(format!("the resistance is of the right size: {seen}"));
     }
+}
+
+/// Another number of parallel strings with which the resistance is the model's.
+fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
+    /// A cell's resistance differs from its model's by less than this factor.
+    const LIKE: f64 = 1.3;
+    let by_string = ohm / f64::from(configured);
+    // At most ODD_RATIO x 1024.
+    let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
+    let is_like = (fast / LIKE..=slow * LIKE).contains(&(by_string * f64::from(strings)));
+    (is_like && strings != configured).then_some(strings)
 }
 
 fn power_of_ten(ratio: f64) -> f64 {
@@ -133,8 +148,8 @@ fn power_of_ten(ratio: f64) -> f64 {
 /// The power of ten by which the current is off, by its steps; `None` = unknown, or 1.
 pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
     let slope = cell_slope(judge)?;
-    let (fast, settled) = judge.model_ohm(judge.plan.pack.model.as_ref()?);
-    let factor = power_of_ten(slope.ohm.abs() / (fast * settled).sqrt());
+    let (fast, slow) = judge.model_ohm(judge.plan.pack.model.as_ref()?, judge.doctor.slope_block_s());
+    let factor = power_of_ten(slope.ohm.abs() / (fast * slow).sqrt());
     (slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED && factor != 1.0).then_some(factor)
 }
 

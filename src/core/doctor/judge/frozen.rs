@@ -1,8 +1,8 @@
-//! Signals that stand still while others move, and cells that respond unlike the others.
+//! Signals that stand still while others move, cells that respond unlike the others, and cells with one voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::words::{channels, count, milli, number, ranges};
-use crate::doctor::plan::Kind;
+use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::Topic;
 use crate::doctor::response::Slope;
 use crate::doctor::series::Series;
@@ -55,6 +55,43 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
         .seen(format!("{} is {value} A in all of {readings}, while the cells step by up to {step} mV", signal.name))
         .why("only a current moves voltages this fast")
         .change(&signal.table, "signal", "the signal of the current that is measured");
+}
+
+/// Cells with the voltage of another cell: by their bits, and by their values.
+pub(super) fn check_equal(judge: &mut Judge<'_>) {
+    /// Blocks in which cells must have moved: neighbours of coarse resolution agree for a while.
+    const FEWEST_BLOCKS: u32 = 25;
+    let voltages = judge.signals(Kind::Voltage);
+    let mut reported: Vec<Channel> = Vec::new();
+    for (index, (signal, _)) in voltages.iter().enumerate() {
+        let reads_same_bits = |other: &&SignalPlan| {
+            let (a, b) = (&signal.binding, &other.binding);
+            (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux) && signal.layout.overlaps(&other.layout)
+        };
+        let Some(other) = voltages[..index].iter().map(|(other, _)| *other).find(reads_same_bits) else { continue };
+        let pair = [other.binding.channel, signal.binding.channel];
+        reported.extend(pair);
+        error(judge, Topic::Swapped, format!("{} read the same bits", channels(&pair)))
+            .seen(format!("{} and {} share bits of one message in the DBC", other.name, signal.name))
+            .why("two cells have a voltage each")
+            .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
+            .advice("compare the start bits in the DBC with the sender's documentation");
+    }
+    let [fast, slow] = judge.doctor.responses().each_ref().map(|response| response.equal_cells.groups(FEWEST_BLOCKS));
+    for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
+        let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));
+        let members: Vec<_> = voltages.iter().filter(is_member).collect();
+        let list: Vec<Channel> = members.iter().map(|(signal, _)| signal.binding.channel).collect();
+        let [first, second, ..] = members[..] else { continue };
+        if list.iter().all(|channel| reported.contains(channel)) {
+            continue;
+        }
+        error(judge, Topic::Swapped, format!("{} always have the same voltage", channels(&list)))
+            .seen(format!("{} and {} moved {blocks} times, each time to the same value", first.0.name, second.0.name))
+            .why("two cells in series differ in some digit: one value stands in the place of both")
+            .change(&first.0.table, "signal", "a pattern that gives each cell its own signal")
+            .advice("compare the signals in the DBC, and the sender's list of cells");
+    }
 }
 
 /// Cells with a voltage that does not follow the current as the others do.

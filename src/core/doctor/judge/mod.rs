@@ -3,22 +3,26 @@
 //! | file | checks |
 //! | --- | --- |
 //! | `bus` | interfaces, identifiers, error frames, foreign senders, end-to-end protection |
+//! | `other_bus` | the current's message on two interfaces |
+//! | `beside` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
 //! | `swapped` | one signal in another's place |
 //! | `values` | units, byte order, limits |
-//! | `frozen` | signals that stand still, cells that respond unlike the others |
+//! | `frozen` | signals that stand still, cells that respond unlike the others or have one voltage |
 //! | `electrical` | sign of the current, resistance (from steps, or from the `drift` of steady runs) |
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
 //!
 //! All share `context`. A factor found in `values` is applied before `electrical` runs.
 
+mod beside;
 mod bus;
 mod context;
 mod drift;
 mod electrical;
 mod frozen;
 mod model;
+mod other_bus;
 mod presence;
 mod swapped;
 mod timing;
@@ -26,7 +30,8 @@ mod unit;
 mod values;
 mod words;
 
-use super::report::Report;
+use super::plan::Kind;
+use super::report::{Finding, Report, Topic};
 use super::watch::Doctor;
 use context::Judge;
 
@@ -40,16 +45,47 @@ impl Doctor {
         let mut judge = Judge::new(&self);
         bus::check(&mut judge);
         presence::check(&mut judge);
+        other_bus::check(&mut judge);
         swapped::check(&mut judge);
         values::check(&mut judge);
+        swapped::check_odd(&mut judge);
+        frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
         electrical::check(&mut judge);
+        beside::check(&mut judge);
         timing::check(&mut judge);
+        if self.plan.diagnostic_inputs > 0 {
+            let inputs = words::count(self.plan.diagnostic_inputs as u64, "input");
+            judge.unjudged(format!("{inputs} in diagnostic answers: the doctor reads the signals of frames only"));
+        }
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < SHORT_S {
             let span = words::seconds(awake_s);
             judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));
         }
+        fold(&mut judge);
         judge.report
+    }
+}
+
+/// Puts the consequences of a wrong layout below its finding.
+fn fold(judge: &mut Judge<'_>) {
+    const OF_VALUES: [Topic; 8] = [
+        Topic::CellCount,
+        Topic::Swapped,
+        Topic::Unit,
+        Topic::CurrentSign,
+        Topic::Frozen,
+        Topic::Cell,
+        Topic::Range,
+        Topic::CellModel,
+    ];
+    // A wrong temperature explains other temperatures only.
+    let explains_all = judge.wrong_layouts.iter().any(|kind| *kind != Kind::Temperature);
+    if !judge.wrong_layouts.is_empty() {
+        let is_consequence = |finding: &Finding| {
+            OF_VALUES.contains(&finding.topic) && (explains_all || finding.title.starts_with("temperature"))
+        };
+        judge.report.fold(Topic::Layout, is_consequence);
     }
 }

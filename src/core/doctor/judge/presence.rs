@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::context::{Judge, error, find};
+use super::values;
 use super::words::{channels, number, seconds};
 use crate::can::CanId;
 use crate::doctor::plan::{Kind, SignalPlan};
@@ -29,7 +30,10 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     let all = judge.plan.signals.iter().zip(&judge.doctor.series);
     let unexplained = all.filter(|(s, _)| !judge.explained.contains(&(s.binding.bus, s.binding.id)));
     let absent = unexplained.filter_map(|(signal, series)| Some((signal, absence(judge, signal, series)?)));
-    let absent = absent.collect();
+    let is_explained = |(signal, absence): &Absent<'_>| {
+        *absence == Absence::Short && values::is_short_by_layout(judge, Kind::of(signal.binding.channel))
+    };
+    let absent = absent.filter(|absent| !is_explained(absent)).collect();
     let absent = fewer_cells(judge, absent);
     silent(judge, &absent);
     more_cells(judge);

@@ -2,6 +2,7 @@
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::unit::unit_of;
+use super::values::is_impossible;
 use super::words::{channel, number};
 use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::Topic;
@@ -15,6 +16,10 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     if !by_unit(judge) && !pack_voltage_as_current(judge) {
         by_values(judge);
     }
+}
+
+/// Signals with values unlike those of all the others.
+pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
 }
@@ -157,13 +162,15 @@ fn odd_cells(judge: &mut Judge<'_>) {
 /// Sensors with a value unlike that of all the others.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
-    let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
+    // Impossible ones were reported with the values.
+    let possible = |series: &Series| series.values.median().filter(|_| !is_impossible(series));
+    let median_c = judge.median_of(Kind::Temperature, possible);
     let Some(median_c) = median_c.filter(|_| sensors.len() >= 4 && judge.cell_voltage().is_some()) else { return };
     for (signal, series) in sensors {
         let (Some(value), Channel::Temperature(sensor)) = (series.values.median(), signal.binding.channel) else {
             continue;
         };
-        if (value - median_c).abs() <= 30.0 {
+        if (value - median_c).abs() <= 30.0 || is_impossible(series) {
             continue;
         }
         let still = if series.extent.changes == 0 { " and never moves" } else { "" };

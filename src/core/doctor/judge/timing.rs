@@ -1,9 +1,10 @@
 //! Periods: against the age from which readings are stale, and against the DBC's cycle times.
 
 use super::context::{Judge, SignalSeries, find, warning};
-use super::words::{count, seconds, toml};
+use super::words::{count, percent, seconds, toml};
 use crate::doctor::plan::Kind;
 use crate::doctor::report::{Severity, Topic};
+use crate::doctor::series::median;
 
 /// A period this many times the DBC's is a finding.
 const SLOWER: f64 = 2.0;
@@ -11,6 +12,8 @@ const SLOWER: f64 = 2.0;
 const MIN_PERIODS: f64 = 2.0;
 /// Proposed age limit in periods.
 const PROPOSED_PERIODS: f64 = 5.0;
+/// Share of missing frames that is a finding: single ones are lost on every bus.
+const LOST: f64 = 0.03;
 /// Share of gaps above the limit from which they are reported.
 const STALE_SHARE: f64 = 1e-3;
 
@@ -24,7 +27,31 @@ pub(super) fn check(judge: &mut Judge<'_>) {
             stale(judge, (table, what), slowest, period_s);
         }
     }
+    lost(judge);
     cycle_times(judge);
+}
+
+/// Messages that lose frames: the gaps of each of their signals are multiples of its cycle.
+fn lost(judge: &mut Judge<'_>) {
+    for message in &judge.plan.messages {
+        let signals = judge.plan.signals.iter().zip(&judge.doctor.series);
+        let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
+        let losses: Vec<(f64, f64)> = of_message.filter_map(|(_, series)| series.loss.share()).collect();
+        let Some(share) = median(losses.iter().map(|(share, _)| *share)).filter(|share| *share >= LOST) else {
+            continue;
+        };
+        let cycle_s = losses.iter().map(|(_, cycle_s)| *cycle_s).fold(f64::INFINITY, f64::min);
+        let (name, one_in) = (&message.name, (1.0 / share).round());
+        let title = format!("{name}: one frame in {one_in} is missing");
+        warning(judge, Topic::Period, title)
+            .seen(format!(
+                "its signals come every {} or after a multiple of that; {} % of them are missing",
+                seconds(cycle_s),
+                percent(share)
+            ))
+            .why("frames are lost on the way: an overloaded gateway or computer, or a second sender of the identifier")
+            .advice("compare with candump on the bus itself, and look at the interface's counters: ip -details -statistics link show");
+    }
 }
 
 /// The signal with the longest period, of several the one with the longest gap.

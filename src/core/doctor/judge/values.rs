@@ -3,36 +3,43 @@
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, find};
 use super::electrical;
 use super::unit::unit_of;
-use super::words::{number, toml};
+use super::words::{channels, number, percent, toml};
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::{Severity, Topic};
-use crate::doctor::series::{AlternativeReading, Extent, LAYOUT_FAULTS};
+use crate::doctor::series::{AlternativeReading, Extent, LAYOUT_FAULTS, Series};
+use crate::quantity::Channel;
 
 /// Factors by which a unit may be wrong.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 /// Plausible temperatures, degrees C.
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
+/// Temperatures that a pack may have for a moment, on fire or in the cold, degrees C.
+const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
 /// Temperatures above the plausible ones that a pack in danger may have, degrees C.
 const HOT_C: std::ops::Range<f64> = 60.0..90.0;
 /// Share of implausible readings that is more than a disturbance.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
-    if judge.is_mixed_up {
-        return;
+    if !judge.is_mixed_up {
+        voltages(judge);
+        current(judge);
     }
-    voltages(judge);
-    current(judge);
-    temperatures(judge);
+    if !judge.has(&[Topic::Swapped]) {
+        temperatures(judge);
+    }
 }
+
+/// A signal and the layout with which its values are possible.
+type BetterLayout<'d> = (SignalSeries<'d>, &'d AlternativeReading);
 
 /// The first alternative layout that fits three quarters of the signals, with the first signal it fits.
 fn better_layout<'d>(
     all: &[SignalSeries<'d>],
     fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,
-) -> Option<(SignalSeries<'d>, &'d AlternativeReading)> {
-    let alive = all.iter().filter(|(_, series)| series.count() > 0).count();
+) -> Option<BetterLayout<'d>> {
+    let alive = all.iter().filter(|(_, series)| series.count() > 0 || series.unusable.short > 0).count();
     LAYOUT_FAULTS.into_iter().find_map(|fault| {
         let alternative = |(signal, series): SignalSeries<'d>| {
             let other = series.alternatives.iter().find(|other| other.fault == fault)?;
@@ -57,9 +64,10 @@ fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -
 fn wrong_layout(
     judge: &mut Judge<'_>,
     all: &[SignalSeries<'_>],
-    ((signal, series), other): (SignalSeries<'_>, &AlternativeReading),
+    ((signal, series), other): BetterLayout<'_>,
     what: &str,
 ) {
+    judge.wrong_layouts.push(Kind::of(signal.binding.channel));
     let span = |extent: &Extent| {
         format!("{} to {} in steps of {}", number(extent.min), number(extent.max), number(extent.step()))
     };
@@ -80,13 +88,7 @@ fn voltages(judge: &mut Judge<'_>) {
     let cells = judge.cells_per_reading();
     let (what, per) = if judge.plan.pack.is_total { ("pack voltage", " a cell") } else { ("cell voltages", "") };
     let is_plausible = (low..=high).contains(&median_v);
-    let better = better_layout(&all, |signal, other| {
-        let extent = &other.extent;
-        let in_band = low * cells <= extent.mean() && extent.mean() <= high * cells;
-        let is_steady = extent.range() < 0.5 * (high - low) * cells + 1e-9 || in_band && extent.range() < high * cells;
-        is_steady && (is_smoother(signal, other) || !is_plausible && in_band)
-    });
-    if let Some(better) = better {
+    if let Some(better) = better_voltages(judge, &all) {
         judge.is_mixed_up = true;
         return wrong_layout(judge, &all, better, what);
     }
@@ -113,6 +115,41 @@ fn voltages(judge: &mut Judge<'_>) {
             .why(format!("{band}, and no power of ten helps"))
             .change_cell_model()
             .advice("or the signal is not a cell voltage");
+    }
+}
+
+/// The layout with which the voltages are possible, if they are not as configured.
+fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
+    let (low, high) = judge.voltage_band();
+    let cells = judge.cells_per_reading();
+    let is_plausible = judge.cell_voltage().is_some_and(|median_v| (low..=high).contains(&median_v));
+    better_layout(all, |signal, other| {
+        let extent = &other.extent;
+        let in_band = low * cells <= extent.mean() && extent.mean() <= high * cells;
+        let is_steady = extent.range() < 0.5 * (high - low) * cells + 1e-9 || in_band && extent.range() < high * cells;
+        let is_unread = signal.1.count() == 0;
+        is_steady && (is_smoother(signal, other) || (!is_plausible || is_unread) && in_band)
+    })
+}
+
+/// The layout with which the temperatures are possible, if they are not as configured.
+fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
+    let ambient_c = judge.plan.pack.ambient_c;
+    let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
+    let is_plausible = median_c.is_some_and(|median_c| PLAUSIBLE_C.contains(&median_c));
+    better_layout(all, |signal, other| {
+        let is_near = (other.extent.mean() - ambient_c).abs() < 45.0 && other.extent.range() < 40.0;
+        is_near && (is_smoother(signal, other) || !is_plausible || signal.1.count() == 0)
+    })
+}
+
+/// Whether the frames end before the signals of a kind because of the byte order in the DBC.
+pub(super) fn is_short_by_layout(judge: &Judge<'_>, kind: Kind) -> bool {
+    let all = judge.signals(kind);
+    match kind {
+        Kind::Voltage => better_voltages(judge, &all).is_some(),
+        Kind::Temperature => better_temperatures(judge, &all).is_some(),
+        Kind::Current | Kind::Reported => false,
     }
 }
 
@@ -184,10 +221,7 @@ fn temperatures(judge: &mut Judge<'_>) {
     let Some(median_c) = judge.median_of(Kind::Temperature, |series| series.values.median()) else { return };
     let ambient_c = judge.plan.pack.ambient_c;
     let is_plausible = PLAUSIBLE_C.contains(&median_c);
-    let better = better_layout(&all, |signal, other| {
-        let is_near = (other.extent.mean() - ambient_c).abs() < 45.0 && other.extent.range() < 40.0;
-        is_near && (is_smoother(signal, other) || !is_plausible)
-    });
+    let impossible: Vec<_> = all.iter().filter(|(_, series)| is_impossible(series)).copied().collect();
     let unit = TEMPERATURE_UNITS
         .into_iter()
         .map(|(factor, offset, name)| (factor, offset, name, median_c * factor + offset))
@@ -195,10 +229,34 @@ fn temperatures(judge: &mut Judge<'_>) {
         .min_by(|a, b| (a.3 - ambient_c).abs().total_cmp(&(b.3 - ambient_c).abs()));
     // A wrong unit explains more than another bit order, unless the values jump.
     let is_steady = all.iter().all(|(_, series)| series.extent.range() < 60.0);
-    if let Some(better) = better.filter(|_| unit.is_none() || !is_steady) {
+    if let Some(better) = better_temperatures(judge, &all).filter(|_| unit.is_none() || !is_steady) {
         wrong_layout(judge, &all, better, "temperatures");
+    } else if !impossible.is_empty() && (is_plausible || 4 * impossible.len() < 3 * all.len()) {
+        impossible_sensors(judge, &impossible, all.len());
     } else if unconverted(judge, &all, median_c).is_none() && !is_plausible {
         wrong_temperature(judge, &all, median_c, unit);
+    }
+}
+
+/// Whether many readings of a sensor are temperatures that no pack has.
+pub(super) fn is_impossible(series: &Series) -> bool {
+    series.values.share(|c| !POSSIBLE_C.contains(&c)) > MANY
+}
+
+/// Impossible readings that no unit explains, because the others of the same sensor or of other sensors are possible.
+fn impossible_sensors(judge: &mut Judge<'_>, sensors: &[SignalSeries<'_>], all: usize) {
+    let list: Vec<Channel> = sensors.iter().map(|(signal, _)| signal.binding.channel).collect();
+    let (signal, series) = sensors[0];
+    let (low, high) = (number(series.extent.min), number(series.extent.max));
+    let share = percent(series.values.share(|c| !POSSIBLE_C.contains(&c)));
+    let others = if sensors.len() < all { "the other sensors are possible" } else { "its other readings are possible" };
+    let finding = error(judge, Topic::Cell, format!("{}: no pack has this temperature", channels(&list)))
+        .seen(format!("{} reads {low} to {high} degrees C; {share} % of its readings are impossible", signal.name))
+        .why(format!(
+            "{others}: no sensor is there, a wire is broken, or a code for \"not available\" is not configured"
+        ));
+    for (signal, _) in sensors {
+        finding.change(&signal.table, "signal", "a sensor that is there");
     }
 }
 

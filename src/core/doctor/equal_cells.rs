@@ -1,0 +1,78 @@
+//! Cells whose voltages are always the same: one signal in the place of two.
+//!
+//! In: the cells' mean voltages of one block after the other, V. Out: groups of cells that never differed, with the number
+//! of blocks in which they moved. Exact: a copy has the same digits, and two cells in series differ in some of them.
+
+/// Groups of cells that have not differed so far.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct EqualCells {
+    /// Number of its group, by cell.
+    groups: Vec<usize>,
+    last_v: Vec<f64>,
+    /// Blocks in which a cell moved.
+    changes: Vec<u32>,
+}
+
+impl EqualCells {
+    /// Takes the voltages of a block; one in which a cell has none is left out.
+    pub(crate) fn push(&mut self, cells_v: &[f64]) {
+        let cells = cells_v.len();
+        if cells < 2 || cells_v.iter().any(|v| !v.is_finite()) {
+            return;
+        }
+        if self.groups.is_empty() {
+            (self.groups, self.changes) = (vec![0; cells], vec![0; cells]);
+            self.last_v = cells_v.to_vec();
+        }
+        for (cell, voltage_v) in cells_v.iter().enumerate() {
+            self.changes[cell] += u32::from(self.last_v[cell] != *voltage_v);
+        }
+        self.last_v.copy_from_slice(cells_v);
+        self.split();
+    }
+
+    /// Separates cells of a group that differ now.
+    fn split(&mut self) {
+        let key = |cell: &usize| (self.groups[*cell], self.last_v[*cell].to_bits());
+        let mut order: Vec<usize> = (0..self.groups.len()).collect();
+        order.sort_by_key(key);
+        let mut groups = vec![0; order.len()];
+        for pair in order.windows(2) {
+            groups[pair[1]] = groups[pair[0]] + usize::from(key(&pair[0]) != key(&pair[1]));
+        }
+        self.groups = groups;
+    }
+
+    /// Groups of at least two cells that moved in at least `fewest` blocks, with that number, in the order of the cells.
+    pub(crate) fn groups(&self, fewest: u32) -> Vec<(Vec<usize>, u32)> {
+        let moved = (0..self.groups.len()).filter(|cell| self.changes[*cell] >= fewest);
+        let mut found: Vec<(usize, Vec<usize>, u32)> = Vec::new();
+        for cell in moved {
+            match found.iter_mut().find(|(group, ..)| *group == self.groups[cell]) {
+                Some((_, cells, _)) => cells.push(cell),
+                None => found.push((self.groups[cell], vec![cell], self.changes[cell])),
+            }
+        }
+        found.into_iter().filter(|(_, cells, _)| cells.len() > 1).map(|(_, cells, changes)| (cells, changes)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_that_never_differ_stay_together() {
+        let mut cells = EqualCells::default();
+        for block in 0..40 {
+            let v = 3.7 + 0.001 * f64::from(block % 7);
+            // The third differs once, the fourth never moves, and a block with a gap says nothing.
+            cells.push(&[v, v, if block == 20 { v + 0.001 } else { v }, 3.7, v]);
+            cells.push(&[v, f64::NAN, v, 3.7, v]);
+        }
+        let groups = cells.groups(20);
+        assert_eq!(groups.len(), 1);
+        assert_eq!(groups[0].0, [0, 1, 4]);
+        assert!(groups[0].1 >= 30 && cells.groups(1000).is_empty());
+    }
+}

@@ -1,0 +1,74 @@
+//! Signals that are not configured, against those that are: the pack's voltage against the sum of its cells, a second state of
+//! charge against the configured one.
+
+use super::context::{Judge, SignalSeries, find, warning};
+use super::words::number;
+use crate::doctor::plan::Kind;
+use crate::doctor::report::{Severity, Topic};
+use crate::quantity::Channel;
+
+/// Deviation of the sum of the cells that sensors explain.
+const SUM_TOLERANCE: f64 = 0.03;
+/// Ratios outside are another voltage: an auxiliary battery, a link behind open contactors.
+const SAME_VOLTAGE: std::ops::Range<f64> = 0.2..20.0;
+/// States of charge that differ by more are worth knowing.
+const SOC_DIFFERS: f64 = 0.03;
+/// States of charge that differ by more must be checked: a dash that hides a reserve at both ends differs by less.
+const SOC_DISAGREES: f64 = 0.1;
+
+pub(super) fn check(judge: &mut Judge<'_>) {
+    if !judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped, Topic::Silent, Topic::CellCount]) {
+        pack_voltage(judge);
+    }
+    states_of_charge(judge);
+}
+
+/// Signals of the DBC beside the configured ones, with their median values.
+fn beside<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
+    let all = judge.plan.beside.iter().zip(&judge.doctor.beside);
+    let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);
+    wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
+}
+
+fn pack_voltage(judge: &mut Judge<'_>) {
+    let medians_v = judge.signals(Kind::Voltage).into_iter().map(|(_, series)| series.values.median());
+    let Some(medians_v) = medians_v.collect::<Option<Vec<f64>>>().filter(|_| !judge.plan.pack.is_total) else { return };
+    let sum_v: f64 = medians_v.iter().sum();
+    let candidates = beside(judge, Channel::PackVoltage).into_iter();
+    let candidates = candidates.filter(|(_, pack_v)| SAME_VOLTAGE.contains(&(pack_v / sum_v)));
+    let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
+    let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
+    let (cells, sum, pack) = (judge.plan.pack.cells, number(sum_v), number(pack_v));
+    if (pack_v / sum_v - 1.0).abs() <= SUM_TOLERANCE {
+        return judge.fine(format!("the {cells} cells add up to {sum} V; {} is {pack} V", signal.name));
+    }
+    let counted = (f64::from(cells) * pack_v / sum_v).round();
+    let finding = warning(judge, Topic::PackVoltage, "the cells do not add up to the pack's voltage")
+        .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
+        .why("the voltages of cells in series add up")
+        .advice("a cell's signal, its factor or the factor of the pack's voltage in the DBC may be wrong too");
+    if counted >= 1.0 && counted != f64::from(cells) {
+        finding.change("pack", "cells", format!("{counted} cells would have that voltage"));
+    }
+}
+
+fn states_of_charge(judge: &mut Judge<'_>) {
+    let configured = judge.plan.signals.iter().zip(&judge.doctor.series);
+    let mut configured = configured.filter(|(signal, _)| signal.binding.channel == Channel::ReportedSoc);
+    let Some((own, own_soc)) = configured.find_map(|(signal, series)| Some((signal, series.values.median()?))) else {
+        return;
+    };
+    for ((signal, _), soc) in beside(judge, Channel::ReportedSoc) {
+        let difference = (soc - own_soc).abs();
+        let [own_percent, percent] = [own_soc, soc].map(|soc| number((1000.0 * soc).round() / 10.0));
+        if difference <= SOC_DIFFERS {
+            judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
+            continue;
+        }
+        let severity = if difference > SOC_DISAGREES { Severity::Warning } else { Severity::Note };
+        find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
+            .seen(format!("the configured state of charge is {own_percent} %, the other one {percent} %"))
+            .why("a dash may hide a reserve at both ends; otherwise one of them is not the state of charge")
+            .change(&own.table, "signal", format!("{:?}, if that is the pack's own", signal.name));
+    }
+}

@@ -1,0 +1,86 @@
+//! The current's message on another interface: which of the two the voltages follow.
+
+use super::context::{EXPLAINED, Judge, error, warning};
+use super::words::number;
+use crate::doctor::other_current::OtherCurrent;
+use crate::doctor::plan::{Kind, SignalPlan};
+use crate::doctor::report::Topic;
+use crate::doctor::response::Slope;
+use crate::doctor::series::Series;
+use crate::quantity::BusIndex;
+
+pub(super) fn check(judge: &mut Judge<'_>) {
+    let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };
+    let others = judge.doctor.other_currents.iter().filter(|(_, other)| other.series.count() > 0);
+    let here = judge.doctor.slope();
+    for (bus, other) in others {
+        let there = other.slope().filter(is_clear);
+        match (here.is_some_and(|slope| is_clear(&slope)), there) {
+            (false, Some(there)) => followed(judge, signal, (*bus, &there), here),
+            _ if is_alike(series, &other.series) => {}
+            // Two packs on two buses: the voltages follow both currents.
+            (true, Some(_)) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
+            (true, _) => {}
+            (false, None) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
+            (false, None) => undecided(judge, signal, (*bus, other)),
+        }
+    }
+}
+
+/// Whether the voltages are read from an interface.
+fn has_voltages(judge: &Judge<'_>, bus: BusIndex) -> bool {
+    judge.signals(Kind::Voltage).iter().any(|(signal, _)| signal.binding.bus == bus)
+}
+
+/// Whether voltages follow a current.
+fn is_clear(slope: &Slope) -> bool {
+    slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED
+}
+
+/// Whether a gateway repeats the message: then both have the same extent.
+fn is_alike(a: &Series, b: &Series) -> bool {
+    let (a, b) = (&a.extent, &b.extent);
+    let tolerance = 0.02 * a.range().max(b.range()) + 1e-9;
+    [a.min - b.min, a.max - b.max, a.mean() - b.mean()].into_iter().all(|difference| difference.abs() <= tolerance)
+}
+
+fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex, &Slope), here: Option<Slope>) {
+    judge.is_mixed_up = true;
+    let (configured, other) = (judge.interface(signal.binding.bus), judge.interface(bus));
+    let share = |slope: &Slope| number((100.0 * slope.r2).round());
+    let (explained, unexplained) = (share(there), here.as_ref().map_or("0".to_owned(), share));
+    error(judge, Topic::Interface, format!("the pack's current is on {other}, not on {configured}"))
+        .seen(format!(
+            "{} ({}) comes on both: the one on {other} explains {explained} % of the voltages' steps, the one on \
+             {configured} {unexplained} %",
+            signal.message, signal.binding.id
+        ))
+        .why("the voltages of a pack follow its current; the same identifier on the other bus is another message")
+        .change(&signal.table, "interface", format!("{other:?}"));
+}
+
+/// The current and the voltages come from two interfaces, and both have the current's message.
+fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
+    let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
+    let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
+    warning(judge, Topic::Interface, format!("the current is read from {configured}, the voltages from {name}"))
+        .seen(format!(
+            "{} ({}) is on {name} too, with other values: {low} to {high} A",
+            signal.message, signal.binding.id
+        ))
+        .why("a pack usually sends both on one bus; the other one may be another pack's")
+        .change(&signal.table, "interface", format!("{name:?}"))
+        .advice("compare the resistance and the charge with the pack's; listen under load");
+}
+
+/// The voltages follow neither, or nothing moved.
+fn undecided(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
+    let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));
+    judge.unjudged(format!(
+        "{} ({}) is on {} too, with other values ({low} to {high} A): which one is the pack's current shows only under load; \
+         drive or charge for a minute",
+        signal.message,
+        signal.binding.id,
+        judge.interface(bus)
+    ));
+}

@@ -1,0 +1,84 @@
+//! Frames missing from a cyclic signal.
+//!
+//! In: the times between two readings, s. Out: the share of readings that are missing. The cycle is the median of the first
+//! gaps; afterwards a gap of n cycles is n - 1 missing readings. A sender without a cycle differs from one that loses frames
+//! by its gaps, which are not multiples.
+
+use super::series::median;
+
+/// Gaps from which the cycle is taken.
+const FIRST: usize = 16;
+/// Fewest gaps to judge by.
+const FEWEST: u32 = 30;
+/// Longest gap that counts as loss, cycles: a longer one is a pause.
+const LONGEST: f64 = 5.0;
+/// A gap is a multiple of the cycle within this fraction of the cycle.
+const TOLERANCE: f64 = 0.4;
+/// Share of the gaps that must be multiples.
+const REGULAR: f64 = 0.9;
+
+/// Counts of a signal.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct LossCounter {
+    first: Vec<f64>,
+    cycle_s: Option<f64>,
+    gaps: u32,
+    regular: u32,
+    missing: u32,
+}
+
+impl LossCounter {
+    pub(crate) fn push(&mut self, gap_s: f64) {
+        let Some(cycle_s) = self.cycle_s else {
+            self.first.push(gap_s);
+            if self.first.len() == FIRST {
+                self.cycle_s = median(self.first.drain(..)).filter(|cycle_s| *cycle_s > 0.0);
+            }
+            return;
+        };
+        let cycles = gap_s / cycle_s;
+        if cycles > LONGEST + 0.5 {
+            return;
+        }
+        self.gaps = self.gaps.saturating_add(1);
+        let whole = cycles.round();
+        if whole >= 1.0 && (cycles - whole).abs() <= TOLERANCE {
+            self.regular = self.regular.saturating_add(1);
+            // At most LONGEST.
+            self.missing = self.missing.saturating_add(whole as u32 - 1);
+        }
+    }
+
+    /// Share of the readings that are missing, and the cycle, s; `None` = too few gaps, or no cycle.
+    pub(crate) fn share(&self) -> Option<(f64, f64)> {
+        let (gaps, missing) = (f64::from(self.gaps), f64::from(self.missing));
+        let is_cyclic = self.gaps >= FEWEST && f64::from(self.regular) >= REGULAR * gaps;
+        self.cycle_s.filter(|_| is_cyclic).map(|cycle_s| (missing / (gaps + missing), cycle_s))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn share(gaps: impl Iterator<Item = f64>) -> Option<f64> {
+        let mut counter = LossCounter::default();
+        gaps.for_each(|gap_s| counter.push(gap_s));
+        counter.share().map(|(share, _)| share)
+    }
+
+    #[test]
+    fn every_seventh_frame_missing_is_a_seventh() {
+        let found = share((0..700).map(|n| if n % 6 == 5 { 0.021 } else { 0.0099 }));
+        assert!(found.is_some_and(|share| (share - 1.0 / 7.0).abs() < 0.01), "{found:?}");
+    }
+
+    #[test]
+    fn jitter_pauses_and_senders_without_a_cycle_are_no_loss() {
+        let jitter = share((0..700).map(|n| 0.01 + 0.002 * f64::from(n % 3 - 1)));
+        assert_eq!(jitter, Some(0.0));
+        assert_eq!(share((0..700).map(|n| if n % 100 == 50 { 3.0 } else { 0.01 })), Some(0.0));
+        assert_eq!(share((0..700).map(|n| 0.01 * (1.0 + 0.13 * f64::from(n % 10)))), None);
+        assert_eq!(share((0..20).map(|_| 0.01)), None);
+    }
+}

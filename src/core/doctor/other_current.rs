@@ -1,0 +1,47 @@
+//! The configured current's message on another interface.
+//!
+//! Buses of one vehicle use the same identifier for different messages, or carry those of several packs. Read as the configured
+//! current, one of them may be what the voltages follow.
+
+use super::response::Slope;
+use super::response::{BLOCKS_S, VoltageResponse, best_response};
+use super::series::Series;
+use crate::can::decode::Binding;
+use crate::can::signal::SignalLayout;
+use crate::quantity::Timestamp;
+
+/// The message on one other interface.
+#[derive(Debug)]
+pub(crate) struct OtherCurrent {
+    pub(crate) series: Series,
+    responses: [VoltageResponse; 2],
+}
+
+impl OtherCurrent {
+    /// `cells` voltages follow it, with steps above `tolerance_a`.
+    pub(crate) fn new(layout: &SignalLayout, cells: usize, tolerance_a: f64) -> Self {
+        let responses = BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s));
+        Self { series: Series::new(layout, None), responses }
+    }
+
+    pub(crate) fn handle(&mut self, time: Timestamp, payload: &[u8], binding: &Binding) {
+        let Some(current_a) = self.series.handle(time, payload, binding, f64::INFINITY) else { return };
+        self.responses.iter_mut().for_each(|response| response.handle_current(time, current_a));
+    }
+
+    /// Over short and long blocks.
+    pub(crate) fn responses_mut(&mut self) -> &mut [VoltageResponse; 2] {
+        &mut self.responses
+    }
+
+    /// Slope of the pack's voltage over this current.
+    pub(crate) fn slope(&self) -> Option<Slope> {
+        best_response(&self.responses).slope()
+    }
+
+    /// Not listening: what follows says nothing about what was before.
+    pub(crate) fn pause(&mut self) {
+        self.series.pause();
+        self.responses.iter_mut().for_each(VoltageResponse::pause);
+    }
+}

@@ -1,0 +1,103 @@
+//! Signals of the DBC files that are not configured and can be compared with those that are.
+//!
+//! In: the DBC files and the configured signals. Out: signals that are the pack's voltage or a state of charge by their name and
+//! unit, bound to every interface, for a DBC does not state its bus.
+
+use crate::can::dbc::{Message, Signal};
+use crate::can::decode::Binding;
+use crate::can::unit::{Quantity, SignalUnit};
+use crate::config::{Databases, NamedSignal, RawTables, ResolvedSignal};
+use crate::doctor::SignalPlan;
+use crate::quantity::{BusIndex, Channel};
+
+/// Most signals that are followed, on all interfaces together.
+const MAX_SIGNALS: usize = 64;
+
+/// The comparable signals.
+pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedSignal<'_>]) -> Vec<SignalPlan> {
+    let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
+    let free = databases.signals().filter(|named| named.answer.is_none() && !is_configured(named.signal));
+    let wanted = free
+        .filter_map(|NamedSignal { message, signal, .. }| Some((message, signal, channel_of(raw, message, signal)?)));
+    let buses = u8::try_from(raw.interfaces.len()).unwrap_or(u8::MAX);
+    let bound = wanted.flat_map(|(message, signal, channel)| {
+        (0..buses).filter_map(move |bus| plan(BusIndex(bus), message, signal, channel))
+    });
+    bound.take(MAX_SIGNALS).collect()
+}
+
+/// What a signal is by its name and unit; `None` = nothing to compare.
+fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Channel> {
+    let unit = SignalUnit::parse(&signal.unit);
+    let name = format!("{}{}", message.name, signal.name).to_ascii_lowercase().replace('_', "");
+    let own = signal.name.to_ascii_lowercase().replace('_', "");
+    let has = |text: &str, words: &[&str]| words.iter().any(|word| text.contains(word));
+    if has(&own, &["min", "max", "lim", "target", "request", "avg", "cell", "aux", "12v", "lv"]) {
+        return None;
+    }
+    let is_volt = unit.is_some_and(|unit| unit.quantity == Quantity::Voltage);
+    let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::Other("a percentage"));
+    let is_pack = |text: &str| has(text, &["pack", "total", "batt", "stack", "hv", "bms"]);
+    let is_elsewhere = has(&own, &["link", "dc", "iso", "contactor", "charg"]);
+    if is_volt && !is_elsewhere && (is_pack(&own) || is_pack(&name) && has(&own, &["volt", "sum"])) {
+        (!raw.is_pack_total()).then_some(Channel::PackVoltage)
+    } else if is_share && (own.ends_with("soc") || own.starts_with("soc") || has(&own, &["stateofcharge"])) {
+        Some(Channel::ReportedSoc)
+    } else {
+        None
+    }
+}
+
+fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Option<SignalPlan> {
+    let unit = SignalUnit::parse(&signal.unit);
+    let scale = match channel {
+        Channel::PackVoltage => unit.map_or(1.0, |unit| unit.factor),
+        // Without a unit, what reaches beyond 1.5 counts percent.
+        _ if unit.is_some() || signal.layout.extent().1 > 1.5 => 0.01,
+        _ => 1.0,
+    };
+    let mut binding = Binding::new(bus, message, signal, channel).ok()?;
+    binding.scale = scale;
+    Some(SignalPlan {
+        binding,
+        layout: signal.layout,
+        table: String::new(),
+        message: message.name.clone(),
+        name: format!("{}.{}", message.name, signal.name),
+        unit: signal.unit.clone(),
+        scale,
+        offset: 0.0,
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::can::dbc::Database;
+    use crate::config::PartialConfig;
+
+    #[test]
+    fn names_and_units_decide_what_is_compared() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
+        let raw = PartialConfig::read(&folder.join("example.toml")).unwrap().raw;
+        let channel = |message: &str, signal: &str, unit: &str| {
+            let text = format!("BO_ 1 {message}: 8 X\n SG_ {signal} : 0|16@1+ (1,0) [0|0] \"{unit}\" X\n");
+            let database = Database::parse(&format!("VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n{text}")).unwrap();
+            channel_of(&raw, &database.messages[0], &database.messages[0].signals[0])
+        };
+        let voltage = Some(Channel::PackVoltage);
+        assert_eq!(channel("PackStatus", "PackVoltage", "V"), voltage);
+        assert_eq!((channel("Bms", "Volt", "V"), channel("X", "HV_Batt_U", "V")), (voltage, voltage));
+        for other in ["PackVoltageMax", "DcLinkVoltage", "ChargeVoltageLimit", "CellVoltage1"] {
+            assert_eq!(channel("Bms", other, "V"), None, "{other}");
+        }
+        assert_eq!(channel("Bms", "PackVoltage", "A"), None);
+        for soc in ["DisplaySOC", "SOC_dash", "State_of_Charge"] {
+            assert_eq!(channel("Dash", soc, "%"), Some(Channel::ReportedSoc), "{soc}");
+        }
+        assert_eq!((channel("Dash", "SocMin", "%"), channel("Dash", "Soc", "V")), (None, None));
+    }
+}
