@@ -30,6 +30,6 @@ mod response;
 mod series;
 mod watch;
 
-pub use plan::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
+pub use plan::{AnswerSource, InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 pub use report::{Change, Finding, Report, Severity, Topic};
 pub use watch::Doctor;

@@ -2,6 +2,7 @@
 
 use crate::can::CanId;
 use crate::can::decode::Binding;
+use crate::can::diagnostic::Question;
 use crate::can::guard::GuardConfig;
 use crate::can::signal::SignalLayout;
 use crate::cell::CellModel;
@@ -14,8 +15,6 @@ pub struct Plan {
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
-    /// Configured signals in diagnostic answers, which the doctor does not read.
-    pub diagnostic_inputs: usize,
     /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured and look like the pack's voltage (beside cell voltages) or a state of charge,
@@ -74,6 +73,8 @@ pub struct SignalPlan {
     pub binding: Binding,
     /// Its layout as the DBC writes it.
     pub layout: SignalLayout,
+    /// Where it is in a diagnostic answer; `None` = in a frame.
+    pub answer: Option<AnswerSource>,
     /// Table of the configuration, `input.temperature[3]`.
     pub table: String,
     /// Message in the DBC.
@@ -86,6 +87,15 @@ pub struct SignalPlan {
     pub scale: f64,
     /// The configuration's `offset`.
     pub offset: f64,
+}
+
+/// Position of a signal in a diagnostic answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AnswerSource {
+    /// What is answered.
+    pub question: Question,
+    /// Byte behind the echoed service and identifier with which its layout begins.
+    pub first_byte: usize,
 }
 
 /// One message with configured signals.

@@ -7,6 +7,7 @@ use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan};
 use super::response::{BLOCKS_S, Slope, VoltageResponse, best_response};
 use super::series::Series;
+use crate::can::diagnostic::{Answer, Heard, Listener, Question};
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
 use crate::can::{CanId, Frame, FrameKind};
@@ -81,6 +82,10 @@ pub struct Doctor {
     pub(crate) beside: Vec<Series>,
     /// Signals by message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
+    /// Diagnostic answers with signals.
+    listener: Listener,
+    /// Signals by answer.
+    by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
     /// The current's message on other interfaces.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     guards: Guards,
@@ -106,18 +111,28 @@ impl Doctor {
             (SignalList::MoreCells, &plan.more_cells),
             (SignalList::Beside, &plan.beside),
         ];
+        let mut by_question: BTreeMap<Question, Vec<(SignalList, usize)>> = BTreeMap::new();
         for (name, list) in lists {
             // In the order of channels: the current of a frame before its voltages.
             let mut order: Vec<usize> = (0..list.len()).collect();
             order.sort_by_key(|&index| list[index].binding.channel);
             for index in order {
-                by_id.entry((list[index].binding.bus, list[index].binding.id)).or_default().push((name, index));
+                match list[index].answer {
+                    Some(answer) => by_question.entry(answer.question).or_default().push((name, index)),
+                    None => {
+                        by_id.entry((list[index].binding.bus, list[index].binding.id)).or_default().push((name, index));
+                    }
+                }
             }
         }
         let (cells, tolerance_a) = response_settings(&plan);
         let bus = |interface: &InterfacePlan| BusStats { name: interface.name.clone(), ..BusStats::default() };
         let signals = plan.signals.iter();
+        let answers: Vec<Answer> =
+            by_question.keys().map(|question| Answer { question: *question, signals: Vec::new() }).collect();
         Self {
+            listener: Listener::new(&answers),
+            by_question,
             buses: plan.interfaces.iter().map(bus).collect(),
             series: signals.map(|s| Series::new(&s.layout, plan.plausible(s.binding.channel))).collect(),
             more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
@@ -156,6 +171,7 @@ impl Doctor {
         if frame.kind() != FrameKind::Remote {
             self.check_protection(time, bus, frame);
             self.read(time, bus, frame);
+            self.read_answer(time, bus, frame);
             self.read_other_current(time, bus, frame);
         }
     }
@@ -164,7 +180,7 @@ impl Doctor {
     fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
         let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
-        if signal.binding.id != frame.id() || signal.binding.bus == bus {
+        if signal.binding.id != frame.id() || signal.binding.bus == bus || signal.answer.is_some() {
             return;
         }
         let (cells, tolerance_a) = response_settings(&self.plan);
@@ -185,18 +201,37 @@ impl Doctor {
     }
 
     fn read(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let Self { plan, series, more_cells, beside, by_id, responses, other_currents, .. } = self;
+        let key = (bus, frame.id());
+        let Some(signals) = self.by_id.get_mut(&key).map(std::mem::take) else { return };
+        self.read_signals(time, &signals, frame.data());
+        self.by_id.insert(key, signals);
+    }
+
+    /// Reads the signals of an answer that the frame completes.
+    fn read_answer(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        self.listener.losses.clear();
+        let Heard::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
+        let (question, data) = (answer.question, data.to_vec());
+        let Some(signals) = self.by_question.remove(&question) else { return };
+        self.read_signals(time, &signals, &data);
+        self.by_question.insert(question, signals);
+    }
+
+    /// Reads signals of a frame's payload or of an answer's data.
+    fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
+        let Self { plan, series, more_cells, beside, responses, other_currents, .. } = self;
         let cells = f64::from(plan.pack.cells.max(1));
-        for &(list, index) in by_id.get(&(bus, frame.id())).into_iter().flatten() {
+        for &(list, index) in wanted {
             let (signals, series) = match list {
                 SignalList::Configured => (&plan.signals, &mut *series),
                 SignalList::MoreCells => (&plan.more_cells, &mut *more_cells),
                 SignalList::Beside => (&plan.beside, &mut *beside),
             };
-            let binding = &signals[index].binding;
+            let SignalPlan { binding, answer, .. } = &signals[index];
+            let data = data.get(answer.map_or(0, |answer| answer.first_byte)..).unwrap_or_default();
             let is_configured = list == SignalList::Configured;
             let max_age_s = if is_configured { plan.max_age_s(binding.channel) } else { f64::INFINITY };
-            let value = series[index].handle(time, frame.data(), binding, max_age_s);
+            let value = series[index].handle(time, data, binding, max_age_s);
             let Some(value) = value.filter(|_| is_configured) else { continue };
             let (cell, voltage_v) = match binding.channel {
                 Channel::Current => {
@@ -265,6 +300,7 @@ impl Doctor {
         series.iter_mut().chain(more_cells).chain(beside).for_each(Series::pause);
         self.end_blocks();
         self.guards.restart();
+        self.listener.restart();
     }
 
     /// Takes an event of an interface.

@@ -14,6 +14,7 @@ use crate::can::diagnostic::{Answer, AnswerSignal, Controller, Question, Service
 use crate::can::isotp::MAX_MESSAGE;
 use crate::can::poll::{FOREIGN_SILENCE_NS, PollConfig, PollRequest};
 use crate::can::signal::{ByteOrder, LayoutFault, SignalLayout, ValueType};
+use crate::doctor::AnswerSource;
 use crate::monitor::SupplyConfig;
 use crate::quantity::{BusIndex, Channel};
 
@@ -67,6 +68,11 @@ impl AnswerPlace<'_> {
         let request = self.definition.question(BusIndex(0)).request();
         let bytes: Vec<String> = request.iter().map(|byte| format!("{byte:02X}")).collect();
         format!("answer of {} to {}", self.definition.response.0, bytes.join(" "))
+    }
+
+    /// The signal's source for the doctor.
+    pub(crate) fn source(&self, bus: BusIndex) -> AnswerSource {
+        AnswerSource { question: self.definition.question(bus), first_byte: self.first_byte }
     }
 
     /// Position of the signal's first bit in the answer, as the file counts it.

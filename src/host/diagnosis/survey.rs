@@ -65,9 +65,8 @@ pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
 fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     let PartialConfig { config, raw, model, databases, .. } = partial;
     let (pack, config, model) = (raw.pack.as_ref(), config.as_ref(), model.as_ref());
-    // The doctor reads frames, not the answers that several of them make.
     let in_frames: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.answer.is_none()).cloned().collect();
-    let signals: Vec<SignalPlan> = in_frames.iter().filter_map(|resolved| signal(raw, resolved)).collect();
+    let signals: Vec<SignalPlan> = found.iter().filter_map(|resolved| signal(raw, resolved)).collect();
     let strings = pack.map_or(1, |pack| pack.strings);
     let pack_ah = model.map_or(USUAL_AH, |model| model.rated_capacity_ah) * f64::from(strings);
     let pack_plan = PackPlan {
@@ -86,7 +85,6 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
         beside: beside::signals(raw, databases, found),
         messages: messages(&in_frames, &signals),
         signals,
-        diagnostic_inputs: found.len() - in_frames.len(),
         pack: pack_plan,
         limits: config.map(limits).unwrap_or_default(),
         max_ages_s: max_ages_s(raw),
@@ -108,13 +106,16 @@ fn cells_of(found: &[ResolvedSignal<'_>]) -> u16 {
 
 fn signal(raw: &RawTables, resolved: &ResolvedSignal<'_>) -> Option<SignalPlan> {
     let source = raw.source(resolved.channel)?;
-    Some(signal_plan(&source, resolved.message, resolved.signal, resolved.binding().ok()?))
+    let mut plan = signal_plan(&source, resolved.message, resolved.signal, resolved.binding().ok()?);
+    plan.answer = resolved.answer.map(|place| place.source(resolved.bus));
+    Some(plan)
 }
 
 fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, binding: Binding) -> SignalPlan {
     SignalPlan {
         binding,
         layout: signal.layout,
+        answer: None,
         table: source.place.path.clone(),
         message: message.name.clone(),
         name: format!("{}.{}", message.name, signal.name),

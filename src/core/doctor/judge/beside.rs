@@ -42,6 +42,15 @@ fn pack_voltage(judge: &mut Judge<'_>) {
     if (pack_v / sum_v - 1.0).abs() <= SUM_TOLERANCE {
         return judge.fine(format!("the {cells} cells add up to {sum} V; {} is {pack} V", signal.name));
     }
+    let power = (pack_v / sum_v).log10().round();
+    if power != 0.0 && ((pack_v / sum_v) / 10.0_f64.powf(power) - 1.0).abs() <= SUM_TOLERANCE {
+        let times = number(10.0_f64.powf(power));
+        warning(judge, Topic::PackVoltage, format!("{} is off by {times}", signal.name))
+            .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
+            .why("the voltages of cells in series add up; a factor of ten is a decimal place of its definition")
+            .change(&signal.table, "factor", format!("{times} times smaller in the definition of {}", signal.name));
+        return;
+    }
     let counted = (f64::from(cells) * pack_v / sum_v).round();
     let finding = warning(judge, Topic::PackVoltage, "the cells do not add up to the pack's voltage")
         .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))

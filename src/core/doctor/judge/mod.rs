@@ -54,10 +54,6 @@ impl Doctor {
         electrical::check(&mut judge);
         beside::check(&mut judge);
         timing::check(&mut judge);
-        if self.plan.diagnostic_inputs > 0 {
-            let inputs = words::count(self.plan.diagnostic_inputs as u64, "input");
-            judge.unjudged(format!("{inputs} in diagnostic answers: the doctor reads the signals of frames only"));
-        }
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < SHORT_S {
             let span = words::seconds(awake_s);

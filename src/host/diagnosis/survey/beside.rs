@@ -16,12 +16,15 @@ const MAX_SIGNALS: usize = 64;
 /// The comparable signals.
 pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedSignal<'_>]) -> Vec<SignalPlan> {
     let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
-    let free = databases.signals().filter(|named| named.answer.is_none() && !is_configured(named.signal));
-    let wanted = free
-        .filter_map(|NamedSignal { message, signal, .. }| Some((message, signal, channel_of(raw, message, signal)?)));
+    let free = databases.signals().filter(|named| !is_configured(named.signal));
+    let wanted = free.filter_map(|named| Some((named, channel_of(raw, named.message, named.signal)?)));
     let buses = u8::try_from(raw.interfaces.len()).unwrap_or(u8::MAX);
-    let bound = wanted.flat_map(|(message, signal, channel)| {
-        (0..buses).filter_map(move |bus| plan(BusIndex(bus), message, signal, channel))
+    let bound = wanted.flat_map(|(NamedSignal { message, signal, answer, .. }, channel)| {
+        (0..buses).map(BusIndex).filter_map(move |bus| {
+            let mut plan = plan(bus, message, signal, channel)?;
+            plan.answer = answer.map(|place| place.source(bus));
+            Some(plan)
+        })
     });
     bound.take(MAX_SIGNALS).collect()
 }
@@ -61,6 +64,7 @@ fn plan(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> 
     Some(SignalPlan {
         binding,
         layout: signal.layout,
+        answer: None,
         table: String::new(),
         message: message.name.clone(),
         name: format!("{}.{}", message.name, signal.name),
