@@ -12,6 +12,7 @@ pub mod fit;
 pub mod fleet;
 pub mod gpr;
 pub mod ident;
+pub mod import;
 pub mod measured;
 pub mod report;
 pub mod rul;

@@ -30,6 +30,8 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+#[cfg(feature = "lab")]
+mod import_obdb;
 mod isotp_peer;
 mod layering;
 mod life_decodes;
