@@ -98,7 +98,9 @@ fn byte(field: &str, text: Option<&String>) -> Result<Option<u8>, String> {
 mod tests {
     use super::*;
 
-    fn addresses(fields: [Option<&str>; 6]) -> Result<(u32, u32, Option<(u8, u8)>), String> {
+    type Numbers = (u32, u32, Option<(u8, u8)>);
+
+    fn addresses(fields: [Option<&str>; 6]) -> Result<Numbers, String> {
         let [hdr, rax, eax, pri, tst, proto] = fields.map(|field| field.map(str::to_owned));
         let document = AddressDocument { hdr: hdr.unwrap(), rax, eax, pri, tst, proto };
         Addresses::new(&document)
