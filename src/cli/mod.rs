@@ -8,6 +8,8 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+#[cfg(feature = "lab")]
+mod discover;
 mod doctor;
 #[cfg(feature = "lab")]
 mod export;
@@ -98,6 +100,9 @@ enum Command {
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
+    /// Find the signals of the traction battery in a log
+    #[cfg(feature = "lab")]
+    Discover(discover::Args),
     /// Convert descriptions of a car's signals to parts of a configuration
     #[cfg(feature = "lab")]
     Import(import::Args),
@@ -166,6 +171,8 @@ pub fn main() -> ExitCode {
         Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Discover(args) => discover::run(&args),
         #[cfg(feature = "lab")]
         Command::Import(args) => import::run(&args),
         #[cfg(feature = "lab")]

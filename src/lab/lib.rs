@@ -6,6 +6,7 @@ pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
 pub mod chart;
+pub mod discover;
 pub mod error;
 mod fields;
 pub mod fit;

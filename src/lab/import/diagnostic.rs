@@ -78,6 +78,31 @@ impl DiagnosticSignal {
         self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
     }
 
+    /// One signal of the series, counted from 0.
+    pub(crate) fn of_series(&self, index: u32) -> Self {
+        let Some(NumberRange { first, step, .. }) = self.numbers else { return self.clone() };
+        let name = self.name.replace("{n}", &(first + index).to_string());
+        Self { name, bit: self.bit + index * step, numbers: None, ..self.clone() }
+    }
+
+    /// Its value in the data behind the echoed service and identifier; `None` = beyond their end, not available or out of the
+    /// range.
+    pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
+        let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
+        let bytes = data.get(usize::try_from(first).ok()?..=usize::try_from(last).ok()?)?;
+        let join = |word: u128, byte: &u8| word << 8 | u128::from(*byte);
+        let word = if self.little_endian { bytes.iter().rev().fold(0, join) } else { bytes.iter().fold(0, join) };
+        let below = 8 * (last + 1) - (self.bit + self.length);
+        let code = u64::try_from((word >> below) & (u128::MAX >> (128 - self.length))).ok()?;
+        let unused = 64 - self.length;
+        let number = if self.signed { ((code << unused).cast_signed() >> unused) as f64 } else { code as f64 };
+        let value = number * self.factor + self.offset;
+        // Half a code: limits are rounded decimals.
+        let room = self.factor.abs() / 2.0;
+        let is_inside = self.range.is_none_or(|(low, high)| value >= low - room && value <= high + room);
+        (is_inside && !self.not_available.contains(&code)).then_some(value)
+    }
+
     /// Smallest and largest code.
     pub(crate) fn codes(&self) -> (f64, f64) {
         let top = 2_f64.powi(i32::try_from(self.length).unwrap_or(64));

@@ -43,6 +43,25 @@ pub struct ObdbSettings {
 /// # Errors
 /// The text is no such JSON, or nothing in it can be converted; the error has place, found and allowed.
 pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
+    let (document, converter) = convert(text, settings)?;
+    let Converter { tables, exclusions, warnings, .. } = converter;
+    let name = tables.first().map_or("", |table| &table.name);
+    let mut result = ImportResult { text: head(name, settings, &document), exclusions, warnings, signals: 0 };
+    result.signals = tables.iter().map(DiagnosticTable::signal_count).sum();
+    for table in &tables {
+        let _ = write!(result.text, "\n{table}");
+    }
+    result.text.push_str(&tail(&result));
+    Ok(result)
+}
+
+/// The tables alone.
+pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<DiagnosticTable>, LabError> {
+    Ok(convert(text, settings)?.1.tables)
+}
+
+/// Reads the text, and converts it to at least one table.
+fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Converter), LabError> {
     let source = &settings.source;
     if let Some(name) = settings.name.as_ref().filter(|name| !is_name(name)) {
         return Err(LabError(format!("name is {name:?}, must be letters, digits and _")));
@@ -53,20 +72,14 @@ pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabEr
     })?;
     let mut converter = Converter { year: settings.year, ..Converter::default() };
     converter.convert(&document);
-    let Converter { mut tables, exclusions, warnings, .. } = converter;
+    let Converter { tables, exclusions, .. } = &mut converter;
     if tables.is_empty() {
         let first = exclusions.first().map_or_else(|| "commands is empty".to_owned(), ToString::to_string);
         return Err(LabError(format!("{source}: nothing can be converted, {} left out; {first}", exclusions.len())));
     }
-    let name = rename(&mut tables, settings.name.as_deref());
+    rename(tables, settings.name.as_deref());
     tables.sort_by_key(|table| (table.request, table.response, table.extension));
-    let mut result = ImportResult { text: head(&name, settings, &document), exclusions, warnings, signals: 0 };
-    result.signals = tables.iter().map(DiagnosticTable::signal_count).sum();
-    for table in &tables {
-        let _ = write!(result.text, "\n{table}");
-    }
-    result.text.push_str(&tail(&result));
-    Ok(result)
+    Ok((document, converter))
 }
 
 /// Whether a text can stand in the name of a signal.
@@ -227,8 +240,8 @@ fn remarks(command: &CommandDocument) -> Vec<String> {
     remarks
 }
 
-/// Gives the tables their name, shortens the signals' names, joins numbered ones; returns the name.
-fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) -> String {
+/// Gives the tables their name, shortens the signals' names, joins numbered ones.
+fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) {
     let first_word = |signal: &DiagnosticSignal| signal.name.split_once('_').map(|(word, _)| word.to_owned());
     let words = tables.iter().flat_map(|table| &table.signals).map(first_word);
     let word = words.reduce(|a, b| if a == b { a } else { None }).flatten().filter(|word| !word.is_empty());
@@ -243,7 +256,6 @@ fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) -> String {
         }
         table.signals = series::join(std::mem::take(&mut table.signals));
     }
-    name
 }
 
 fn head(name: &str, settings: &ObdbSettings, document: &SignalSetDocument) -> String {
