@@ -3,7 +3,7 @@
 //! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
 //! count 2 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
-use super::series::Series;
+use super::series::{Relation, Series};
 use super::signals::{LogSignal, SignalOrigin};
 use super::words::Dimension;
 use super::{Candidate, PositiveDirection, Quantity};
@@ -17,6 +17,9 @@ const MAX_CANDIDATES: usize = 10;
 const MAX_COMPARED: usize = 40;
 /// Correlation of changes that counts.
 const MIN_CORRELATION: f64 = 0.5;
+/// Correlation times the root of the number of changes: standard deviations from chance.
+const MIN_STRENGTH: f64 = 2.0;
+const MIN_STRENGTH_RAW: f64 = 4.0;
 /// Plausible resistance, ohms per V of the pack: 400 V have 4 milliohm to 4 ohm.
 const OHM_PER_V: (f64, f64) = (1e-5, 1e-2);
 /// Deviation of the sum of the cells from a pack voltage that still counts.
@@ -109,6 +112,9 @@ fn sort(evidence: &mut [Evidence]) {
 
 fn ranked(quantity: Quantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
     sort(&mut evidence);
+    // A field is there once, with the best of its scales.
+    let mut known = std::collections::BTreeSet::new();
+    evidence.retain(|evidence| known.insert((evidence.bus, evidence.name.clone())));
     let good = evidence.into_iter().filter(|evidence| evidence.points >= MIN_POINTS).take(MAX_CANDIDATES);
     let candidate = |(rank, evidence): (usize, Evidence)| Candidate {
         quantity,
@@ -136,6 +142,9 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if !is_named {
         return None;
     }
+    if matches!(signal.origin, SignalOrigin::Raw(..)) {
+        return Some(raw_voltage(evidence, signal));
+    }
     evidence.add(2.0, signal.dimension == Dimension::Voltage, "unit V");
     evidence.add(2.0, signal.words.says_voltage(), "its name says voltage");
     evidence.add_place(signal);
@@ -147,6 +156,54 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Some(evidence)
 }
 
+/// A field without a name: what a pack's voltage looks like.
+fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
+    let Series { values, .. } = &signal.series;
+    let (low, high) = (evidence.low, evidence.high);
+    evidence.add(2.0, (250.0..=850.0).contains(&signal.series.mean()), "a usual voltage of a pack");
+    evidence.add(1.5, high - low <= 0.05 * high && high > low, "changes by little");
+    evidence.add(1.5, 2 * signal.series.distinct() >= values.len().min(100), "its last digits are alive");
+    evidence.add(-1.5, high == low, "it never changes in this log");
+    let step = signal.field().map_or(0.0, |field| field.factor);
+    evidence.add(-1.0, step > 0.2, "its steps would be coarse");
+    evidence
+}
+
+/// A field without a name: what a pack's current looks like.
+fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
+    let Some(field) = signal.field() else { return evidence };
+    // A number of 24 or 32 bits that needs 16 of them is one on purpose.
+    let needed = 32_768.0 * field.factor;
+    let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
+    // The shorter forms are in the longest one.
+    let points = if field.length == 32 { 3.0 } else { 2.0 };
+    evidence.add(points, is_extended, &format!("a number of {} bits with a sign", field.length));
+    evidence.add(-1.0, evidence.high - evidence.low < 1.0, "hardly moves");
+    evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
+    let is_calm = evidence.high - evidence.low <= 600.0;
+    evidence.add(1.0, is_calm, "");
+    evidence
+}
+
+impl LogSignal {
+    /// Whether two fields of one answer overlap.
+    fn shares_bits(&self, other: &Self) -> bool {
+        let (SignalOrigin::Raw(own, _), SignalOrigin::Raw(others, _)) = (&self.origin, &other.origin) else {
+            return false;
+        };
+        let spans = self.span().zip(other.span());
+        own == others && spans.is_some_and(|(a, b)| a.0 <= b.1 && b.0 <= a.1)
+    }
+
+    /// The field of an answer without a definition.
+    fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
+        match &self.origin {
+            SignalOrigin::Raw(_, field) => Some(field),
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) => None,
+        }
+    }
+}
+
 fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     let mut evidence = Evidence::new(index, signal);
     let fits = evidence.low >= -2000.0 && evidence.high <= 2000.0;
@@ -154,6 +211,9 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
         || (signal.dimension == Dimension::None && signal.words.says_current() && signal.words.says_pack());
     if !fits || !is_named {
         return None;
+    }
+    if matches!(signal.origin, SignalOrigin::Raw(..)) {
+        return Some(raw_current(evidence, signal));
     }
     evidence.add(2.0, signal.dimension == Dimension::Current, "unit A");
     evidence.add(2.0, signal.words.says_current(), "its name says current");
@@ -236,6 +296,7 @@ fn temperature_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evide
     (evidence.low, evidence.high) = ends(found.iter().map(|index| &signals[*index].series));
     let text = format!("{} sensors of {:.1} to {:.1} degC", found.len(), evidence.low, evidence.high);
     evidence.add(1.0, evidence.high - evidence.low <= 25.0, &text);
+    evidence.add(1.0, group.pattern.contains("Row"), "");
     evidence.members = found;
     Some(evidence)
 }
@@ -246,7 +307,9 @@ fn temperature(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if !fits || signal.dimension != Dimension::Temperature {
         return None;
     }
-    evidence.add(2.0, true, "unit degC");
+    let is_raw = matches!(signal.origin, SignalOrigin::Raw(..));
+    evidence.add(2.0, !is_raw, "unit degC");
+    evidence.add(1.5, is_raw, "may be a temperature: its scale is a guess");
     evidence.add(1.0, signal.words.says_temperature(), "its name says temperature");
     evidence.add_place(signal);
     // Temperatures of a pack hardly change within minutes.
@@ -308,13 +371,13 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
 /// Finds for each current the voltage that answers to it best, and the other way round; the direction gives the sign.
 fn compare_currents(voltages: &mut [Evidence], currents: &mut [Evidence], signals: &[LogSignal]) {
     for current in currents.iter_mut().take(MAX_COMPARED) {
-        let current_series = &signals[current.members[0]].series;
-        let related = |voltage: &Evidence| relation(&signals[voltage.members[0]].series, current_series);
+        let related = |voltage: &Evidence| relation(&signals[voltage.members[0]], &signals[current.members[0]]);
         let compared = voltages.iter_mut().take(MAX_COMPARED);
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
         // A voltage that is likely by itself is better evidence than one that is not.
+        let weight = |relation: Relation, voltage: &Evidence| relation.correlation.abs() + 0.05 * voltage.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
-        let Some(((slope, correlation), voltage)) = best else { continue };
+        let Some((Relation { slope, correlation, .. }, voltage)) = best else { continue };
         let (direction, verb) = match slope < 0.0 {
             true => (PositiveDirection::Discharge, "falls"),
             false => (PositiveDirection::Charge, "rises"),
@@ -327,23 +390,25 @@ fn compare_currents(voltages: &mut [Evidence], currents: &mut [Evidence], signal
         );
         current.add(3.0 * correlation.abs(), true, &text);
         current.positive = Some(direction);
-        let text = format!("{verb} with {} (correlation {correlation:.2})", current.name);
-        if !voltage.reasons.iter().any(|reason| reason.contains(" with ")) {
+        let text = format!("{verb} when {} rises (correlation {correlation:.2})", current.name);
+        if !voltage.reasons.iter().any(|reason| reason.contains("(correlation")) {
             voltage.add(3.0 * correlation.abs(), true, &text);
         }
     }
 }
 
-fn weight(relation: (f64, f64), voltage: &Evidence) -> f64 {
-    relation.1.abs() + 0.05 * voltage.points
-}
-
-/// Slope and correlation if they are those of a pack.
-fn relation(voltage: &Series, current: &Series) -> Option<(f64, f64)> {
-    let relation = voltage.relation(current)?;
-    let per_volt = relation.slope.abs() / voltage.mean();
-    let is_plausible = (OHM_PER_V.0..=OHM_PER_V.1).contains(&per_volt) && relation.correlation.abs() >= MIN_CORRELATION;
-    is_plausible.then_some((relation.slope, relation.correlation))
+/// How a voltage changes with a current, if that is the way of a pack and no coincidence.
+fn relation(voltage: &LogSignal, current: &LogSignal) -> Option<Relation> {
+    let shares_bits = voltage.shares_bits(current);
+    let relation = voltage.series.relation(&current.series).filter(|_| !shares_bits)?;
+    let per_volt = relation.slope.abs() / voltage.series.mean();
+    // Many fields without names are compared: some agree by chance.
+    let is_raw = voltage.field().is_some() || current.field().is_some();
+    let strength = relation.correlation.abs();
+    let is_significant =
+        strength * (relation.steps as f64).sqrt() >= if is_raw { MIN_STRENGTH_RAW } else { MIN_STRENGTH };
+    let is_plausible = (OHM_PER_V.0..=OHM_PER_V.1).contains(&per_volt);
+    (is_plausible && is_significant && strength >= MIN_CORRELATION).then_some(relation)
 }
 
 fn ends<'a>(series: impl Iterator<Item = &'a Series>) -> (f64, f64) {
@@ -356,8 +421,12 @@ pub(super) fn groups(signals: &[LogSignal]) -> Vec<SignalGroup> {
     for (index, signal) in signals.iter().enumerate() {
         let is_table = !matches!(signal.origin, SignalOrigin::Dbc(_));
         let (texts, numbers) = split_numbers(&signal.name);
-        // A dot in front keeps answers apart from messages of the same name.
-        let skeleton = format!("{}{}", if is_table { "." } else { "" }, texts.join("#"));
+        // Numbers of an answer's own name are no numbers of cells; a dot keeps answers apart from messages.
+        let raw_table = match &signal.origin {
+            SignalOrigin::Raw(key, _) => format!("{key:?}"),
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) => String::new(),
+        };
+        let skeleton = format!("{}{raw_table}{}", if is_table { "." } else { "" }, texts.join("#"));
         found.entry((signal.bus, skeleton)).or_default().push((index, numbers));
     }
     found.into_values().filter(|members| members.len() >= 2).filter_map(|members| group(&members, signals)).collect()

@@ -28,21 +28,30 @@ const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
 /// Largest plausible current, A.
 const MAX_CURRENT_A: f64 = 1500.0;
-/// Codes of no value.
-const ABSENT_8: u64 = 0xFF;
+/// Voltages of 16 bits from here on are the sign of a longer number, or no value.
+const SIGN_16: f64 = 65_280.0;
+/// Fewest sensors of a row of temperatures.
+const MIN_SENSORS: usize = 3;
+/// Sensors of one pack are at most so far apart, K.
+const MAX_SPREAD_C: f64 = 12.0;
 /// Answers to judge a field by.
 const MIN_ANSWERS: usize = 3;
 
-/// Signals that may be in these answers.
-pub(super) fn signals(key: &AnswerKey, answers: &Answers) -> Vec<LogSignal> {
+/// Signals that may be in these answers, beside the bits (first, last) that are described.
+pub(super) fn signals(key: &AnswerKey, answers: &Answers, described: &[(u32, u32)]) -> Vec<LogSignal> {
     let bytes = answers.payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0);
     if answers.payloads.len() < MIN_ANSWERS {
         return Vec::new();
     }
-    let cells = cells(key, answers, bytes);
-    let taken: Vec<(u32, u32)> = cells.iter().filter_map(|signal| signal.span()).collect();
-    let is_free = |bit: u32, length: u32| taken.iter().all(|(low, high)| bit > *high || bit + length <= *low);
-    let mut found = cells;
+    let is_free_of = |taken: &[(u32, u32)], bit: u32, length: u32| {
+        taken.iter().all(|(low, high)| bit > *high || bit + length <= *low)
+    };
+    let mut found = cells(key, answers, bytes);
+    found.extend(temperatures(key, answers, bytes));
+    found.retain(|signal| signal.span().is_some_and(|(low, high)| is_free_of(described, low, high + 1 - low)));
+    let mut taken: Vec<(u32, u32)> = found.iter().filter_map(LogSignal::span).collect();
+    taken.extend(described);
+    let is_free = |bit: u32, length: u32| is_free_of(&taken, bit, length);
     for byte in 0..u32::try_from(bytes).unwrap_or(0) {
         let bit = 8 * byte;
         let rest = 8 * (u32::try_from(bytes).unwrap_or(0) - byte);
@@ -59,8 +68,8 @@ pub(super) fn signals(key: &AnswerKey, answers: &Answers) -> Vec<LogSignal> {
 }
 
 impl LogSignal {
-    /// First and last bit of a field.
-    fn span(&self) -> Option<(u32, u32)> {
+    /// First and last bit of a field without a definition.
+    pub(super) fn span(&self) -> Option<(u32, u32)> {
         let SignalOrigin::Raw(_, field) = &self.origin else { return None };
         Some((field.bit, field.bit + field.length - 1))
     }
@@ -69,7 +78,7 @@ impl LogSignal {
 /// A field with a name that says where it is.
 fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> DiagnosticSignal {
     let unit = match what {
-        "Temperature" => "degC",
+        "Temperature" | "Sensor" => "degC",
         "Current" => "A",
         _ => "V",
     };
@@ -105,7 +114,6 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         origin: SignalOrigin::Raw(*key, Box::new(form)),
         dimension,
         series,
-        scale: 1.0,
     })
 }
 
@@ -117,18 +125,69 @@ pub(super) fn table_name(key: &AnswerKey) -> String {
 }
 
 fn is_plausible(signal: &LogSignal) -> bool {
-    let Series { values, .. } = &signal.series;
+    let (SignalOrigin::Raw(_, field), Series { values, .. }) = (&signal.origin, &signal.series) else { return false };
     let within = |low: f64, high: f64| values.iter().all(|value| (low..=high).contains(value));
     match signal.dimension {
-        Dimension::Voltage => within(PACK_V.0, PACK_V.1),
+        Dimension::Voltage => within(PACK_V.0, PACK_V.1) && signal.series.high() < SIGN_16 * field.factor,
         Dimension::Current => within(-MAX_CURRENT_A, MAX_CURRENT_A) && !signal.series.is_constant(),
         Dimension::Temperature => {
-            let is_absent =
-                values.iter().all(|value| *value == ABSENT_8 as f64 - 40.0 || *value == -1.0 || *value == 0.0);
+            // 0 and 0xFF all the time are no value.
+            let is_absent = values.iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
             within(-35.0, 75.0) && signal.series.largest_step() <= 2.0 && !is_absent
         }
         Dimension::Percent | Dimension::None | Dimension::Other => false,
     }
+}
+
+/// The best row of temperatures: bytes at one distance that are close to one another and hardly change. A place without a
+/// sensor (0xFF) may lie between.
+fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
+    let mut best: Vec<LogSignal> = Vec::new();
+    let mut best_weight = 0;
+    for (distance, offset) in (1..=4).flat_map(|distance| [(distance, 0.0), (distance, -40.0)]) {
+        for first in 0..bytes {
+            let row = temperature_row(key, answers, (first, bytes), distance, offset);
+            let values: std::collections::BTreeSet<u64> =
+                row.iter().flat_map(|signal| &signal.series.values).map(|value| value.to_bits()).collect();
+            // Equal constants are rather bytes of other numbers.
+            let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
+            if row.len() >= MIN_SENSORS && weight > best_weight {
+                (best, best_weight) = (row, weight);
+            }
+        }
+    }
+    best
+}
+
+fn temperature_row(
+    key: &AnswerKey,
+    answers: &Answers,
+    (first, end): (usize, usize),
+    distance: usize,
+    offset: f64,
+) -> Vec<LogSignal> {
+    let is_absent = |byte: usize| answers.payloads.iter().all(|(_, data)| data.get(byte) == Some(&0xFF));
+    let mut row: Vec<LogSignal> = Vec::new();
+    for byte in (first..end).step_by(distance) {
+        if is_absent(byte) && !row.is_empty() {
+            continue;
+        }
+        // A record of which half is absent is no record.
+        if !row.is_empty() && (byte + 1 - distance..byte).any(is_absent) {
+            break;
+        }
+        let mut form = field("Sensor", u32::try_from(8 * byte).unwrap_or(u32::MAX), 8, offset == 0.0, 1.0);
+        (form.name, form.offset) = (format!("Row{first}Sensor{}", row.len() + 1), offset);
+        let next = signal(key, answers, form).filter(is_plausible);
+        let is_near = |signal: &LogSignal| {
+            row.first().is_none_or(|first| (signal.series.mean() - first.series.mean()).abs() <= MAX_SPREAD_C)
+        };
+        match next.filter(is_near) {
+            Some(signal) => row.push(signal),
+            None => break,
+        }
+    }
+    row
 }
 
 /// The longest row of cell voltages, each cell a signal.
@@ -161,7 +220,7 @@ fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) 
     let is_cell = |start: usize| {
         answers.payloads.iter().all(|(_, data)| {
             let code = data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte));
-            (CELL_V.0..=CELL_V.1).contains(&(f64::from(code) * scale))
+            (CELL_V.0..=CELL_V.1).contains(&(f64::from(code) * scale)) && code != u32::MAX >> (32 - 8 * width)
         })
     };
     let value = |start: usize| {

@@ -26,6 +26,8 @@ pub(super) struct Relation {
     pub(super) slope: f64,
     /// Of the changes, -1 to 1.
     pub(super) correlation: f64,
+    /// Changes compared.
+    pub(super) steps: usize,
 }
 
 impl Series {
@@ -63,6 +65,13 @@ impl Series {
         self.values.iter().sum::<f64>() / self.values.len() as f64
     }
 
+    /// Different values among the first hundred.
+    pub(super) fn distinct(&self) -> usize {
+        let values: std::collections::BTreeSet<u64> =
+            self.values.iter().take(100).map(|value| value.to_bits()).collect();
+        values.len()
+    }
+
     pub(super) fn is_constant(&self) -> bool {
         self.low() == self.high()
     }
@@ -83,8 +92,11 @@ impl Series {
                 (xx, xy, yy) = (xx + dx * dx, xy + dx * dy, yy + dy * dy);
             }
         }
-        (steps >= MIN_STEPS && xx > 0.0 && yy > 0.0)
-            .then(|| Relation { slope: xy / xx, correlation: xy / (xx * yy).sqrt() })
+        (steps >= MIN_STEPS && xx > 0.0 && yy > 0.0).then(|| Relation {
+            slope: xy / xx,
+            correlation: xy / (xx * yy).sqrt(),
+            steps,
+        })
     }
 
     /// Time, own value, the other's value nearest in time.

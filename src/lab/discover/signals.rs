@@ -38,8 +38,6 @@ pub(super) struct LogSignal {
     pub(super) is_pack_message: bool,
     /// Values in V, A, degrees Celsius, per cent, or as they are.
     pub(super) series: Series,
-    /// Factor that was applied to the unit of the description.
-    pub(super) scale: f64,
 }
 
 /// Descriptions that the user gave.
@@ -64,9 +62,9 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<Log
         for (index, table) in &tables {
             signals.extend(table.signals.iter().flat_map(|signal| of_definition(key, answers, *index, table, signal)));
         }
-        if tables.is_empty() {
-            signals.extend(raw::signals(key, answers));
-        }
+        let described: Vec<(u32, u32)> =
+            tables.iter().flat_map(|(_, table)| &table.signals).flat_map(DiagnosticSignal::spans).collect();
+        signals.extend(raw::signals(key, answers, &described));
     }
     signals
 }
@@ -101,7 +99,6 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             words: Words::new(&signal.name),
             is_pack_message,
             series: Series::collect(readings, count),
-            scale,
         })
     };
     message.signals.iter().filter_map(of_signal).filter(has_values).collect()
@@ -133,7 +130,6 @@ fn of_definition(
             words: Words::new(&single.name),
             is_pack_message: Words::new(&table.name).says_pack(),
             series: Series::collect(readings, answers.payloads.len()),
-            scale,
         }
     });
     each.filter(has_values).collect()

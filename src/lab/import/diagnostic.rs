@@ -78,6 +78,12 @@ impl DiagnosticSignal {
         self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
     }
 
+    /// First and last bit of each signal of the series.
+    pub(crate) fn spans(&self) -> impl Iterator<Item = (u32, u32)> {
+        let step = self.numbers.map_or(0, |numbers| numbers.step);
+        (0..self.count()).map(move |n| (self.bit + n * step, self.bit + n * step + self.length - 1))
+    }
+
     /// One signal of the series, counted from 0.
     pub(crate) fn of_series(&self, index: u32) -> Self {
         let Some(NumberRange { first, step, .. }) = self.numbers else { return self.clone() };
