@@ -2,7 +2,8 @@
 //!
 //! Exit code 1: a file cannot be read, or the log has no frames. Finding nothing is no failure: the page says so.
 
-use std::path::PathBuf;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use serde_json::json;
@@ -12,9 +13,11 @@ use super::import::read;
 use super::output::{failure, print, print_json, table, unless_closed};
 use super::replay::Bar;
 use crate::can::dbc::Database;
+use crate::config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource, Record};
-use crate::lab::discover::{Candidate, Discoverer, Discovery, Quantity};
+use crate::io::result_file::{ResultFile, check_place};
+use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection, Quantity};
 use crate::lab::import::obdb::ObdbSettings;
 use crate::replay::ReplayProgress;
 
@@ -47,6 +50,27 @@ pub(crate) struct Args {
     /// Print all candidates as one JSON document
     #[arg(long)]
     json: bool,
+    /// Write a configuration of the best candidates; an existing file is replaced
+    #[arg(long, value_name = "PACK.toml", requires = "model")]
+    write: Option<PathBuf>,
+    /// Cell model for --write
+    #[arg(long, value_name = "CELL.toml")]
+    model: Option<PathBuf>,
+    /// Cells in series for --write, where the log has the total voltage alone
+    #[arg(long, value_name = "N", requires = "write", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    cells: Option<u16>,
+    /// What a positive current means, for --write, where the log does not show it
+    #[arg(long, value_enum, requires = "write")]
+    positive: Option<Positive>,
+}
+
+/// Sign of a current on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Positive {
+    /// Positive charges
+    Charge,
+    /// Positive discharges
+    Discharge,
 }
 
 /// Runs the command.
@@ -66,12 +90,62 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("{}: has no frames, must be a log of frames", args.log.display())));
     }
     match args.json {
-        true => unless_closed(print_json(&json!({ "version": VERSION, "discovery": discovery }))),
-        false => print(&page(&discovery)),
+        true => unless_closed(print_json(&json!({ "version": VERSION, "discovery": discovery })))?,
+        false => print(&page(&discovery))?,
+    }
+    match (&args.write, &args.model) {
+        (Some(file), Some(model)) => write(args, &discoverer, &discovery, file, model),
+        _ => Ok(()),
     }
 }
 
-fn database(file: &std::path::Path) -> Result<Database, Failure> {
+/// Writes the configuration if it is a valid one.
+fn write(
+    args: &Args,
+    discoverer: &Discoverer,
+    discovery: &Discovery,
+    file: &Path,
+    model: &Path,
+) -> Result<(), Failure> {
+    let inputs = args.dbc.iter().chain([&args.log]).chain(&args.obdb).chain(&args.model);
+    check_place(file, inputs).map_err(Failure::new)?;
+    let settings = PackSettings {
+        source: args.log.display().to_string(),
+        databases: args.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
+        cell_model: named_from(file, model)?,
+        cells: args.cells,
+        positive: args.positive.map(|positive| match positive {
+            Positive::Charge => PositiveDirection::Charge,
+            Positive::Discharge => PositiveDirection::Discharge,
+        }),
+    };
+    let failed = |what: &str| Failure::new(format!("{}: not written:\n{what}", file.display()));
+    let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.0))?;
+    let read = |path: &Path| if path == file { Ok(pack.text.clone().into_bytes()) } else { std::fs::read(path) };
+    config::load_with(file, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
+    let written = ResultFile::create(file).and_then(|mut out| {
+        out.write_all(pack.text.as_bytes())?;
+        out.finish()
+    });
+    written.map_err(failure)?;
+    eprintln!("{} written; the log does not decide:", file.display());
+    pack.open.iter().for_each(|question| eprintln!("  {question}"));
+    Ok(())
+}
+
+/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
+fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
+    let whole =
+        |path: &Path| std::path::absolute(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())));
+    let (config, file) = (whole(config)?, whole(file)?);
+    let name = match config.parent() {
+        Some(folder) => file.strip_prefix(folder).unwrap_or(&file),
+        None => &file,
+    };
+    Ok(name.display().to_string())
+}
+
+fn database(file: &Path) -> Result<Database, Failure> {
     let fault = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", file.display()));
     let bytes = std::fs::read(file).map_err(|error| fault(&format!("cannot be read: {error}")))?;
     Database::parse_bytes(&bytes).map_err(|error| fault(&error))

@@ -9,6 +9,7 @@
 //! a guess from plausible values.
 
 mod capture;
+mod configuration;
 mod judge;
 mod raw;
 mod series;
@@ -25,7 +26,10 @@ use crate::error::LabError;
 use crate::import::obdb::{self, ObdbSettings};
 use crate::quantity::{BusIndex, Timestamp};
 use capture::Capture;
-use signals::Descriptions;
+use configuration::Writer;
+use signals::{Descriptions, LogSignal};
+
+pub use configuration::{PackConfiguration, PackSettings};
 
 /// What is looked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -83,7 +87,7 @@ pub struct Candidate {
 }
 
 /// What was found.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Serialize)]
 pub struct Discovery {
     /// Candidates by quantity, best first.
     pub candidates: Vec<Candidate>,
@@ -95,8 +99,10 @@ pub struct Discovery {
     pub answers: usize,
     /// Length of the log, s.
     pub seconds: f64,
-    /// Signals of the descriptions that have values in the log.
+    /// Signals that have values in the log.
     pub signals: usize,
+    #[serde(skip)]
+    log_signals: Vec<LogSignal>,
 }
 
 /// Takes a log frame by frame.
@@ -184,6 +190,17 @@ impl Discoverer {
             answers: self.capture.answers.len(),
             seconds: self.capture.seconds(),
             signals: signals.len(),
+            log_signals: signals,
         }
+    }
+
+    /// A configuration of the best candidates of what [`finish`](Self::finish) found.
+    ///
+    /// # Errors
+    /// The questions that the log leaves open and the settings do not answer, one a line.
+    pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
+        let Self { capture, descriptions } = self;
+        let writer = Writer { discovery, capture, descriptions, settings };
+        writer.write().map_err(|questions| LabError(questions.join("\n")))
     }
 }

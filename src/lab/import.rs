@@ -5,6 +5,7 @@
 
 mod diagnostic;
 pub mod obdb;
+pub(crate) mod series;
 
 use std::collections::BTreeMap;
 use std::fmt;

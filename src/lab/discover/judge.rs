@@ -15,6 +15,8 @@ const MIN_POINTS: f64 = 2.5;
 const MAX_CANDIDATES: usize = 10;
 /// Voltages and currents that are compared with each other: the best of each by name, unit and range.
 const MAX_COMPARED: usize = 40;
+/// Groups of cells that are compared with currents.
+const MAX_GROUPS: usize = 5;
 /// Correlation of changes that counts.
 const MIN_CORRELATION: f64 = 0.5;
 /// Correlation times the root of the number of changes: standard deviations from chance.
@@ -66,6 +68,11 @@ impl Evidence {
         }
     }
 
+    /// Whether the values stay within the range of a pack at work.
+    fn is_steady(&self) -> bool {
+        self.high - self.low <= 0.35 * self.high
+    }
+
     /// Evidence of every quantity: where the signal is, and whether it is a measurement.
     fn add_place(&mut self, signal: &LogSignal) {
         let words = &signal.words;
@@ -87,9 +94,12 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
     sort(&mut voltages);
     sort(&mut currents);
     let mut cells: Vec<Evidence> = groups.iter().filter_map(|group| cell_group(group, signals)).collect();
-    cells.extend(usable.iter().filter_map(|index| single_cell(*index, &signals[*index])));
+    let grouped: std::collections::BTreeSet<usize> = cells.iter().flat_map(|group| group.members.clone()).collect();
+    let alone = usable.iter().filter(|index| !grouped.contains(index));
+    cells.extend(alone.filter_map(|index| single_cell(*index, &signals[*index])));
     compare_sums(&mut voltages, &mut cells, signals);
-    compare_currents(&mut voltages, &mut currents, signals);
+    sort(&mut cells);
+    compare_currents(&mut voltages, &mut cells, &mut currents, signals);
     let mut temperatures: Vec<Evidence> = groups.iter().filter_map(|group| temperature_group(group, signals)).collect();
     temperatures.extend(usable.iter().filter_map(|index| temperature(*index, &signals[*index])));
     let percents = |judge: fn(usize, &LogSignal) -> Option<Evidence>| {
@@ -150,8 +160,7 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     evidence.add_place(signal);
     evidence.add(-3.0, signal.words.says_cell(), "its name says cell");
     evidence.add(-2.0, signal.words.says_extreme(), "its name says extreme");
-    let is_steady = evidence.high - evidence.low <= 0.35 * evidence.high;
-    evidence.add(1.0, is_steady, "range of a pack at work");
+    evidence.add(1.0, evidence.is_steady(), "range of a pack at work");
     evidence.add(-1.0, evidence.high < 60.0, "");
     Some(evidence)
 }
@@ -355,7 +364,7 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
     for group in cells.iter_mut().filter(|group| group.members.len() >= 8) {
         let sum: f64 = group.members.iter().map(|index| signals[*index].series.mean()).sum();
         let mut is_found = false;
-        for voltage in voltages.iter_mut() {
+        for voltage in voltages.iter_mut().filter(|voltage| voltage.is_steady()) {
             let mean = signals[voltage.members[0]].series.mean();
             if (mean / sum - 1.0).abs() <= SUM_TOLERANCE {
                 voltage.add(4.0, true, &format!("the sum of {} is {sum:.1} V", group.name));
@@ -369,10 +378,16 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
 }
 
 /// Finds for each current the voltage that answers to it best, and the other way round; the direction gives the sign.
-fn compare_currents(voltages: &mut [Evidence], currents: &mut [Evidence], signals: &[LogSignal]) {
+/// A group of cells stands beside the pack voltages with its first cell.
+fn compare_currents(
+    voltages: &mut [Evidence],
+    cells: &mut [Evidence],
+    currents: &mut [Evidence],
+    signals: &[LogSignal],
+) {
     for current in currents.iter_mut().take(MAX_COMPARED) {
         let related = |voltage: &Evidence| relation(&signals[voltage.members[0]], &signals[current.members[0]]);
-        let compared = voltages.iter_mut().take(MAX_COMPARED);
+        let compared = voltages.iter_mut().take(MAX_COMPARED).chain(cells.iter_mut().take(MAX_GROUPS));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
         // A voltage that is likely by itself is better evidence than one that is not.
         let weight = |relation: Relation, voltage: &Evidence| relation.correlation.abs() + 0.05 * voltage.points;

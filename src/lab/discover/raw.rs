@@ -114,6 +114,7 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         origin: SignalOrigin::Raw(*key, Box::new(form)),
         dimension,
         series,
+        scale: 1.0,
     })
 }
 

@@ -17,6 +17,8 @@ pub(super) struct Series {
     pub(super) values: Vec<f64>,
     /// Readings without a value: outside the range, too short, not available.
     pub(super) bad: usize,
+    /// Time from one reading to the next, mean, s.
+    pub(super) period_s: f64,
 }
 
 /// How one signal changes when another does.
@@ -43,6 +45,9 @@ impl Series {
                 }
                 None => series.bad += 1,
             }
+        }
+        if let (Some(first), Some(last), 2..) = (series.times.first(), series.times.last(), series.times.len()) {
+            series.period_s = (last - first) / (every * (series.times.len() - 1)) as f64;
         }
         series
     }

@@ -38,6 +38,8 @@ pub(super) struct LogSignal {
     pub(super) is_pack_message: bool,
     /// Values in V, A, degrees Celsius, per cent, or as they are.
     pub(super) series: Series,
+    /// Factor from the description's unit to V, A, degrees Celsius or per cent.
+    pub(super) scale: f64,
 }
 
 /// Descriptions that the user gave.
@@ -99,6 +101,7 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             words: Words::new(&signal.name),
             is_pack_message,
             series: Series::collect(readings, count),
+            scale,
         })
     };
     message.signals.iter().filter_map(of_signal).filter(has_values).collect()
@@ -130,6 +133,7 @@ fn of_definition(
             words: Words::new(&single.name),
             is_pack_message: Words::new(&table.name).says_pack(),
             series: Series::collect(readings, answers.payloads.len()),
+            scale,
         }
     });
     each.filter(has_values).collect()

@@ -9,7 +9,6 @@
 
 mod address;
 mod document;
-mod series;
 mod signal;
 #[cfg(test)]
 mod tests;
@@ -19,7 +18,7 @@ use std::fmt::Write as _;
 
 use serde_json::Value;
 
-use super::{DiagnosticSignal, DiagnosticTable, Exclusion, ExclusionReason, ImportResult};
+use super::{DiagnosticSignal, DiagnosticTable, Exclusion, ExclusionReason, ImportResult, series};
 use crate::error::LabError;
 use address::Addresses;
 use document::{CommandDocument, SignalDocument, SignalSetDocument};

@@ -15,7 +15,7 @@ struct NumberedName<'a> {
 }
 
 /// Joins what belongs to one series; `signals` are in the order of their bits.
-pub(super) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
+pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     let mut joined: Vec<DiagnosticSignal> = Vec::new();
     let mut rest = signals.as_slice();
     while let Some((first, after)) = rest.split_first() {
