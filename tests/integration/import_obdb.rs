@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use toml::Value;
 
-fn folder() -> Option<PathBuf> {
+pub(crate) fn folder() -> Option<PathBuf> {
     let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let data = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from);
     // Beside the folder of data, or in it.
@@ -101,14 +101,14 @@ fn read(signal: &toml::Table, bit: i64, data: &[u8]) -> Option<Reading> {
 
 /// One test case of a file: expected values by id, and the text with the frames.
 #[derive(Debug, Default)]
-struct Case {
+pub(crate) struct Case {
     expected: Vec<(String, String)>,
     response: String,
 }
 
 /// Reads a file of cases: below `expected_values` lines `ID: VALUE`, below `response` frames, as lines of a block (`|-`) or in
 /// one text in quotes, in which `\n` ends a frame and the end of a line is a blank.
-fn cases(text: &str) -> Vec<Case> {
+pub(crate) fn cases(text: &str) -> Vec<Case> {
     let mut cases: Vec<Case> = Vec::new();
     for line in text.lines().map(str::trim_end) {
         if line.starts_with("- ") {
@@ -128,7 +128,7 @@ fn cases(text: &str) -> Vec<Case> {
 }
 
 impl Case {
-    fn frames(&self) -> Vec<String> {
+    pub(crate) fn frames(&self) -> Vec<String> {
         let lines = self.response.split("\\n");
         let digits = lines.map(|line| line.chars().filter(char::is_ascii_alphanumeric).collect::<String>());
         digits.filter(|digits| !digits.is_empty()).collect()

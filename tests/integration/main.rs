@@ -18,6 +18,8 @@ mod capacity_peers;
 mod check_cli;
 mod contactor;
 mod dbc_vectors;
+#[cfg(feature = "lab")]
+mod discover_cli;
 mod diagnostic;
 mod doctor;
 mod e2e_peer;

@@ -3,7 +3,7 @@
 //! What the log decides is written; what it does not (the cell model, which sensor belongs to which cells, limits and alarms)
 //! is listed. The sign of the current and the number of cells are never guessed: without evidence they are questions.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use super::capture::{AnswerKey, Capture};
@@ -74,6 +74,8 @@ impl Writer<'_> {
         self.limits(&selection, &mut text);
         open.push(format!("cell_model = {:?}: is it this cell?", self.settings.cell_model));
         open.push("alarms, limits of current and temperature: see the reference of keys".to_owned());
+        let mut known = BTreeSet::new();
+        open.retain(|question: &String| known.insert(question.clone()));
         text.push_str("\n# Not decided by the log:\n");
         for question in &open {
             let _ = writeln!(text, "# - {}", plain(question));
@@ -272,6 +274,15 @@ impl Writer<'_> {
             };
             table.signals.retain(is_used);
             table.remarks.clear();
+            for signal in &mut table.signals {
+                let full_name = format!("{name}.{}", signal.name);
+                if self.discovery.log_signals.iter().any(|other| other.is_read_signed && other.name == full_name) {
+                    *signal = signal.as_signed();
+                    table
+                        .remarks
+                        .push(format!("{} is unsigned in the source, its values are of a signed number.", signal.name));
+                }
+            }
             Some(table)
         };
         (names.into_iter().filter_map(table).collect(), fields)
@@ -302,7 +313,12 @@ impl Writer<'_> {
                 remarks,
                 signals: series::join(signals),
             };
-            open.push(format!("{}: are the scales right? compare with the dashboard", table.name));
+            let names: Vec<&str> = table.signals.iter().map(|signal| signal.name.as_str()).collect();
+            let names = names.join(", ");
+            open.push(format!(
+                "{} {names}: found by their values alone, are they right? compare with the dashboard",
+                table.name
+            ));
             let _ = write!(text, "\n{table}");
         }
     }

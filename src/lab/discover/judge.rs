@@ -3,6 +3,7 @@
 //! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
 //! count 2 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
+use super::raw;
 use super::series::{Relation, Series};
 use super::signals::{LogSignal, SignalOrigin};
 use super::words::Dimension;
@@ -41,6 +42,8 @@ pub(super) struct Evidence {
     low: f64,
     high: f64,
     positive: Option<PositiveDirection>,
+    /// A pack voltage that is the sum of cells.
+    is_sum: bool,
 }
 
 /// Signals whose names differ in numbers alone.
@@ -56,7 +59,7 @@ impl Evidence {
     fn new(index: usize, signal: &LogSignal) -> Self {
         let (low, high) = (signal.series.low(), signal.series.high());
         let (members, name, bus) = (vec![index], signal.name.clone(), signal.bus);
-        Self { members, name, bus, points: 0.0, reasons: Vec::new(), low, high, positive: None }
+        Self { members, name, bus, points: 0.0, reasons: Vec::new(), low, high, positive: None, is_sum: false }
     }
 
     fn add(&mut self, points: f64, holds: bool, reason: &str) {
@@ -229,6 +232,7 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     evidence.add_place(signal);
     evidence.add(-2.0, signal.words.says_extreme(), "its name says extreme");
     evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
+    evidence.add(0.0, signal.is_read_signed, "its definition says unsigned, its values are of a signed number");
     evidence.add(-1.5, evidence.low == 0.0 && evidence.high == 0.0, "is 0 all the time");
     Some(evidence)
 }
@@ -367,6 +371,7 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
         for voltage in voltages.iter_mut().filter(|voltage| voltage.is_steady()) {
             let mean = signals[voltage.members[0]].series.mean();
             if (mean / sum - 1.0).abs() <= SUM_TOLERANCE {
+                voltage.is_sum = true;
                 voltage.add(4.0, true, &format!("the sum of {} is {sum:.1} V", group.name));
                 if !is_found {
                     group.add(3.0, true, &format!("their sum, {sum:.1} V, is {}", voltage.name));
@@ -385,9 +390,15 @@ fn compare_currents(
     currents: &mut [Evidence],
     signals: &[LogSignal],
 ) {
+    // A field without a name is compared only where nothing better is known.
+    let is_known = |voltage: &Evidence| {
+        voltage.is_sum || signals[voltage.members[0]].field().is_none() || voltage.members.len() > 1
+    };
+    let has_known = voltages.iter().chain(cells.iter()).any(is_known);
     for current in currents.iter_mut().take(MAX_COMPARED) {
         let related = |voltage: &Evidence| relation(&signals[voltage.members[0]], &signals[current.members[0]]);
         let compared = voltages.iter_mut().take(MAX_COMPARED).chain(cells.iter_mut().take(MAX_GROUPS));
+        let compared = compared.filter(|voltage| !has_known || is_known(voltage));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
         // A voltage that is likely by itself is better evidence than one that is not.
         let weight = |relation: Relation, voltage: &Evidence| relation.correlation.abs() + 0.05 * voltage.points;
@@ -438,7 +449,8 @@ pub(super) fn groups(signals: &[LogSignal]) -> Vec<SignalGroup> {
         let (texts, numbers) = split_numbers(&signal.name);
         // Numbers of an answer's own name are no numbers of cells; a dot keeps answers apart from messages.
         let raw_table = match &signal.origin {
-            SignalOrigin::Raw(key, _) => format!("{key:?}"),
+            SignalOrigin::Raw(key, field) if !field.name.starts_with(raw::CELL) => format!("{key:?}"),
+            SignalOrigin::Raw(key, _) => key.response.to_string(),
             SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) => String::new(),
         };
         let skeleton = format!("{}{raw_table}{}", if is_table { "." } else { "" }, texts.join("#"));

@@ -5,12 +5,18 @@
 //! are all plausible voltages close to one another. Other fields are tried at every byte with customary scales; which of
 //! them is what is judged from their values, as for named signals.
 
+use std::collections::BTreeMap;
+
 use super::capture::{AnswerKey, Answers};
 use super::series::Series;
 use super::signals::{LogSignal, SignalOrigin};
 use super::words::{Dimension, Words};
+use crate::can::CanId;
 use crate::import::{DiagnosticSignal, NumberRange};
+use crate::quantity::BusIndex;
 
+/// Name of a cell, before its number.
+pub(super) const CELL: &str = "Cell";
 /// Fewest neighbours of a row of cells.
 const MIN_CELLS: usize = 8;
 /// Plausible voltages of a cell in use, V.
@@ -37,8 +43,17 @@ const MAX_SPREAD_C: f64 = 12.0;
 /// Answers to judge a field by.
 const MIN_ANSWERS: usize = 3;
 
+/// Rows of cells so far, by controller, first bit, length and scale: a row of the same form in the next answer continues it.
+#[derive(Debug, Default)]
+pub(super) struct CellRows(BTreeMap<(BusIndex, CanId, Option<u8>, u32, u32, u64), u32>);
+
 /// Signals that may be in these answers, beside the bits (first, last) that are described.
-pub(super) fn signals(key: &AnswerKey, answers: &Answers, described: &[(u32, u32)]) -> Vec<LogSignal> {
+pub(super) fn signals(
+    key: &AnswerKey,
+    answers: &Answers,
+    described: &[(u32, u32)],
+    rows: &mut CellRows,
+) -> Vec<LogSignal> {
     let bytes = answers.payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0);
     if answers.payloads.len() < MIN_ANSWERS {
         return Vec::new();
@@ -46,7 +61,7 @@ pub(super) fn signals(key: &AnswerKey, answers: &Answers, described: &[(u32, u32
     let is_free_of = |taken: &[(u32, u32)], bit: u32, length: u32| {
         taken.iter().all(|(low, high)| bit > *high || bit + length <= *low)
     };
-    let mut found = cells(key, answers, bytes);
+    let mut found = cells(key, answers, bytes, rows);
     found.extend(temperatures(key, answers, bytes));
     found.retain(|signal| signal.span().is_some_and(|(low, high)| is_free_of(described, low, high + 1 - low)));
     let mut taken: Vec<(u32, u32)> = found.iter().filter_map(LogSignal::span).collect();
@@ -105,6 +120,11 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         "A" => Dimension::Current,
         _ => Dimension::Voltage,
     };
+    // Cells are numbered through all answers, other fields are named by their answer.
+    let mut form = form;
+    if !form.name.starts_with(CELL) {
+        form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
+    }
     (series.values.len() >= MIN_ANSWERS).then(|| LogSignal {
         name: format!("{}.{}", table_name(key), form.name),
         bus: key.bus,
@@ -114,15 +134,15 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         origin: SignalOrigin::Raw(*key, Box::new(form)),
         dimension,
         series,
+        is_read_signed: false,
         scale: 1.0,
     })
 }
 
-/// Name of the table of an answer: `Answer7BB_2102`.
+/// Name of the tables of a controller's answers: `Answer7BB`.
 pub(super) fn table_name(key: &AnswerKey) -> String {
     let extension = key.extension.map(|byte| format!("_{byte:02X}")).unwrap_or_default();
-    let digits = if key.service == 0x22 { 4 } else { 2 };
-    format!("Answer{}{extension}_{:02X}{:0digits$X}", key.response, key.service, key.identifier)
+    format!("Answer{}{extension}", key.response)
 }
 
 fn is_plausible(signal: &LogSignal) -> bool {
@@ -192,7 +212,7 @@ fn temperature_row(
 }
 
 /// The longest row of cell voltages, each cell a signal.
-fn cells(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
+fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) -> Vec<LogSignal> {
     let mut best: Option<(usize, DiagnosticSignal)> = None;
     for (length, scales) in CELL_SCALES {
         let width = length as usize / 8;
@@ -210,10 +230,13 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
         }
     }
     let Some((count, mut form)) = best else { return Vec::new() };
-    let last = u32::try_from(count).unwrap_or(1);
-    form.name = "Cell{n}".to_owned();
-    form.numbers = Some(NumberRange { first: 1, last, step: form.length });
-    (0..last).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
+    let count = u32::try_from(count).unwrap_or(1);
+    let form_key = (key.bus, key.response, key.extension, form.bit, form.length, form.factor.to_bits());
+    let before = rows.0.entry(form_key).or_default();
+    form.name = format!("{CELL}{{n}}");
+    form.numbers = Some(NumberRange { first: *before + 1, last: *before + count, step: form.length });
+    *before += count;
+    (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
 }
 
 /// Length and first byte of the longest run of plausible neighbours that begin at `first`, `first + width`, ...

@@ -38,6 +38,8 @@ pub(super) struct LogSignal {
     pub(super) is_pack_message: bool,
     /// Values in V, A, degrees Celsius, per cent, or as they are.
     pub(super) series: Series,
+    /// Its definition says unsigned, its values are of a signed number.
+    pub(super) is_read_signed: bool,
     /// Factor from the description's unit to V, A, degrees Celsius or per cent.
     pub(super) scale: f64,
 }
@@ -52,6 +54,7 @@ pub(super) struct Descriptions {
 /// Every signal of the log with values, in a fixed order.
 pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<LogSignal> {
     let mut signals = Vec::new();
+    let mut rows = raw::CellRows::default();
     for (key, payloads) in &capture.messages {
         for (file, database) in descriptions.databases.iter().enumerate() {
             let messages = database.messages.iter().filter(|message| message.id == key.1);
@@ -66,7 +69,7 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<Log
         }
         let described: Vec<(u32, u32)> =
             tables.iter().flat_map(|(_, table)| &table.signals).flat_map(DiagnosticSignal::spans).collect();
-        signals.extend(raw::signals(key, answers, &described));
+        signals.extend(raw::signals(key, answers, &described, &mut rows));
     }
     signals
 }
@@ -101,6 +104,7 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             words: Words::new(&signal.name),
             is_pack_message,
             series: Series::collect(readings, count),
+            is_read_signed: false,
             scale,
         })
     };
@@ -124,7 +128,7 @@ fn of_definition(
     let (dimension, scale) = dimension(&signal.unit);
     let each = (0..signal.count()).map(|n| {
         let single = signal.of_series(n);
-        let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, single.value(data).map(|v| v * scale)));
+        let (series, is_read_signed) = values(answers, &single, scale, dimension);
         LogSignal {
             name: format!("{}.{}", table.name, single.name),
             bus: key.bus,
@@ -132,11 +136,28 @@ fn of_definition(
             dimension,
             words: Words::new(&single.name),
             is_pack_message: Words::new(&table.name).says_pack(),
-            series: Series::collect(readings, answers.payloads.len()),
+            series,
+            is_read_signed,
             scale,
         }
     });
     each.filter(has_values).collect()
+}
+
+/// Values of a defined signal. A current that its definition calls unsigned is read as a signed number where that brings
+/// values at both ends of its codes together: a few negative amperes look like thousands.
+fn values(answers: &Answers, signal: &DiagnosticSignal, scale: f64, dimension: Dimension) -> (Series, bool) {
+    let collect = |signal: &DiagnosticSignal| {
+        let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, signal.value(data).map(|v| v * scale)));
+        Series::collect(readings, answers.payloads.len())
+    };
+    let series = collect(signal);
+    if signal.signed || dimension != Dimension::Current || series.is_constant() {
+        return (series, false);
+    }
+    let signed = collect(&signal.as_signed());
+    let is_nearer = signed.bad <= series.bad && signed.high() - signed.low() < (series.high() - series.low()) / 4.0;
+    if is_nearer { (signed, true) } else { (series, false) }
 }
 
 fn has_values(signal: &LogSignal) -> bool {

@@ -91,6 +91,11 @@ impl DiagnosticSignal {
         Self { name, bit: self.bit + index * step, numbers: None, ..self.clone() }
     }
 
+    /// The same bits as two's complement, without a range.
+    pub(crate) fn as_signed(&self) -> Self {
+        Self { signed: true, range: None, ..self.clone() }
+    }
+
     /// Its value in the data behind the echoed service and identifier; `None` = beyond their end, not available or out of the
     /// range.
     pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
