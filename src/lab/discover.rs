@@ -2,7 +2,7 @@
 //! controller's own SOC and SOH.
 //!
 //! In: frames with times; DBC files and definitions of diagnostic answers, if there are any. Out: ranked candidates of each
-//! quantity, each with its reasons in plain words. Answers to diagnostic requests are read whoever asked; those that no
+//! quantity, each with its reasons in plain words. Answers to diagnostic requests are read, whatever device asked; those that no
 //! definition describes are searched for rows of cell voltages and other fields. Memory is bounded, any frames are accepted.
 //!
 //! It proposes, the owner decides: names mislead, and a car at rest shows little. The scale of a field without a definition is
