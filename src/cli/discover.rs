@@ -9,10 +9,9 @@ use std::sync::atomic::Ordering;
 use serde_json::json;
 
 use super::Failure;
-use super::import::read;
+use super::import::{database, read};
 use super::output::{failure, print, print_json, table, unless_closed};
 use super::replay::Bar;
-use crate::can::dbc::Database;
 use crate::config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource, Record};
@@ -143,12 +142,6 @@ fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
         None => &file,
     };
     Ok(name.display().to_string())
-}
-
-fn database(file: &Path) -> Result<Database, Failure> {
-    let fault = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", file.display()));
-    let bytes = std::fs::read(file).map_err(|error| fault(&format!("cannot be read: {error}")))?;
-    Database::parse_bytes(&bytes).map_err(|error| fault(&error))
 }
 
 /// Passes every frame on; returns the names of the interfaces.

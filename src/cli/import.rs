@@ -8,8 +8,10 @@ use std::path::{Path, PathBuf};
 
 use super::Failure;
 use super::output::{failure, unless_closed};
+use crate::can::dbc::Database;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::import::ImportResult;
+use crate::lab::import::dbc;
 use crate::lab::import::obdb::{self, ObdbSettings};
 
 /// Largest file read; the largest known signal set has 0.5 MB.
@@ -26,6 +28,18 @@ pub(crate) struct Args {
 enum ImportCommand {
     /// Convert an OBDb signal set (JSON) to [[input.diagnostic]] tables
     Obdb(ObdbArgs),
+    /// Write the likely battery signals of a DBC as the [input] part of a configuration, by name, unit and range
+    Dbc(DbcArgs),
+}
+
+/// Arguments of `import dbc`.
+#[derive(Debug, clap::Args)]
+struct DbcArgs {
+    /// DBC file
+    #[arg(value_name = "FILE.dbc")]
+    file: PathBuf,
+    #[command(flatten)]
+    output: OutputArgs,
 }
 
 /// Arguments of `import obdb`.
@@ -61,7 +75,21 @@ struct OutputArgs {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         ImportCommand::Obdb(args) => import_obdb(args),
+        ImportCommand::Dbc(args) => import_dbc(args),
     }
+}
+
+fn import_dbc(args: &DbcArgs) -> Result<(), Failure> {
+    check_place(&args.output.output, std::iter::once(&args.file)).map_err(Failure::new)?;
+    let text = dbc::import(&database(&args.file)?, &args.file.display().to_string()).map_err(failure)?;
+    write(&args.output.output, &text)
+}
+
+/// A DBC file, read.
+pub(super) fn database(file: &Path) -> Result<Database, Failure> {
+    let fault = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", file.display()));
+    let bytes = std::fs::read(file).map_err(|error| fault(&format!("cannot be read: {error}")))?;
+    Database::parse_bytes(&bytes).map_err(|error| fault(&error))
 }
 
 fn import_obdb(args: &ObdbArgs) -> Result<(), Failure> {

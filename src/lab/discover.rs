@@ -10,13 +10,14 @@
 
 mod capture;
 mod configuration;
+pub(crate) mod groups;
 mod judge;
 mod raw;
 mod series;
 mod signals;
 #[cfg(test)]
 mod tests;
-mod words;
+pub(crate) mod words;
 
 use serde::Serialize;
 

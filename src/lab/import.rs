@@ -3,6 +3,7 @@
 //! In: the text of a file. Out: TOML a person can read and edit, and a list of everything that was left out, with place and
 //! reason. Pure: nothing is read or written here.
 
+pub mod dbc;
 mod diagnostic;
 pub mod obdb;
 pub(crate) mod series;

@@ -48,6 +48,9 @@ pub(super) struct AnswerKey {
     pub(super) identifier: u16,
 }
 
+/// A request: its time, s, its identifier and first byte with extended addressing.
+type HeardRequest = (f64, CanId, Option<u8>);
+
 /// Answers of one kind.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
@@ -70,7 +73,7 @@ pub(super) struct Capture {
     /// Frames of messages beyond [`MAX_MESSAGES`].
     pub(super) ignored: u64,
     receivers: BTreeMap<(MessageKey, Option<u8>), Receiver>,
-    requests: BTreeMap<(BusIndex, u8, u16), (f64, CanId, Option<u8>)>,
+    requests: BTreeMap<(BusIndex, u8, u16), HeardRequest>,
     start: Option<Timestamp>,
     latest_s: f64,
     bytes: usize,

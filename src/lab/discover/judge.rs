@@ -3,6 +3,7 @@
 //! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
 //! count 2 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
+use super::groups::{SignalGroup, groups};
 use super::raw;
 use super::series::{Relation, Series};
 use super::signals::{LogSignal, SignalOrigin};
@@ -46,15 +47,6 @@ pub(super) struct Evidence {
     is_sum: bool,
 }
 
-/// Signals whose names differ in numbers alone.
-#[derive(Debug, Clone)]
-pub(super) struct SignalGroup {
-    /// Name with `{n}`, and `{m}` for further numbers.
-    pub(super) pattern: String,
-    /// Signals by their number.
-    pub(super) members: Vec<(u32, usize)>,
-}
-
 impl Evidence {
     fn new(index: usize, signal: &LogSignal) -> Self {
         let (low, high) = (signal.series.low(), signal.series.high());
@@ -89,7 +81,7 @@ impl Evidence {
 
 /// Candidates of every quantity, best first.
 pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Candidate> {
-    let groups = groups(signals);
+    let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
     let usable: Vec<usize> =
         (0..signals.len()).filter(|index| signals[*index].series.valid_share() >= MIN_VALID).collect();
     let mut voltages: Vec<Evidence> = usable.iter().filter_map(|index| voltage(*index, &signals[*index])).collect();
@@ -117,6 +109,17 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
         (Quantity::Soh, percents(soh)),
     ];
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
+}
+
+/// Only signals of one interface and source form groups. Numbers of an answer's own name are no numbers of cells.
+fn partition(signal: &LogSignal) -> String {
+    let source = match &signal.origin {
+        SignalOrigin::Dbc(_) => String::new(),
+        SignalOrigin::Defined(_) => "defined".to_owned(),
+        SignalOrigin::Raw(key, field) if !field.name.starts_with(raw::CELL) => format!("{key:?}"),
+        SignalOrigin::Raw(key, _) => key.response.to_string(),
+    };
+    format!("{} {source}", signal.bus.index())
 }
 
 fn sort(evidence: &mut [Evidence]) {
@@ -439,62 +442,4 @@ fn relation(voltage: &LogSignal, current: &LogSignal) -> Option<Relation> {
 
 fn ends<'a>(series: impl Iterator<Item = &'a Series>) -> (f64, f64) {
     series.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), one| (low.min(one.low()), high.max(one.high())))
-}
-
-/// Groups of at least two signals of one interface whose names differ in numbers alone.
-pub(super) fn groups(signals: &[LogSignal]) -> Vec<SignalGroup> {
-    let mut found: std::collections::BTreeMap<(BusIndex, String), Vec<(usize, Vec<&str>)>> = Default::default();
-    for (index, signal) in signals.iter().enumerate() {
-        let is_table = !matches!(signal.origin, SignalOrigin::Dbc(_));
-        let (texts, numbers) = split_numbers(&signal.name);
-        // Numbers of an answer's own name are no numbers of cells; a dot keeps answers apart from messages.
-        let raw_table = match &signal.origin {
-            SignalOrigin::Raw(key, field) if !field.name.starts_with(raw::CELL) => format!("{key:?}"),
-            SignalOrigin::Raw(key, _) => key.response.to_string(),
-            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) => String::new(),
-        };
-        let skeleton = format!("{}{raw_table}{}", if is_table { "." } else { "" }, texts.join("#"));
-        found.entry((signal.bus, skeleton)).or_default().push((index, numbers));
-    }
-    found.into_values().filter(|members| members.len() >= 2).filter_map(|members| group(&members, signals)).collect()
-}
-
-fn group(members: &[(usize, Vec<&str>)], signals: &[LogSignal]) -> Option<SignalGroup> {
-    let numbers = &members[0].1;
-    let distinct = |at: usize| {
-        let values: std::collections::BTreeSet<&str> = members.iter().map(|(_, numbers)| numbers[at]).collect();
-        values.len()
-    };
-    let counted = (0..numbers.len()).max_by_key(|at| (distinct(*at), *at)).filter(|at| distinct(*at) >= 2)?;
-    let (texts, _) = split_numbers(&signals[members[0].0].name);
-    let mut pattern = texts[0].to_owned();
-    for (at, text) in texts.iter().enumerate().skip(1) {
-        let number = at - 1;
-        let part = if number == counted {
-            "{n}"
-        } else if distinct(number) > 1 {
-            "{m}"
-        } else {
-            numbers[number]
-        };
-        pattern = pattern + part + text;
-    }
-    let numbered = members.iter().filter_map(|(index, numbers)| Some((numbers[counted].parse().ok()?, *index)));
-    let mut numbered: Vec<(u32, usize)> = numbered.collect();
-    numbered.sort_unstable();
-    numbered.dedup_by_key(|member| member.0);
-    (numbered.len() == members.len()).then_some(SignalGroup { pattern, members: numbered })
-}
-
-/// The texts between the numbers of a name (one more than numbers), and the numbers.
-fn split_numbers(name: &str) -> (Vec<&str>, Vec<&str>) {
-    let (mut texts, mut numbers, mut rest) = (Vec::new(), Vec::new(), name);
-    while let Some(start) = rest.find(|c: char| c.is_ascii_digit()) {
-        let length = rest[start..].bytes().take_while(u8::is_ascii_digit).count();
-        texts.push(&rest[..start]);
-        numbers.push(&rest[start..start + length]);
-        rest = &rest[start + length..];
-    }
-    texts.push(rest);
-    (texts, numbers)
 }

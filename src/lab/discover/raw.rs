@@ -45,7 +45,10 @@ const MIN_ANSWERS: usize = 3;
 
 /// Rows of cells so far, by controller, first bit, length and scale: a row of the same form in the next answer continues it.
 #[derive(Debug, Default)]
-pub(super) struct CellRows(BTreeMap<(BusIndex, CanId, Option<u8>, u32, u32, u64), u32>);
+pub(super) struct CellRows(BTreeMap<RowForm, u32>);
+
+/// Controller, first bit, length and bits of the scale.
+type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, u64);
 
 /// Signals that may be in these answers, beside the bits (first, last) that are described.
 pub(super) fn signals(
@@ -251,7 +254,8 @@ fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) 
         let data = answers.payloads.iter().next().map_or(&[][..], |(_, data)| data);
         scale * f64::from(data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte)))
     };
-    let (mut best, mut run): (Option<(usize, usize)>, Option<(usize, usize)>) = (None, None);
+    let mut best: Option<(usize, usize)> = None;
+    let mut run: Option<(usize, usize)> = None;
     for start in (first..bytes).step_by(width).filter(|start| start + width <= bytes) {
         run = match run {
             _ if !is_cell(start) => None,

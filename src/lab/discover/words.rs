@@ -2,7 +2,7 @@
 
 /// What a unit measures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Dimension {
+pub(crate) enum Dimension {
     /// V; mV have a factor of 0.001.
     Voltage,
     /// A.
@@ -18,7 +18,7 @@ pub(super) enum Dimension {
 }
 
 /// Dimension of a unit, and the factor to V, A, degrees Celsius or per cent.
-pub(super) fn dimension(unit: &str) -> (Dimension, f64) {
+pub(crate) fn dimension(unit: &str) -> (Dimension, f64) {
     match unit.trim() {
         "V" | "v" | "Volt" | "Volts" | "volt" | "volts" => (Dimension::Voltage, 1.0),
         "mV" | "mv" => (Dimension::Voltage, 1e-3),
@@ -33,7 +33,7 @@ pub(super) fn dimension(unit: &str) -> (Dimension, f64) {
 
 /// Words of a name, lower case: split at every change of case, at digits and at anything else.
 #[derive(Debug)]
-pub(super) struct Words {
+pub(crate) struct Words {
     words: Vec<String>,
     whole: String,
 }
@@ -43,6 +43,7 @@ const PACK: &[&str] = &["batt", "akku", "pack", "bms", "traction", "hvb", "=hv",
 /// Words of other devices and of the 12 V battery.
 const ELSEWHERE: &[&str] = &[
     "12v",
+    "twelvevolt",
     "=lv",
     "aux",
     "starter",
@@ -132,7 +133,7 @@ const EXTREME: &[&str] = &["max", "min", "highest", "lowest"];
 
 impl Words {
     /// Splits a name.
-    pub(super) fn new(name: &str) -> Self {
+    pub(crate) fn new(name: &str) -> Self {
         let chars: Vec<char> = name.chars().collect();
         let mut words = vec![String::new()];
         for (index, &c) in chars.iter().enumerate() {
@@ -160,49 +161,49 @@ impl Words {
         })
     }
 
-    pub(super) fn says_pack(&self) -> bool {
+    pub(crate) fn says_pack(&self) -> bool {
         self.has(PACK)
     }
 
-    pub(super) fn says_elsewhere(&self) -> bool {
+    pub(crate) fn says_elsewhere(&self) -> bool {
         self.has(ELSEWHERE)
     }
 
-    pub(super) fn says_no_measurement(&self) -> bool {
+    pub(crate) fn says_no_measurement(&self) -> bool {
         self.has(NO_MEASUREMENT)
     }
 
-    pub(super) fn says_extreme(&self) -> bool {
+    pub(crate) fn says_extreme(&self) -> bool {
         self.has(EXTREME)
     }
 
-    pub(super) fn says_voltage(&self) -> bool {
+    pub(crate) fn says_voltage(&self) -> bool {
         self.has(&["volt", "spannung", "=v", "=u", "vdc", "=vbat", "=vbatt", "=ubatt"])
     }
 
-    pub(super) fn says_current(&self) -> bool {
+    pub(crate) fn says_current(&self) -> bool {
         self.has(&["curr", "strom", "amp", "=i", "=ibat", "=ibatt", "=a"])
     }
 
-    pub(super) fn says_cell(&self) -> bool {
+    pub(crate) fn says_cell(&self) -> bool {
         self.has(&["cell", "brick", "cmu", "zelle", "=vc"])
     }
 
-    pub(super) fn says_temperature(&self) -> bool {
+    pub(crate) fn says_temperature(&self) -> bool {
         self.has(&["temp", "=t", "=tmp"])
     }
 
-    pub(super) fn says_soc(&self) -> bool {
+    pub(crate) fn says_soc(&self) -> bool {
         self.has(&["=soc", "stateofcharge", "state_of_charge", "socave", "socui", "socdisp"])
             || self.words.iter().any(|word| word.starts_with("soc") && word.len() <= 7)
             || self.whole.starts_with("soc")
     }
 
-    pub(super) fn says_dash(&self) -> bool {
+    pub(crate) fn says_dash(&self) -> bool {
         self.has(&["disp", "=ui", "dash", "socui"])
     }
 
-    pub(super) fn says_soh(&self) -> bool {
+    pub(crate) fn says_soh(&self) -> bool {
         self.has(&["soh", "stateofhealth", "state_of_health"])
     }
 }
