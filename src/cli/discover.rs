@@ -49,7 +49,7 @@ pub(crate) struct Args {
     /// Print all candidates as one JSON document
     #[arg(long)]
     json: bool,
-    /// Write a configuration of the best candidates; an existing file is replaced
+    /// Write a configuration of the best candidates, and beside it PACK.dbc with fields that no DBC describes; existing files are replaced
     #[arg(long, value_name = "PACK.toml", requires = "model")]
     write: Option<PathBuf>,
     /// Cell model for --write
@@ -111,6 +111,7 @@ fn write(
     let settings = PackSettings {
         source: args.log.display().to_string(),
         databases: args.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
+        own_database: named_from(file, &file.with_extension("dbc"))?,
         cell_model: named_from(file, model)?,
         cells: args.cells,
         positive: args.positive.map(|positive| match positive {
@@ -120,16 +121,30 @@ fn write(
     };
     let failed = |what: &str| Failure::new(format!("{}: not written:\n{what}", file.display()));
     let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.0))?;
-    let read = |path: &Path| if path == file { Ok(pack.text.clone().into_bytes()) } else { std::fs::read(path) };
+    let own = file.with_extension("dbc");
+    let read = |path: &Path| match &pack.database {
+        _ if path == file => Ok(pack.text.clone().into_bytes()),
+        Some(database) if path == own => Ok(database.clone().into_bytes()),
+        _ => std::fs::read(path),
+    };
     config::load_with(file, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
-    let written = ResultFile::create(file).and_then(|mut out| {
-        out.write_all(pack.text.as_bytes())?;
-        out.finish()
-    });
-    written.map_err(failure)?;
+    if let Some(database) = &pack.database {
+        check_place(&own, args.dbc.iter().chain([&args.log])).map_err(Failure::new)?;
+        write_whole(&own, database)?;
+        eprintln!("{} written: fields that no DBC describes", own.display());
+    }
+    write_whole(file, &pack.text)?;
     eprintln!("{} written; the log does not decide:", file.display());
     pack.open.iter().for_each(|question| eprintln!("  {question}"));
     Ok(())
+}
+
+fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
+    let written = ResultFile::create(file).and_then(|mut out| {
+        out.write_all(text.as_bytes())?;
+        out.finish()
+    });
+    written.map_err(failure)
 }
 
 /// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.

@@ -10,6 +10,7 @@
 
 mod capture;
 mod configuration;
+mod fields;
 pub(crate) mod groups;
 mod judge;
 mod raw;

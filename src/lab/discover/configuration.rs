@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use super::capture::{AnswerKey, Capture};
+use super::fields::{self, MessageField};
 use super::signals::{Descriptions, LogSignal, SignalOrigin};
 use super::{Candidate, Discovery, PositiveDirection, Quantity, raw};
 use crate::can::CanId;
@@ -28,6 +29,8 @@ pub struct PackSettings {
     pub source: String,
     /// DBC files as the configuration names them, in the order in which they were added.
     pub databases: Vec<String>,
+    /// DBC as the configuration names it, for fields that no given one describes.
+    pub own_database: String,
     /// Cell model as the configuration names it.
     pub cell_model: String,
     /// Cells in series, for a pack that publishes its total voltage alone.
@@ -41,6 +44,8 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
+    /// DBC of the fields that no given DBC describes, for the file that [`PackSettings::own_database`] names.
+    pub database: Option<String>,
     /// What the log does not decide.
     pub open: Vec<String>,
 }
@@ -80,7 +85,19 @@ impl Writer<'_> {
         for question in &open {
             let _ = writeln!(text, "# - {}", plain(question));
         }
-        Ok(PackConfiguration { text, open })
+        let fields = self.fields(&selection);
+        let database = (!fields.is_empty()).then(|| fields::database(&fields).to_dbc());
+        Ok(PackConfiguration { text, database, open })
+    }
+
+    /// Used fields of messages without a DBC.
+    fn fields(&self, selection: &Selection<'_>) -> Vec<&MessageField> {
+        let members = self.candidates(selection).into_iter().flat_map(|candidate| &candidate.members);
+        let found = members.filter_map(|index| match &self.signal(*index).origin {
+            SignalOrigin::Field(field) => Some(&**field),
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) | SignalOrigin::Raw(..) => None,
+        });
+        found.collect()
     }
 
     fn best(&self, quantity: Quantity) -> Option<&Candidate> {
@@ -135,7 +152,9 @@ impl Writer<'_> {
     }
 
     fn is_raw(&self, candidate: &Candidate) -> bool {
-        candidate.members.iter().any(|index| matches!(self.signal(*index).origin, SignalOrigin::Raw(..)))
+        let is_raw =
+            |index: &usize| matches!(self.signal(*index).origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_));
+        candidate.members.iter().any(is_raw)
     }
 
     /// Cells of a group whose numbers have no gap.
@@ -197,6 +216,13 @@ impl Writer<'_> {
                     files.extend(self.settings.databases.get(file).map(|name| quoted(name)));
                 }
             }
+        }
+        let fields = self.fields(selection);
+        if !fields.is_empty() {
+            files.push(quoted(&self.settings.own_database));
+            let names: BTreeSet<String> = fields.iter().map(|field| fields::message_name(field.id)).collect();
+            let names = names.into_iter().collect::<Vec<_>>().join(", ");
+            open.push(format!("{names}: found by their values alone, are they right? compare with the dashboard"));
         }
         files.sort_unstable();
         files.dedup();
@@ -263,7 +289,7 @@ impl Writer<'_> {
             match &signal.origin {
                 SignalOrigin::Defined(table) => names.entry(*table).or_default().push(&signal.name),
                 SignalOrigin::Raw(key, field) => fields.entry(*key).or_default().push((**field).clone()),
-                SignalOrigin::Dbc(_) => {}
+                SignalOrigin::Dbc(_) | SignalOrigin::Field(_) => {}
             }
         }
         let table = |(index, used): (usize, Vec<&str>)| {

@@ -3,6 +3,7 @@
 //! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
 //! count 2 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
+use super::fields::overlap;
 use super::groups::{SignalGroup, groups};
 use super::raw;
 use super::series::{Relation, Series};
@@ -118,6 +119,7 @@ fn partition(signal: &LogSignal) -> String {
         SignalOrigin::Defined(_) => "defined".to_owned(),
         SignalOrigin::Raw(key, field) if !field.name.starts_with(raw::CELL) => format!("{key:?}"),
         SignalOrigin::Raw(key, _) => key.response.to_string(),
+        SignalOrigin::Field(_) => "field".to_owned(),
     };
     format!("{} {source}", signal.bus.index())
 }
@@ -158,7 +160,7 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if !is_named {
         return None;
     }
-    if matches!(signal.origin, SignalOrigin::Raw(..)) {
+    if signal.is_unnamed() {
         return Some(raw_voltage(evidence, signal));
     }
     evidence.add(2.0, signal.dimension == Dimension::Voltage, "unit V");
@@ -186,7 +188,15 @@ fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
 
 /// A field without a name: what a pack's current looks like.
 fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
-    let Some(field) = signal.field() else { return evidence };
+    let Some(field) = signal.field() else {
+        // A field of a message is here because it moves with a voltage.
+        evidence.add(1.0, true, "its scale is a guess");
+        // A shorter field may be cut out of a longer one.
+        let is_long = matches!(&signal.origin, SignalOrigin::Field(own) if own.signal.layout.length_bits > 12);
+        evidence.add(0.5, is_long, "");
+        evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
+        return evidence;
+    };
     // A number of 24 or 32 bits that needs 16 of them is one on purpose.
     let needed = 32_768.0 * field.factor;
     let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
@@ -201,8 +211,16 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
 }
 
 impl LogSignal {
-    /// Whether two fields of one answer overlap.
+    /// Whether nothing but its values says what it is.
+    fn is_unnamed(&self) -> bool {
+        matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
+    }
+
+    /// Whether two fields of one answer or message overlap.
     fn shares_bits(&self, other: &Self) -> bool {
+        if let (SignalOrigin::Field(own), SignalOrigin::Field(others)) = (&self.origin, &other.origin) {
+            return own.id == others.id && overlap(&own.signal.layout, &others.signal.layout);
+        }
         let (SignalOrigin::Raw(own, _), SignalOrigin::Raw(others, _)) = (&self.origin, &other.origin) else {
             return false;
         };
@@ -214,7 +232,7 @@ impl LogSignal {
     fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
         match &self.origin {
             SignalOrigin::Raw(_, field) => Some(field),
-            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) => None,
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) | SignalOrigin::Field(_) => None,
         }
     }
 }
@@ -227,7 +245,7 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if !fits || !is_named {
         return None;
     }
-    if matches!(signal.origin, SignalOrigin::Raw(..)) {
+    if signal.is_unnamed() {
         return Some(raw_current(evidence, signal));
     }
     evidence.add(2.0, signal.dimension == Dimension::Current, "unit A");
@@ -323,7 +341,7 @@ fn temperature(index: usize, signal: &LogSignal) -> Option<Evidence> {
     if !fits || signal.dimension != Dimension::Temperature {
         return None;
     }
-    let is_raw = matches!(signal.origin, SignalOrigin::Raw(..));
+    let is_raw = signal.is_unnamed();
     evidence.add(2.0, !is_raw, "unit degC");
     evidence.add(1.5, is_raw, "may be a temperature: its scale is a guess");
     evidence.add(1.0, signal.words.says_temperature(), "its name says temperature");
@@ -394,9 +412,8 @@ fn compare_currents(
     signals: &[LogSignal],
 ) {
     // A field without a name is compared only where nothing better is known.
-    let is_known = |voltage: &Evidence| {
-        voltage.is_sum || signals[voltage.members[0]].field().is_none() || voltage.members.len() > 1
-    };
+    let is_known =
+        |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);
     for current in currents.iter_mut().take(MAX_COMPARED) {
         let related = |voltage: &Evidence| relation(&signals[voltage.members[0]], &signals[current.members[0]]);
@@ -432,7 +449,7 @@ fn relation(voltage: &LogSignal, current: &LogSignal) -> Option<Relation> {
     let relation = voltage.series.relation(&current.series).filter(|_| !shares_bits)?;
     let per_volt = relation.slope.abs() / voltage.series.mean();
     // Many fields without names are compared: some agree by chance.
-    let is_raw = voltage.field().is_some() || current.field().is_some();
+    let is_raw = voltage.is_unnamed() || current.is_unnamed();
     let strength = relation.correlation.abs();
     let is_significant =
         strength * (relation.steps as f64).sqrt() >= if is_raw { MIN_STRENGTH_RAW } else { MIN_STRENGTH };

@@ -81,6 +81,16 @@ impl Series {
         self.low() == self.high()
     }
 
+    /// Whether it counts: most steps are the same one, other than 0.
+    pub(super) fn is_counter(&self) -> bool {
+        let mut steps: std::collections::BTreeMap<u64, usize> = std::collections::BTreeMap::new();
+        for pair in self.values.windows(2).take(200).filter(|pair| pair[0] != pair[1]) {
+            *steps.entry((pair[1] - pair[0]).abs().to_bits()).or_default() += 1;
+        }
+        let most = steps.values().max().copied().unwrap_or(0);
+        5 * most > 3 * self.values.len().saturating_sub(1).min(200)
+    }
+
     /// Largest step between neighbours.
     pub(super) fn largest_step(&self) -> f64 {
         self.values.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)

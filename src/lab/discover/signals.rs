@@ -2,6 +2,7 @@
 //! no definition describes.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
+use super::fields::{self, MessageField};
 use super::raw;
 use super::series::Series;
 use super::words::{Dimension, Words, dimension};
@@ -22,6 +23,8 @@ pub(super) enum SignalOrigin {
     Defined(usize),
     /// In an answer without a definition.
     Raw(AnswerKey, Box<DiagnosticSignal>),
+    /// In a message without a DBC.
+    Field(Box<MessageField>),
 }
 
 /// A signal that is in the log.
@@ -70,6 +73,9 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<Log
         let described: Vec<(u32, u32)> =
             tables.iter().flat_map(|(_, table)| &table.signals).flat_map(DiagnosticSignal::spans).collect();
         signals.extend(raw::signals(key, answers, &described, &mut rows));
+    }
+    if descriptions.databases.is_empty() {
+        signals.extend(fields::signals(capture));
     }
     signals
 }
