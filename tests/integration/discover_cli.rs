@@ -156,6 +156,13 @@ const TESLA_OF_CELLS: &[(&str, &str)] = &[
     ("cell_voltage", "ID401CellVoltages.Cell{n}"),
     ("temperature", "ID332BattCellMinMax.BattCellTempMax332"),
 ];
+/// Without a DBC: messages are named by their number.
+const KONA_FIELDS: &[(&str, &str)] = &[
+    ("current", "Message1429.Current_16bits_at_32_little"),
+    ("pack_voltage", "Message1429.Voltage_16bits_at_48_little"),
+];
+const TESLA_FIELDS: &[(&str, &str)] =
+    &[("current", "Message306.Current_16bits_at_16_little"), ("cell_voltage", "Message1025.Cell{n}")];
 const KONA_ANSWERS: &[(&str, &str)] = &[
     ("current", "KONAEV.HVBAT_CURR"),
     ("pack_voltage", "KONAEV.HVBAT_VDC"),
@@ -203,6 +210,10 @@ fn signals_of_three_cars_are_among_the_first_three_candidates() {
             expected: TESLA_OF_CELLS,
         },
     ];
+    for (index, expected) in [(2, KONA_FIELDS), (4, TESLA_FIELDS)] {
+        let log = trials[index].log.clone();
+        trials.push(Trial { name: "the same without a DBC", log, options: Vec::new(), expected });
+    }
     if let Some(obd) = import_obdb::folder() {
         let log = folder.path().join("answers.log");
         log_of_cases(&obd, "hyundai_kona", "2021", &["0101", "0102", "0103", "0104", "0105"], &log);
@@ -231,6 +242,22 @@ fn a_written_configuration_is_accepted_and_estimates_the_log() {
     let output = packwatch(&["replay", "-c", pack, log, "--json"]).success();
     let summary: Value = serde_json::from_slice(&output.get_output().stdout).unwrap();
     assert!(summary.to_string().contains("96"), "{summary}");
+}
+
+#[test]
+fn fields_without_a_dbc_are_written_with_one() {
+    let Some(data) = can_ev() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let tesla = data.join("tesla_model3.dbc");
+    let log = simulate(folder.path(), "cells", &tesla, &format!("{TESLA_CURRENT}{TESLA_CELLS}"), 96);
+    let (pack, model) = (folder.path().join("pack.toml"), config("cells/example_nmc_2600.toml"));
+    let (log, pack, model) = (log.to_str().unwrap(), pack.to_str().unwrap(), model.to_str().unwrap());
+    let output = packwatch(&["discover", log, "--write", pack, "--model", model]).success();
+    let open = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
+    assert!(open.contains("scale of Message306.Current_16bits_at_16_little is a guess"), "{open}");
+    packwatch(&["check", pack]).success();
+    let text = std::fs::read_to_string(pack).unwrap();
+    assert!(text.contains("cells = 96") && text.contains("dbc = [\"pack.dbc\"]"), "{text}");
 }
 
 #[test]
@@ -267,6 +294,11 @@ fn bad_input_is_an_error_that_names_the_file() {
         let error = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
         assert!(error.contains(part), "{args:?}: {error}");
     }
+    let dbc = folder.path().join("c.dbc");
+    std::fs::write(&dbc, "VERSION \"\"\nNS_ :\nBS_:\nBU_: A\nBO_ 1 M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n")
+        .unwrap();
+    let output = packwatch(&["import", "dbc", dbc.to_str().unwrap()]).code(1);
+    assert!(String::from_utf8_lossy(&output.get_output().stderr).contains("c.dbc: no signal"));
     let output = packwatch(&["discover", log]).success();
     assert!(String::from_utf8_lossy(&output.get_output().stdout).contains("no candidate"));
 }

@@ -73,6 +73,12 @@ impl Writer<'_> {
     pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
         let selection = self.select()?;
         let mut open = Vec::new();
+        if self.is_raw(selection.current) {
+            open.push(format!(
+                "the scale of {} is a guess, and capacity follows it: compare with a known current",
+                selection.current.signal
+            ));
+        }
         let mut text = self.head(&selection);
         self.inputs(&selection, &mut text, &mut open);
         self.tables(&selection, &mut text, &mut open);

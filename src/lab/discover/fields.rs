@@ -22,7 +22,7 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 /// Payloads to judge a message by.
 const MIN_PAYLOADS: usize = 20;
 /// Payloads judged of a message, or of each of its pages.
-const MAX_PAYLOADS: usize = 600;
+const MAX_PAYLOADS: usize = 1500;
 /// Plausible voltages of a pack, V, and V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
@@ -32,6 +32,8 @@ const MAX_SWING: f64 = 0.35;
 const MIN_DISTINCT: usize = 5;
 /// A per code of a current.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
+/// Advantage of the first of them, the most customary one, in the logarithm of the resistance.
+const CUSTOMARY: f64 = 0.25;
 /// Resistance of a usual pack, ohms per V: 0.1 ohm at 400 V.
 const USUAL_OHM_PER_V: f64 = 2.5e-4;
 /// Voltages that are compared with every other field, and pairs that are kept.
@@ -230,7 +232,10 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
                 .filter(|(relation, _)| is_strong(relation))
                 .max_by(|a, b| a.0.correlation.abs().total_cmp(&b.0.correlation.abs()));
             let Some((relation, mean_v)) = best else { continue };
-            let distance = |factor: &f64| (relation.slope.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
+            let distance = |factor: &f64| {
+                let unusual = (relation.slope.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
+                if *factor == CURRENT_SCALES[0] { unusual - CUSTOMARY } else { unusual }
+            };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
             let layout = SignalLayout { factor: factor.unwrap_or(1.0), ..layout };
             let series = samples.values(&layout, None);

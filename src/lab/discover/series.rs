@@ -114,8 +114,11 @@ impl Series {
         })
     }
 
-    /// Time, own value, the other's value nearest in time.
+    /// Time, own value, the other's value: of the rarer series each one, with the nearest of the other.
     fn pairs(&self, other: &Self) -> Vec<(f64, f64, f64)> {
+        if self.period_s < other.period_s {
+            return other.pairs(self).into_iter().map(|(time_s, theirs, own)| (time_s, own, theirs)).collect();
+        }
         let mut at = 0;
         let mut pairs = Vec::new();
         for (&time_s, &value) in self.times.iter().zip(&self.values) {
