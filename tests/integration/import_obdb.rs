@@ -1,12 +1,17 @@
 //! `packwatch import obdb` on the signal sets of three cars: every expected value of their test cases, read from raw frames
-//! through the written file.
+//! by the core through the written file: ISO-TP, configuration, decoder.
 //!
 //! The reference decoder moves a value onto the limit of its range; here such a value is out of range. That is the only
 //! difference allowed. Some cases were recorded with characters lost, their lines are no CAN frames: they have no answer here.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use packwatch::can::CanId;
+use packwatch::can::diagnostic::Answer;
+use packwatch::can::isotp::{Progress, Receiver};
+use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 
 pub(crate) fn folder() -> Option<PathBuf> {
@@ -30,73 +35,84 @@ fn import(args: &[&str]) -> String {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Reading {
     Value(f64),
-    /// With the limit nearest to the value.
-    OutOfRange {
-        limit: f64,
-    },
-    Absent,
+    /// With the range of the file.
+    OutOfRange(f64, f64),
+    Other(Fault),
 }
 
-/// Decodes by the written file alone: service, identifier and payload of an answer in; values by signal name out.
-fn decode(tables: &toml::Table, response: i64, answer: &[u8]) -> BTreeMap<String, Reading> {
-    let mut readings = BTreeMap::new();
-    let number = |table: &toml::Table, key: &str| table.get(key).map_or(0, |value| value.as_integer().unwrap());
-    for table in tables["input"]["diagnostic"].as_array().unwrap() {
-        let table = table.as_table().unwrap();
-        let service = number(table, "service");
-        let digits = if service == 0x22 { 3 } else { 2 };
-        let Some(echo) = answer.get(1..digits) else { continue };
-        let identifier = echo.iter().fold(0, |all, byte| all << 8 | i64::from(*byte));
-        let is_it = number(table, "response") == response
-            && i64::from(answer[0]) == service + 0x40
-            && number(table, "identifier") == identifier;
-        if !is_it {
-            continue;
+/// A signal set of one model year as the core reads it: every signal is bound to an input.
+struct ImportedCar {
+    text: String,
+    answers: Vec<Answer>,
+    /// Name and range of the signal that is temperature sensor n.
+    signals: Vec<(String, (f64, f64))>,
+}
+
+/// Inputs that have to be there, in an answer of their own; the imported signals are temperatures, of which there may be most.
+const OTHER_INPUTS: &str = "[[input.diagnostic]]\nname = \"Other\"\nrequest = 1\nresponse = 2\nservice = 0x22\nidentifier = 1\n\
+    signals = [{ name = \"Cell{n}\", numbers = \"1-1024\", bit = 0, length = 8 }, { name = \"Current\", bit = 9000, length = 8 }]\n";
+
+impl ImportedCar {
+    fn new(signal_set: &Path, year: &str) -> Self {
+        let text = import(&[signal_set.to_str().unwrap(), "--year", year]);
+        let signals = signals_of(&text.parse().unwrap());
+        let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells/example_nmc_2600.toml");
+        let mut config = format!(
+            "[pack]\ncells = 1024\ncell_model = {model:?}\n[[interface]]\nname = \"can0\"\n[input]\n[input.current]\n\
+             signal = \"Other.Current\"\npositive = \"charge\"\n[input.cell_voltage]\nsignal = \"Other.Cell{{n}}\"\n"
+        );
+        for (number, (name, _)) in (1..).zip(&signals) {
+            writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\ncells = \"{number}\"").unwrap();
         }
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pack.toml");
+        std::fs::write(&file, config + OTHER_INPUTS + &text).unwrap();
+        let answers = packwatch::config::load(&file).unwrap().monitor.answers;
+        Self { text, answers, signals }
+    }
+
+    /// Readings of a whole answer by signal.
+    fn decode(&self, response: CanId, answer: &[u8]) -> BTreeMap<&str, Reading> {
+        let question = |found: &&Answer| {
+            found.question.controller.response == response && answer.starts_with(&found.question.answer_head())
+        };
+        let found = self.answers.iter().find(question);
+        let readings =
+            found.into_iter().flat_map(|found| found.readings(&answer[found.question.answer_head().len()..]));
+        let named = readings.map(|reading| {
+            let Channel::Temperature(sensor) = reading.channel else { panic!("{:?}", reading.channel) };
+            let (name, (low, high)) = &self.signals[usize::from(sensor.0)];
+            let reading = match reading.value {
+                Ok(value) => Reading::Value(value),
+                Err(Fault::OutOfRange) => Reading::OutOfRange(*low, *high),
+                Err(fault) => Reading::Other(fault),
+            };
+            (name.split_once('.').unwrap().1, reading)
+        });
+        named.collect()
+    }
+}
+
+/// Every signal of a file, series written out, with its range.
+fn signals_of(tables: &toml::Table) -> Vec<(String, (f64, f64))> {
+    let mut signals = Vec::new();
+    for table in tables["input"]["diagnostic"].as_array().unwrap() {
         for signal in table["signals"].as_array().unwrap() {
-            let signal = signal.as_table().unwrap();
+            let limit = |key: &str, without: f64| match signal.get(key) {
+                Some(Value::Integer(number)) => *number as f64,
+                Some(value) => value.as_float().unwrap(),
+                None => without,
+            };
+            let range = (limit("minimum", f64::MIN), limit("maximum", f64::MAX));
             let numbers = signal.get("numbers").map_or("0-0", |numbers| numbers.as_str().unwrap());
             let (first, last) = numbers.split_once('-').unwrap();
-            for n in first.parse::<i64>().unwrap()..=last.parse().unwrap() {
-                let bit = number(signal, "bit") + (n - first.parse::<i64>().unwrap()) * number(signal, "step");
+            for n in first.parse::<u32>().unwrap()..=last.parse().unwrap() {
                 let name = signal["name"].as_str().unwrap().replace("{n}", &n.to_string());
-                if let Some(reading) = read(signal, bit, &answer[digits..]) {
-                    assert!(readings.insert(name, reading).is_none());
-                }
+                signals.push((format!("{}.{name}", table["name"].as_str().unwrap()), range));
             }
         }
     }
-    readings
-}
-
-fn read(signal: &toml::Table, bit: i64, data: &[u8]) -> Option<Reading> {
-    let length = signal["length"].as_integer().unwrap();
-    let mut bytes = data.to_vec();
-    if signal.get("byte_order").is_some_and(|order| order.as_str() == Some("little")) {
-        bytes.get_mut((bit / 8) as usize..((bit + length) / 8) as usize)?.reverse();
-    }
-    let mut code = 0_u64;
-    for at in bit..bit + length {
-        code = code << 1 | u64::from(bytes.get((at / 8) as usize)? >> (7 - at % 8) & 1);
-    }
-    let float = |key: &str, default: f64| match signal.get(key) {
-        Some(Value::Integer(number)) => *number as f64,
-        Some(value) => value.as_float().unwrap(),
-        None => default,
-    };
-    let absent = signal.get("not_available").map_or(&[][..], |codes| codes.as_array().unwrap());
-    if absent.iter().any(|absent| absent.as_integer() == Some(code.cast_signed())) {
-        return Some(Reading::Absent);
-    }
-    let is_negative = signal.contains_key("signed") && code >> (length - 1) & 1 == 1;
-    let number = if is_negative { code as f64 - 2_f64.powi(length as i32) } else { code as f64 };
-    let value = number * float("factor", 1.0) + float("offset", 0.0);
-    let (low, high) = (float("minimum", f64::MIN), float("maximum", f64::MAX));
-    Some(if (low - 1e-9..=high + 1e-9).contains(&value) {
-        Reading::Value(value)
-    } else {
-        Reading::OutOfRange { limit: value.clamp(low, high) }
-    })
+    signals
 }
 
 /// One test case of a file: expected values by id, and the text with the frames.
@@ -135,40 +151,25 @@ impl Case {
     }
 }
 
-/// Identifier and payload of every complete answer in frames with 11-bit identifiers. A line that is no classic frame, or
-/// breaks the sequence, ends its answer.
-fn reassemble(frames: &[String]) -> Vec<(i64, Vec<u8>)> {
+/// Identifier and payload of every complete answer, put together by the core; lines that are no classic frames are left out.
+fn reassemble(frames: &[String]) -> Vec<(CanId, Vec<u8>)> {
+    let mut receiver = Receiver::new(None);
     let mut answers = Vec::new();
-    let mut partial: Option<(usize, u8, Vec<u8>)> = None;
-    for frame in frames {
-        let Some((id, bytes)) = frame_of(frame) else { continue };
-        match (bytes[0] >> 4, partial.take()) {
-            (0, _) => answers.push((id, bytes[1..=usize::from(bytes[0])].to_vec())),
-            (1, _) => {
-                let length = usize::from(bytes[0] & 0xF) << 8 | usize::from(bytes[1]);
-                partial = Some((length, 1, bytes[2..].to_vec()));
-            }
-            (2, Some((length, next, mut data))) if bytes[0] & 0xF == next => {
-                data.extend(&bytes[1..]);
-                if data.len() >= length {
-                    data.truncate(length);
-                    answers.push((id, data));
-                } else {
-                    partial = Some((length, (next + 1) & 0xF, data));
-                }
-            }
-            _ => {}
+    for (id, bytes) in frames.iter().filter_map(|frame| frame_of(frame)) {
+        if receiver.handle(Timestamp::from_nanos(0), &bytes).progress == Progress::Complete {
+            answers.push((id, receiver.message().to_vec()));
         }
     }
     answers
 }
 
 /// Identifier and data; `None` when the text is no classic frame with data.
-fn frame_of(text: &str) -> Option<(i64, Vec<u8>)> {
+fn frame_of(text: &str) -> Option<(CanId, Vec<u8>)> {
     let (id, data) = text.split_at_checked(3)?;
     let bytes = (0..data.len()).step_by(2).map(|at| u8::from_str_radix(data.get(at..at + 2)?, 16).ok());
     let bytes: Vec<u8> = bytes.collect::<Option<_>>()?;
-    (1..=8).contains(&bytes.len()).then_some((i64::from_str_radix(id, 16).ok()?, bytes))
+    let id = CanId::standard(u32::from_str_radix(id, 16).ok()?)?;
+    (1..=8).contains(&bytes.len()).then_some((id, bytes))
 }
 
 /// Counts of compared values.
@@ -183,26 +184,28 @@ struct Comparison {
 }
 
 impl Comparison {
-    fn compare(&mut self, place: &str, case: &Case, prefix: &str, tables: &toml::Table, left_out: &str) {
+    fn compare(&mut self, place: &str, case: &Case, prefix: &str, car: &ImportedCar) {
         let answers = reassemble(&case.frames());
         if answers.is_empty() {
             assert!(case.frames().iter().any(|frame| frame_of(frame).is_none()), "{place}: {case:?}");
             self.damaged += 1;
             return;
         }
+        let readings = answers.iter().flat_map(|(response, answer)| car.decode(*response, answer));
         let readings: BTreeMap<String, Reading> =
-            answers.iter().flat_map(|(response, answer)| decode(tables, *response, answer)).collect();
+            readings.map(|(name, reading)| (without_zeros(name), reading)).collect();
         for (id, expected) in &case.expected {
             let name = id.strip_prefix(prefix).unwrap().strip_prefix('_').unwrap();
-            let found = readings.iter().find(|(found, _)| without_zeros(found) == without_zeros(name));
             let Ok(expected) = expected.parse::<f64>() else {
-                assert!(left_out.contains(&format!("({id}): enumeration")), "{place}: {id}");
+                assert!(car.text.contains(&format!("({id}): enumeration")), "{place}: {id}");
                 self.enumerations += 1;
                 continue;
             };
-            match found.map(|found| *found.1) {
-                Some(Reading::Value(value)) if near(value, expected) => self.equal += 1,
-                Some(Reading::OutOfRange { limit }) if near(limit, expected) => self.clamped += 1,
+            match readings.get(&without_zeros(name)) {
+                Some(Reading::Value(value)) if near(*value, expected) => self.equal += 1,
+                Some(Reading::OutOfRange(low, high)) if near(*low, expected) || near(*high, expected) => {
+                    self.clamped += 1
+                }
                 other => self.different.push(format!("{place}: {id}: expected {expected}, found {other:?}")),
             }
         }
@@ -229,18 +232,15 @@ fn without_zeros(name: &str) -> String {
 
 fn compare_car(folder: &Path, car: &str, prefix: &str) -> Comparison {
     let signal_set = folder.join(car).join("signalset.json");
-    let mut imported: BTreeMap<String, (toml::Table, String)> = BTreeMap::new();
+    let mut imported: BTreeMap<String, ImportedCar> = BTreeMap::new();
     let mut comparison = Comparison::default();
     for entry in std::fs::read_dir(folder.join(car).join("cases")).unwrap() {
         let path = entry.unwrap().path();
         let name = path.file_name().unwrap().to_str().unwrap().to_owned();
         let (year, _) = name.split_once('.').unwrap();
-        let (tables, text) = imported.entry(year.to_owned()).or_insert_with(|| {
-            let text = import(&[signal_set.to_str().unwrap(), "--year", year]);
-            (text.parse().unwrap(), text)
-        });
+        let of_year = imported.entry(year.to_owned()).or_insert_with(|| ImportedCar::new(&signal_set, year));
         for (number, case) in cases(&std::fs::read_to_string(&path).unwrap()).iter().enumerate() {
-            comparison.compare(&format!("{car}/{name}[{number}]"), case, prefix, tables, text);
+            comparison.compare(&format!("{car}/{name}[{number}]"), case, prefix, of_year);
         }
     }
     eprintln!(
