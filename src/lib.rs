@@ -23,7 +23,7 @@
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
-//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, plots (feature `lab`) |
+//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, plots, import, discover (feature `lab`) |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -54,6 +54,8 @@
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
+//! | what an OBDb signal set becomes | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |
+//! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
 //! | a finding of the doctor | `core/doctor/judge` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |

@@ -8,6 +8,8 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+#[cfg(feature = "lab")]
+mod discover;
 mod doctor;
 #[cfg(feature = "lab")]
 mod export;
@@ -20,6 +22,8 @@ mod generate;
 #[cfg(feature = "lab")]
 mod gpr;
 mod history;
+#[cfg(feature = "lab")]
+mod import;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod numbers;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
@@ -96,6 +100,12 @@ enum Command {
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
+    /// Find the signals of the traction battery in a log
+    #[cfg(feature = "lab")]
+    Discover(discover::Args),
+    /// Convert descriptions of a car's signals to parts of a configuration
+    #[cfg(feature = "lab")]
+    Import(import::Args),
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
@@ -161,6 +171,10 @@ pub fn main() -> ExitCode {
         Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Discover(args) => discover::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Import(args) => import::run(&args),
         #[cfg(feature = "lab")]
         Command::Score(args) => score::run(&args),
         #[cfg(feature = "lab")]

@@ -6,12 +6,14 @@ pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
 pub mod chart;
+pub mod discover;
 pub mod error;
 mod fields;
 pub mod fit;
 pub mod fleet;
 pub mod gpr;
 pub mod ident;
+pub mod import;
 pub mod measured;
 pub mod report;
 pub mod rul;

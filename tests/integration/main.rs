@@ -18,6 +18,8 @@ mod capacity_peers;
 mod check_cli;
 mod contactor;
 mod dbc_vectors;
+#[cfg(feature = "lab")]
+mod discover_cli;
 mod diagnostic;
 mod doctor;
 mod e2e_peer;
@@ -30,6 +32,8 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+#[cfg(feature = "lab")]
+mod import_obdb;
 mod isotp_peer;
 mod layering;
 mod life_decodes;

@@ -1,0 +1,223 @@
+//! `packwatch discover`: finds the signals of the traction battery in a log.
+//!
+//! Exit code 1: a file cannot be read, or the log has no frames. Finding nothing is no failure: the page says so.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use serde_json::json;
+
+use super::Failure;
+use super::import::{database, read};
+use super::output::{failure, print, print_json, table, unless_closed};
+use super::replay::Bar;
+use crate::config;
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::{LogOptions, LogSource, Record};
+use crate::io::result_file::{ResultFile, check_place};
+use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection, Quantity};
+use crate::lab::import::obdb::ObdbSettings;
+use crate::replay::ReplayProgress;
+
+/// Candidates shown of a quantity.
+const SHOWN: usize = 3;
+/// Records between two looks at the clock.
+const REPORT_EVERY: u64 = 4096;
+/// Version of the JSON document.
+const VERSION: u32 = 1;
+
+/// Arguments of `discover`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+Signals of the DBC files and of the OBDb signal set that are in the log are ranked by name, unit, range and behaviour. Answers to \
+diagnostic requests that no definition describes are searched for rows of cell voltages, pack voltage, current and temperatures; their \
+scales are guesses from plausible values. A log of a drive shows more than one of a car at rest.")]
+pub(crate) struct Args {
+    /// Log: a journal or a candump log, also .gz or .zst; - is standard input
+    #[arg(value_name = "LOG")]
+    log: PathBuf,
+    /// DBC file; repeat it for several
+    #[arg(long = "dbc", value_name = "FILE.dbc")]
+    dbc: Vec<PathBuf>,
+    /// OBDb signal set of the car model: its diagnostic answers
+    #[arg(long, value_name = "FILE.json")]
+    obdb: Option<PathBuf>,
+    /// Model year, for the OBDb signal set
+    #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = clap::value_parser!(i64).range(1980..=2100))]
+    year: Option<i64>,
+    /// Print all candidates as one JSON document
+    #[arg(long)]
+    json: bool,
+    /// Write a configuration of the best candidates, and beside it PACK.dbc with fields that no DBC describes; existing files are replaced
+    #[arg(long, value_name = "PACK.toml", requires = "model")]
+    write: Option<PathBuf>,
+    /// Cell model for --write
+    #[arg(long, value_name = "CELL.toml")]
+    model: Option<PathBuf>,
+    /// Cells in series for --write, where the log has the total voltage alone
+    #[arg(long, value_name = "N", requires = "write", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    cells: Option<u16>,
+    /// What a positive current means, for --write, where the log does not show it
+    #[arg(long, value_enum, requires = "write")]
+    positive: Option<Positive>,
+}
+
+/// Sign of a current on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Positive {
+    /// Positive charges
+    Charge,
+    /// Positive discharges
+    Discharge,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let mut discoverer = Discoverer::default();
+    for file in &args.dbc {
+        discoverer.add_database(database(file)?);
+    }
+    if let Some(file) = &args.obdb {
+        let source = file.display().to_string();
+        let settings = ObdbSettings { source, year: args.year, name: None };
+        discoverer.add_obdb(&read(file)?, &settings).map_err(failure)?;
+    }
+    let interfaces = feed(args, &mut discoverer)?;
+    let discovery = discoverer.finish(&interfaces);
+    if discovery.frames == 0 {
+        return Err(Failure::new(format!("{}: has no frames, must be a log of frames", args.log.display())));
+    }
+    match args.json {
+        true => unless_closed(print_json(&json!({ "version": VERSION, "discovery": discovery })))?,
+        false => print(&page(&discovery))?,
+    }
+    match (&args.write, &args.model) {
+        (Some(file), Some(model)) => write(args, &discoverer, &discovery, file, model),
+        _ => Ok(()),
+    }
+}
+
+/// Writes the configuration if it is a valid one.
+fn write(
+    args: &Args,
+    discoverer: &Discoverer,
+    discovery: &Discovery,
+    file: &Path,
+    model: &Path,
+) -> Result<(), Failure> {
+    let inputs = args.dbc.iter().chain([&args.log]).chain(&args.obdb).chain(&args.model);
+    check_place(file, inputs).map_err(Failure::new)?;
+    let settings = PackSettings {
+        source: args.log.display().to_string(),
+        databases: args.dbc.iter().map(|dbc| named_from(file, dbc)).collect::<Result<_, _>>()?,
+        own_database: named_from(file, &file.with_extension("dbc"))?,
+        cell_model: named_from(file, model)?,
+        cells: args.cells,
+        positive: args.positive.map(|positive| match positive {
+            Positive::Charge => PositiveDirection::Charge,
+            Positive::Discharge => PositiveDirection::Discharge,
+        }),
+    };
+    let failed = |what: &str| Failure::new(format!("{}: not written:\n{what}", file.display()));
+    let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.0))?;
+    let own = file.with_extension("dbc");
+    let read = |path: &Path| match &pack.database {
+        _ if path == file => Ok(pack.text.clone().into_bytes()),
+        Some(database) if path == own => Ok(database.clone().into_bytes()),
+        _ => std::fs::read(path),
+    };
+    config::load_with(file, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
+    if let Some(database) = &pack.database {
+        check_place(&own, args.dbc.iter().chain([&args.log])).map_err(Failure::new)?;
+        write_whole(&own, database)?;
+        eprintln!("{} written: fields that no DBC describes", own.display());
+    }
+    write_whole(file, &pack.text)?;
+    eprintln!("{} written; the log does not decide:", file.display());
+    pack.open.iter().for_each(|question| eprintln!("  {question}"));
+    Ok(())
+}
+
+fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
+    let written = ResultFile::create(file).and_then(|mut out| {
+        out.write_all(text.as_bytes())?;
+        out.finish()
+    });
+    written.map_err(failure)
+}
+
+/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
+fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
+    let whole =
+        |path: &Path| std::path::absolute(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())));
+    let (config, file) = (whole(config)?, whole(file)?);
+    let name = match config.parent() {
+        Some(folder) => file.strip_prefix(folder).unwrap_or(&file),
+        None => &file,
+    };
+    Ok(name.display().to_string())
+}
+
+/// Passes every frame on; returns the names of the interfaces.
+fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
+    let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
+    let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
+    let options = LogOptions { interfaces: Vec::new(), strict: false, csv, encode_row };
+    let mut source = LogSource::new([args.log.clone()], options);
+    source.adopt_foreign();
+    let bar = Bar::new(std::slice::from_ref(&args.log));
+    let mut records = 0_u64;
+    while let Some(record) = source.next_record().map_err(failure)? {
+        if let Record::Frame { time, bus, frame } = &record {
+            discoverer.handle(*time, *bus, frame);
+        }
+        records += 1;
+        if records.is_multiple_of(REPORT_EVERY) {
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            let times_real_time = discoverer.seconds() / bar.seconds();
+            bar.show(ReplayProgress { bytes, frames: discoverer.frames(), times_real_time });
+        }
+    }
+    bar.clear();
+    let counts = source.counts();
+    if let Some(first) = &counts.first_bad_line {
+        eprintln!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
+    }
+    Ok(source.interfaces().to_vec())
+}
+
+fn page(discovery: &Discovery) -> String {
+    let Discovery { frames, seconds, signals, answers, .. } = discovery;
+    let mut text = format!(
+        "{frames} frames in {seconds:.1} s; {signals} signals with values, {answers} kinds of diagnostic answers\n"
+    );
+    if discovery.ignored_frames > 0 {
+        text += &format!("{} frames ignored: too many identifiers\n", discovery.ignored_frames);
+    }
+    for quantity in Quantity::ALL {
+        text += &format!("\n{}\n", quantity.name());
+        let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
+        let rows: Vec<Vec<String>> = found.take(SHOWN).map(row).collect();
+        text += &match rows.is_empty() {
+            true => "  no candidate\n".to_owned(),
+            false => table(&["  ", "signal", "interface", "values", "reason"], rows, 5),
+        };
+    }
+    text
+}
+
+fn row(candidate: &Candidate) -> Vec<String> {
+    let unit = candidate.quantity.unit();
+    let (low, high) = (number(candidate.low), number(candidate.high));
+    let count = if candidate.signals > 1 { format!("{} of ", candidate.signals) } else { String::new() };
+    let values = if low == high { format!("{count}{low} {unit}") } else { format!("{count}{low} to {high} {unit}") };
+    let rank = format!("  {}", candidate.rank);
+    vec![rank, candidate.signal.clone(), candidate.interface.clone(), values, candidate.reasons.join("; ")]
+}
+
+/// At most three decimals.
+fn number(value: f64) -> String {
+    let text = format!("{value:.3}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}

@@ -1,0 +1,131 @@
+//! `packwatch import`: descriptions of a car's signals from elsewhere, converted to parts of a configuration.
+//!
+//! Standard error gets a count per reason of what was left out; the written file lists each with its place. Exit code 1:
+//! the file cannot be read, is of another kind, or nothing in it can be converted.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use super::Failure;
+use super::output::{failure, unless_closed};
+use crate::can::dbc::Database;
+use crate::io::result_file::{ResultFile, check_place};
+use crate::lab::import::ImportResult;
+use crate::lab::import::dbc;
+use crate::lab::import::obdb::{self, ObdbSettings};
+
+/// Largest file read; the largest known signal set has 0.5 MB.
+const MAX_BYTES: u64 = 64 << 20;
+
+/// Arguments of `import`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: ImportCommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum ImportCommand {
+    /// Convert an OBDb signal set (JSON) to [[input.diagnostic]] tables
+    Obdb(ObdbArgs),
+    /// Write the likely battery signals of a DBC as the [input] part of a configuration, by name, unit and range
+    Dbc(DbcArgs),
+}
+
+/// Arguments of `import dbc`.
+#[derive(Debug, clap::Args)]
+struct DbcArgs {
+    /// DBC file
+    #[arg(value_name = "FILE.dbc")]
+    file: PathBuf,
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+/// Arguments of `import obdb`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+The written tables carry the source's licence, CC BY-SA 4.0. Signals are named NAME.SIGNAL in [input.*]; NAME is the word that all ids \
+of the file begin with, or --name. Numbered signals of one answer become one line with {n}. A signal is left out, and listed at the \
+end of the file, when its values are names or texts, when a field is invalid, or when its bits belong to another signal; a command, \
+when it is of other model years, or its service is not 0x01, 0x21 or 0x22.")]
+struct ObdbArgs {
+    /// signalset.json of a car model
+    #[arg(value_name = "FILE.json")]
+    file: PathBuf,
+    /// Model year: leave out commands of other years [default: commands of all years]
+    #[arg(long, value_name = "YEAR", value_parser = clap::value_parser!(i64).range(1980..=2100))]
+    year: Option<i64>,
+    /// Name before the dot of every signal [default: the word that all ids begin with]
+    #[arg(long)]
+    name: Option<String>,
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+/// Where the result is written.
+#[derive(Debug, clap::Args)]
+struct OutputArgs {
+    /// File to write instead of standard output; an existing file is replaced
+    #[arg(short, long, value_name = "FILE", default_value = "-", hide_default_value = true)]
+    output: PathBuf,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.what {
+        ImportCommand::Obdb(args) => import_obdb(args),
+        ImportCommand::Dbc(args) => import_dbc(args),
+    }
+}
+
+fn import_dbc(args: &DbcArgs) -> Result<(), Failure> {
+    check_place(&args.output.output, std::iter::once(&args.file)).map_err(Failure::new)?;
+    let text = dbc::import(&database(&args.file)?, &args.file.display().to_string()).map_err(failure)?;
+    write(&args.output.output, &text)
+}
+
+/// A DBC file, read.
+pub(super) fn database(file: &Path) -> Result<Database, Failure> {
+    let fault = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", file.display()));
+    let bytes = std::fs::read(file).map_err(|error| fault(&format!("cannot be read: {error}")))?;
+    Database::parse_bytes(&bytes).map_err(|error| fault(&error))
+}
+
+fn import_obdb(args: &ObdbArgs) -> Result<(), Failure> {
+    check_place(&args.output.output, std::iter::once(&args.file)).map_err(Failure::new)?;
+    let text = read(&args.file)?;
+    let source = args.file.display().to_string();
+    let settings = ObdbSettings { source: source.clone(), year: args.year, name: args.name.clone() };
+    let result = obdb::import(&text, &settings).map_err(failure)?;
+    report(&source, &result);
+    write(&args.output.output, &result.text)
+}
+
+/// The text of a file of reasonable size.
+pub(super) fn read(file: &Path) -> Result<String, Failure> {
+    let fault = |what: String| Failure::new(format!("{}: {what}", file.display()));
+    let bytes = std::fs::metadata(file).map_err(|error| fault(format!("cannot be read: {error}")))?.len();
+    if bytes > MAX_BYTES {
+        return Err(fault(format!("has {bytes} bytes, must be at most {MAX_BYTES}")));
+    }
+    std::fs::read_to_string(file).map_err(|error| fault(format!("cannot be read: {error}")))
+}
+
+fn report(source: &str, result: &ImportResult) {
+    for warning in &result.warnings {
+        eprintln!("{source}: {warning}");
+    }
+    eprintln!("{source}: {} signals converted, {} left out", result.signals, result.exclusions.len());
+    for (reason, count) in result.counts() {
+        eprintln!("  {count} {reason}");
+    }
+}
+
+fn write(file: &Path, text: &str) -> Result<(), Failure> {
+    let written = ResultFile::create(file).and_then(|mut file| {
+        file.write_all(text.as_bytes())?;
+        file.finish()
+    });
+    unless_closed(written)
+}

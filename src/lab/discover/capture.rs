@@ -1,0 +1,223 @@
+//! Frames and diagnostic answers of a log, as many as memory allows.
+//!
+//! All frames are kept while they fit into [`MAX_BYTES`]. Beyond, whole windows of [`WINDOW_S`] are dropped, first every
+//! second one, then three of four, ...: what is left has all identifiers of the same moments, pages of multiplexers included.
+//! Answers are put together from every frame; each kind keeps at most [`MAX_ANSWER_BYTES`], halved in the same way.
+
+use std::collections::BTreeMap;
+
+use crate::can::isotp::{Progress, Receiver};
+use crate::can::{CanId, Frame, FrameKind};
+use crate::quantity::{BusIndex, Timestamp};
+
+/// Frames kept, bytes: about two million classic ones.
+const MAX_BYTES: usize = 48 << 20;
+/// Answers of one kind kept, bytes: a thousand of 64 bytes.
+const MAX_ANSWER_BYTES: usize = 64 << 10;
+/// Length of a window, s: long against the period of a page, short against a drive.
+const WINDOW_S: f64 = 2.0;
+/// Messages (identifiers on an interface) followed; a car has a few hundred, a flood of random identifiers more.
+const MAX_MESSAGES: usize = 4096;
+/// Kinds of answers followed.
+const MAX_ANSWERS: usize = 1024;
+/// An answer belongs to a request at most this old, s (longest P2* of ISO 14229-2).
+const ANSWER_WITHIN_S: f64 = 5.0;
+/// First data byte of BMW's answers: extended addressing that needs no definition to be seen.
+const TESTER: u8 = 0xF1;
+
+/// An identifier on an interface.
+pub(super) type MessageKey = (BusIndex, CanId);
+
+/// Payloads of one message, with their times.
+#[derive(Debug, Default)]
+pub(super) struct Payloads {
+    /// s since the first frame of the log.
+    times: Vec<f64>,
+    data: Vec<u8>,
+    /// End of each payload in `data`.
+    ends: Vec<usize>,
+}
+
+/// Which answer: its sender, service and identifier of the values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct AnswerKey {
+    pub(super) bus: BusIndex,
+    pub(super) response: CanId,
+    pub(super) extension: Option<u8>,
+    pub(super) service: u8,
+    pub(super) identifier: u16,
+}
+
+/// A request: its time, s, its identifier and first byte with extended addressing.
+type HeardRequest = (f64, CanId, Option<u8>);
+
+/// Answers of one kind.
+#[derive(Debug, Default)]
+pub(super) struct Answers {
+    /// Identifier of the requests, and their first byte with extended addressing, if they were heard.
+    pub(super) request: Option<(CanId, Option<u8>)>,
+    /// What follows the echoed service and identifier.
+    pub(super) payloads: Payloads,
+    /// Answers seen.
+    pub(super) seen: u64,
+    stride: u64,
+}
+
+/// The capture of one log.
+#[derive(Debug, Default)]
+pub(super) struct Capture {
+    pub(super) messages: BTreeMap<MessageKey, Payloads>,
+    pub(super) answers: BTreeMap<AnswerKey, Answers>,
+    /// Frames taken.
+    pub(super) frames: u64,
+    /// Frames of messages beyond [`MAX_MESSAGES`].
+    pub(super) ignored: u64,
+    receivers: BTreeMap<(MessageKey, Option<u8>), Receiver>,
+    requests: BTreeMap<(BusIndex, u8, u16), HeardRequest>,
+    start: Option<Timestamp>,
+    latest_s: f64,
+    bytes: usize,
+    /// Every how many windows one is kept, less one as a mask: 0, 1, 3, 7, ...
+    mask: u64,
+}
+
+impl Payloads {
+    /// Times and payloads.
+    pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &[u8])> {
+        let starts = std::iter::once(0).chain(self.ends.iter().copied());
+        let ranges = starts.zip(&self.ends).map(|(start, end)| &self.data[start..*end]);
+        self.times.iter().copied().zip(ranges)
+    }
+
+    /// How many.
+    pub(super) fn len(&self) -> usize {
+        self.times.len()
+    }
+
+    fn push(&mut self, time_s: f64, payload: &[u8]) {
+        self.times.push(time_s);
+        self.data.extend_from_slice(payload);
+        self.ends.push(self.data.len());
+    }
+
+    /// Keeps some, by number and time.
+    fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
+        let mut kept = Self::default();
+        for (index, (time_s, payload)) in self.iter().enumerate() {
+            if is_kept(index, time_s) {
+                kept.push(time_s, payload);
+            }
+        }
+        *self = kept;
+    }
+
+    fn bytes(&self) -> usize {
+        self.data.len() + self.times.len() * (size_of::<f64>() + size_of::<usize>())
+    }
+}
+
+impl Capture {
+    /// Takes a frame.
+    pub(super) fn handle(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        if frame.kind() == FrameKind::Remote {
+            return;
+        }
+        let start = *self.start.get_or_insert(time);
+        // Seconds of a log: exact to a microsecond for centuries.
+        let time_s = time.nanos().saturating_sub(start.nanos()) as f64 * 1e-9;
+        self.latest_s = self.latest_s.max(time_s);
+        self.frames += 1;
+        let key = (bus, frame.id());
+        if !self.messages.contains_key(&key) && self.messages.len() >= MAX_MESSAGES {
+            self.ignored += 1;
+            return;
+        }
+        if window(time_s) & self.mask == 0 {
+            self.bytes += frame.data().len() + size_of::<f64>() + size_of::<usize>();
+            self.messages.entry(key).or_default().push(time_s, frame.data());
+        }
+        if self.bytes > MAX_BYTES {
+            self.thin();
+        }
+        self.receive(time, time_s, key, frame.data());
+    }
+
+    /// Length of the log, s.
+    pub(super) fn seconds(&self) -> f64 {
+        self.latest_s
+    }
+
+    fn thin(&mut self) {
+        self.mask = self.mask << 1 | 1;
+        let mask = self.mask;
+        self.messages.values_mut().for_each(|payloads| payloads.retain(|_, time_s| window(time_s) & mask == 0));
+        self.bytes = self.messages.values().map(Payloads::bytes).sum();
+    }
+
+    fn receive(&mut self, time: Timestamp, time_s: f64, key: MessageKey, data: &[u8]) {
+        // BMW asks from 6F1 with the target in the first byte, and is answered with the tester there.
+        let is_extended = |byte: &u8| *byte == TESTER || key.1 == CanId::Standard(0x600 | u16::from(TESTER));
+        let extensions = [None, data.first().copied().filter(is_extended)];
+        for (index, extension) in extensions.into_iter().enumerate() {
+            if index > 0 && extension.is_none() {
+                continue;
+            }
+            // Single, first and consecutive frames; everything else is no part of a message.
+            let control = data.get(usize::from(extension.is_some())).copied().unwrap_or(u8::MAX);
+            if control >> 4 > 2 {
+                continue;
+            }
+            let receiver = self.receivers.entry((key, extension)).or_insert_with(|| Receiver::new(extension));
+            if receiver.handle(time, data).progress == Progress::Complete {
+                let message = receiver.message().to_vec();
+                self.message(time_s, key, extension, &message, control >> 4 == 2);
+            }
+        }
+    }
+
+    fn message(&mut self, time_s: f64, key: MessageKey, extension: Option<u8>, message: &[u8], is_long: bool) {
+        let (bus, id) = key;
+        let Some((&first, rest)) = message.split_first() else { return };
+        let identifier = |service: u8| match (service, rest) {
+            (0x01 | 0x21, [one, ..]) => Some((u16::from(*one), 1)),
+            (0x22, [high, low, ..]) => Some((u16::from_be_bytes([*high, *low]), 2)),
+            _ => None,
+        };
+        if let Some((number, length)) = identifier(first)
+            && rest.len() == length
+        {
+            self.requests.insert((bus, first, number), (time_s, id, extension));
+            return;
+        }
+        let service = first.wrapping_sub(0x40);
+        let Some((number, length)) = identifier(service) else { return };
+        let request = self.requests.get(&(bus, service, number));
+        let request = request.filter(|(at, _, _)| time_s - at <= ANSWER_WITHIN_S).map(|(_, id, first)| (*id, *first));
+        let key = AnswerKey { bus, response: id, extension, service, identifier: number };
+        // A single frame alone may be any message that begins with these bytes.
+        let is_known = self.answers.contains_key(&key) || is_long || request.is_some();
+        if is_known && (self.answers.contains_key(&key) || self.answers.len() < MAX_ANSWERS) {
+            self.answers.entry(key).or_default().push(time_s, request, &rest[length..]);
+        }
+    }
+}
+
+impl Answers {
+    fn push(&mut self, time_s: f64, request: Option<(CanId, Option<u8>)>, data: &[u8]) {
+        self.request = self.request.or(request);
+        self.stride = self.stride.max(1);
+        if self.seen.is_multiple_of(self.stride) {
+            self.payloads.push(time_s, data);
+        }
+        self.seen += 1;
+        if self.payloads.bytes() > MAX_ANSWER_BYTES && self.payloads.len() > 1 {
+            self.stride *= 2;
+            self.payloads.retain(|index, _| index % 2 == 0);
+        }
+    }
+}
+
+/// Number of the window of a time; negative times (stamps before the first) are in window 0.
+fn window(time_s: f64) -> u64 {
+    (time_s / WINDOW_S) as u64
+}

@@ -1,0 +1,394 @@
+//! The best candidates as a configuration, or the questions that keep it from being one.
+//!
+//! What the log decides is written; what it does not (the cell model, which sensor belongs to which cells, limits and alarms)
+//! is listed. The sign of the current and the number of cells are never guessed: without evidence they are questions.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+
+use super::capture::{AnswerKey, Capture};
+use super::fields::{self, MessageField};
+use super::signals::{Descriptions, LogSignal, SignalOrigin};
+use super::{Candidate, Discovery, PositiveDirection, Quantity, raw};
+use crate::can::CanId;
+use crate::import::{DiagnosticSignal, DiagnosticTable, series};
+
+/// Readings may be this many of their periods old.
+const PERIODS: f64 = 3.0;
+/// Shortest age written, s: the defaults of the configuration are as long.
+const MIN_AGE_S: f64 = 2.0;
+/// Distance of answers from requests at the identifiers that ISO 15765-4 fixes.
+const FIXED_DISTANCE: u16 = 8;
+/// Deviation of the pack voltage from the sum of the cells that is worth a remark.
+const SUM_TOLERANCE: f64 = 0.05;
+
+/// What the user decides.
+#[derive(Debug, Clone, Default)]
+pub struct PackSettings {
+    /// The log, for the head.
+    pub source: String,
+    /// DBC files as the configuration names them, in the order in which they were added.
+    pub databases: Vec<String>,
+    /// DBC as the configuration names it, for fields that no given one describes.
+    pub own_database: String,
+    /// Cell model as the configuration names it.
+    pub cell_model: String,
+    /// Cells in series, for a pack that publishes its total voltage alone.
+    pub cells: Option<u16>,
+    /// What a positive current means, where the log does not show it.
+    pub positive: Option<PositiveDirection>,
+}
+
+/// A configuration.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PackConfiguration {
+    /// TOML.
+    pub text: String,
+    /// DBC of the fields that no given DBC describes, for the file that [`PackSettings::own_database`] names.
+    pub database: Option<String>,
+    /// What the log does not decide.
+    pub open: Vec<String>,
+}
+
+/// The signals of the configuration.
+struct Selection<'a> {
+    current: &'a Candidate,
+    positive: PositiveDirection,
+    voltage: &'a Candidate,
+    cells: u16,
+    temperature: Option<&'a Candidate>,
+    reported: Vec<(&'static str, &'a Candidate)>,
+}
+
+/// Everything the text is made from.
+pub(super) struct Writer<'a> {
+    pub(super) discovery: &'a Discovery,
+    pub(super) capture: &'a Capture,
+    pub(super) descriptions: &'a Descriptions,
+    pub(super) settings: &'a PackSettings,
+}
+
+impl Writer<'_> {
+    /// Writes the configuration; `Err` has the questions.
+    pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
+        let selection = self.select()?;
+        let mut open = Vec::new();
+        if self.is_raw(selection.current) {
+            open.push(format!(
+                "the scale of {} is a guess, and capacity follows it: compare with a known current",
+                selection.current.signal
+            ));
+        }
+        let mut text = self.head(&selection);
+        self.inputs(&selection, &mut text, &mut open);
+        self.tables(&selection, &mut text, &mut open);
+        self.limits(&selection, &mut text);
+        open.push(format!("cell_model = {:?}: is it this cell?", self.settings.cell_model));
+        open.push("alarms, limits of current and temperature: see the reference of keys".to_owned());
+        let mut known = BTreeSet::new();
+        open.retain(|question: &String| known.insert(question.clone()));
+        text.push_str("\n# Not decided by the log:\n");
+        for question in &open {
+            let _ = writeln!(text, "# - {}", plain(question));
+        }
+        let fields = self.fields(&selection);
+        let database = (!fields.is_empty()).then(|| fields::database(&fields).to_dbc());
+        Ok(PackConfiguration { text, database, open })
+    }
+
+    /// Used fields of messages without a DBC.
+    fn fields(&self, selection: &Selection<'_>) -> Vec<&MessageField> {
+        let members = self.candidates(selection).into_iter().flat_map(|candidate| &candidate.members);
+        let found = members.filter_map(|index| match &self.signal(*index).origin {
+            SignalOrigin::Field(field) => Some(&**field),
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) | SignalOrigin::Raw(..) => None,
+        });
+        found.collect()
+    }
+
+    fn best(&self, quantity: Quantity) -> Option<&Candidate> {
+        self.discovery.candidates.iter().find(|candidate| candidate.quantity == quantity)
+    }
+
+    fn select(&self) -> Result<Selection<'_>, Vec<String>> {
+        let mut questions = Vec::new();
+        let current = self.best(Quantity::Current);
+        if current.is_none() {
+            questions.push("which signal is the pack current? the log shows none".to_owned());
+        }
+        let positive = self.settings.positive.or(current.and_then(|current| current.positive));
+        if let (Some(current), None) = (current, positive) {
+            questions.push(format!(
+                "what does a positive value of {} mean? the voltage does not show it: give --positive charge or discharge",
+                current.signal
+            ));
+        }
+        let groups = self.discovery.candidates.iter().filter(|candidate| candidate.quantity == Quantity::CellVoltage);
+        let cells = groups.filter_map(|group| Some((group, self.row(group)?))).next();
+        let pack = self.best(Quantity::PackVoltage);
+        let voltage = match (cells, pack, self.settings.cells) {
+            (Some((group, count)), _, _) => Some((group, count)),
+            (None, Some(pack), Some(count)) => Some((pack, count)),
+            (None, Some(pack), None) => {
+                let (low, high) = (pack.high / 4.2, pack.low / 3.0);
+                questions.push(format!(
+                    "how many cells are in series? {} of {:.0} to {:.0} V may be {:.0} to {:.0}: give --cells",
+                    pack.signal, pack.low, pack.high, low, high
+                ));
+                None
+            }
+            (None, None, _) => {
+                questions.push("which signal is the voltage? the log shows none of the pack or of cells".to_owned());
+                None
+            }
+        };
+        let (Some(current), Some(positive), Some((voltage, cells))) = (current, positive, voltage) else {
+            return Err(questions);
+        };
+        // A field without a name may be a temperature, and may be anything.
+        let temperature = self.best(Quantity::Temperature).filter(|candidate| !self.is_raw(candidate));
+        let soc = self.best(Quantity::Soc).map(|candidate| ("reported_soc", candidate));
+        let soh = self.best(Quantity::Soh).map(|candidate| ("reported_soh", candidate));
+        let reported = soc.into_iter().chain(soh).collect();
+        Ok(Selection { current, positive, voltage, cells, temperature, reported })
+    }
+
+    fn signal(&self, index: usize) -> &LogSignal {
+        &self.discovery.log_signals[index]
+    }
+
+    fn is_raw(&self, candidate: &Candidate) -> bool {
+        let is_raw =
+            |index: &usize| matches!(self.signal(*index).origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_));
+        candidate.members.iter().any(is_raw)
+    }
+
+    /// Cells of a group whose numbers have no gap.
+    fn row(&self, group: &Candidate) -> Option<u16> {
+        let numbers = self.numbers(group)?;
+        let first = *numbers.first()?;
+        let has_no_gap = (first..).zip(&numbers).all(|(expected, number)| expected == *number);
+        u16::try_from(numbers.len()).ok().filter(|count| *count >= 2 && has_no_gap)
+    }
+
+    /// Numbers of the cells of a group, ascending.
+    fn numbers(&self, group: &Candidate) -> Option<Vec<u32>> {
+        let before = group.signal.split_once("{n}").filter(|(before, _)| !before.contains("{m}"));
+        let mut numbers = Vec::new();
+        for index in &group.members {
+            let name = &self.signal(*index).name;
+            let rest = match before {
+                Some((before, _)) => name.strip_prefix(before)?,
+                // Another number comes first: the counted one is the last.
+                None => name.rsplit(|c: char| !c.is_ascii_digit()).find(|text| !text.is_empty())?,
+            };
+            let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
+            numbers.push(rest[..digits].parse().ok()?);
+        }
+        numbers.sort_unstable();
+        Some(numbers)
+    }
+
+    fn head(&self, selection: &Selection<'_>) -> String {
+        let mut text = format!("# Written by `packwatch discover` from {}.\n", plain(&self.settings.source));
+        if !self.used_tables(selection).0.is_empty() {
+            text.push_str("# Definitions from OBDb (https://github.com/OBDb) are under CC BY-SA 4.0, and so is this file with them.\n");
+        }
+        let _ =
+            write!(text, "\n[pack]\ncells = {}\ncell_model = {}\n", selection.cells, quoted(&self.settings.cell_model));
+        for interface in self.interfaces(selection) {
+            let _ = write!(text, "\n[[interface]]\nname = {}\n", quoted(interface));
+        }
+        text
+    }
+
+    fn candidates<'s>(&self, selection: &'s Selection<'_>) -> Vec<&'s Candidate> {
+        let reported = selection.reported.iter().map(|(_, candidate)| *candidate);
+        [selection.current, selection.voltage].into_iter().chain(selection.temperature).chain(reported).collect()
+    }
+
+    fn interfaces<'s>(&self, selection: &'s Selection<'_>) -> Vec<&'s str> {
+        let mut names: Vec<&str> = self.candidates(selection).iter().map(|found| found.interface.as_str()).collect();
+        names.sort_unstable();
+        names.dedup();
+        names
+    }
+
+    fn inputs(&self, selection: &Selection<'_>, text: &mut String, open: &mut Vec<String>) {
+        let mut files: Vec<String> = Vec::new();
+        for candidate in self.candidates(selection) {
+            for index in &candidate.members {
+                if let SignalOrigin::Dbc(file) = self.signal(*index).origin {
+                    files.extend(self.settings.databases.get(file).map(|name| quoted(name)));
+                }
+            }
+        }
+        let fields = self.fields(selection);
+        if !fields.is_empty() {
+            files.push(quoted(&self.settings.own_database));
+            let names: BTreeSet<String> = fields.iter().map(|field| fields::message_name(field.id)).collect();
+            let names = names.into_iter().collect::<Vec<_>>().join(", ");
+            open.push(format!("{names}: found by their values alone, are they right? compare with the dashboard"));
+        }
+        files.sort_unstable();
+        files.dedup();
+        let _ = write!(text, "\n[input]\ndbc = [{}]\n", files.join(", "));
+        let positive = format!("positive = \"{}\"\n", selection.positive.name());
+        self.input("[input.current]", selection.current, &selection.current.signal, &positive, text);
+        let first = self.numbers(selection.voltage).and_then(|numbers| numbers.first().copied()).unwrap_or(1);
+        match selection.voltage.quantity {
+            Quantity::CellVoltage => {
+                let first = format!("first = {first}\n");
+                self.input("[input.cell_voltage]", selection.voltage, &selection.voltage.signal, &first, text);
+                self.compare_sum(selection, open);
+            }
+            _ => self.input("[input.pack_voltage]", selection.voltage, &selection.voltage.signal, "", text),
+        }
+        match selection.temperature {
+            Some(temperature) => {
+                let name = self.signal(temperature.members[0]).name.clone();
+                self.input("[[input.temperature]]", temperature, &name, "", text);
+                if temperature.signals > 1 {
+                    open.push(format!(
+                        "{} has {} sensors, {name} alone is used: which cells are beside which sensor?",
+                        temperature.signal, temperature.signals
+                    ));
+                }
+            }
+            None => open.push("no temperature: [pack] ambient_c is assumed".to_owned()),
+        }
+        for (key, candidate) in &selection.reported {
+            self.input(&format!("[input.{key}]"), candidate, &candidate.signal, "", text);
+        }
+    }
+
+    fn input(&self, table: &str, candidate: &Candidate, signal: &str, more: &str, text: &mut String) {
+        let _ = write!(text, "\n# {}\n{table}\nsignal = {}\n", plain(&candidate.reasons.join("; ")), quoted(signal));
+        let _ = write!(text, "interface = {}\n{more}", quoted(&candidate.interface));
+        let scale = self.signal(candidate.members[0]).scale;
+        if scale != 1.0 {
+            let _ = writeln!(text, "scale = {scale}");
+        }
+    }
+
+    fn compare_sum(&self, selection: &Selection<'_>, open: &mut Vec<String>) {
+        let Some(pack) = self.best(Quantity::PackVoltage) else { return };
+        let sum: f64 = selection.voltage.members.iter().map(|index| self.signal(*index).series.mean()).sum();
+        let pack_v = self.signal(pack.members[0]).series.mean();
+        if (pack_v / sum - 1.0).abs() > SUM_TOLERANCE {
+            open.push(format!(
+                "{} is {pack_v:.1} V, the cells are {sum:.1} V together: are all cells there?",
+                pack.signal
+            ));
+        }
+    }
+
+    /// Tables of definitions with the used signals, and used fields without a definition.
+    fn used_tables(
+        &self,
+        selection: &Selection<'_>,
+    ) -> (Vec<DiagnosticTable>, BTreeMap<AnswerKey, Vec<DiagnosticSignal>>) {
+        let mut names: BTreeMap<usize, Vec<&str>> = BTreeMap::new();
+        let mut fields: BTreeMap<AnswerKey, Vec<DiagnosticSignal>> = BTreeMap::new();
+        for index in self.candidates(selection).iter().flat_map(|candidate| &candidate.members) {
+            let signal = self.signal(*index);
+            match &signal.origin {
+                SignalOrigin::Defined(table) => names.entry(*table).or_default().push(&signal.name),
+                SignalOrigin::Raw(key, field) => fields.entry(*key).or_default().push((**field).clone()),
+                SignalOrigin::Dbc(_) | SignalOrigin::Field(_) => {}
+            }
+        }
+        let table = |(index, used): (usize, Vec<&str>)| {
+            let mut table = self.descriptions.tables.get(index)?.clone();
+            let name = table.name.clone();
+            let is_used = |signal: &DiagnosticSignal| {
+                (0..signal.count()).any(|n| used.contains(&format!("{name}.{}", signal.of_series(n).name).as_str()))
+            };
+            table.signals.retain(is_used);
+            table.remarks.clear();
+            for signal in &mut table.signals {
+                let full_name = format!("{name}.{}", signal.name);
+                if self.discovery.log_signals.iter().any(|other| other.is_read_signed && other.name == full_name) {
+                    *signal = signal.as_signed();
+                    table
+                        .remarks
+                        .push(format!("{} is unsigned in the source, its values are of a signed number.", signal.name));
+                }
+            }
+            Some(table)
+        };
+        (names.into_iter().filter_map(table).collect(), fields)
+    }
+
+    fn tables(&self, selection: &Selection<'_>, text: &mut String, open: &mut Vec<String>) {
+        let (tables, fields) = self.used_tables(selection);
+        for table in tables {
+            let _ = write!(text, "\n{table}");
+        }
+        for (key, mut signals) in fields {
+            signals.sort_by_key(|signal| signal.bit);
+            let heard = self.capture.answers.get(&key).and_then(|answers| answers.request);
+            let request = heard.map_or_else(|| guessed_request(key.response), |(id, _)| id);
+            let mut remarks = vec!["Without a definition: places and scales are from plausible values.".to_owned()];
+            if heard.is_none() {
+                remarks.push("No request was heard: its identifier is a guess.".to_owned());
+                open.push(format!("to which identifier is {} asked? 0x{:X} is a guess", key.response, request.raw()));
+            }
+            let first_byte = heard.and_then(|(_, first)| first).unwrap_or_default();
+            let table = DiagnosticTable {
+                name: raw::table_name(&key),
+                request,
+                response: key.response,
+                extension: key.extension.map(|response| (first_byte, response)),
+                service: key.service,
+                identifier: key.identifier,
+                remarks,
+                signals: series::join(signals),
+            };
+            let names: Vec<&str> = table.signals.iter().map(|signal| signal.name.as_str()).collect();
+            let names = names.join(", ");
+            open.push(format!(
+                "{} {names}: found by their values alone, are they right? compare with the dashboard",
+                table.name
+            ));
+            let _ = write!(text, "\n{table}");
+        }
+    }
+
+    /// Ages that suit the periods of the readings: answers come seldom.
+    fn limits(&self, selection: &Selection<'_>, text: &mut String) {
+        let named = [
+            ("current", Some(selection.current)),
+            ("voltage", Some(selection.voltage)),
+            ("temperature", selection.temperature),
+        ];
+        for (name, candidate) in named {
+            let Some(candidate) = candidate else { continue };
+            let period_s =
+                candidate.members.iter().map(|index| self.signal(*index).series.period_s).fold(0.0, f64::max);
+            let age_s = (PERIODS * period_s).max(MIN_AGE_S).ceil();
+            let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
+        }
+    }
+}
+
+fn guessed_request(response: CanId) -> CanId {
+    match response {
+        CanId::Standard(id) => CanId::Standard(id.saturating_sub(FIXED_DISTANCE)),
+        // Normal fixed addressing: the two addresses change places.
+        CanId::Extended(id) => {
+            let [low, high, ..] = id.to_le_bytes();
+            CanId::Extended(id & !0xFFFF | u32::from(low) << 8 | u32::from(high))
+        }
+    }
+}
+
+/// A TOML text.
+fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}
+
+/// One line of a comment.
+fn plain(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+}

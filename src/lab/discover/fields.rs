@@ -1,0 +1,391 @@
+//! Bit fields of messages that no DBC describes: which behave like pack voltage, current or cell voltages.
+//!
+//! * Voltage: 16 bits at every byte and 12 bits at every half byte, both byte orders, customary scales; the value is one of a
+//!   pack, moves a little, and its last digits are alive.
+//! * Current: the same places, signed; its changes go with those of a voltage as a resistance would have it. The scale is the
+//!   one of the customary ones that gives the most usual resistance: a guess.
+//! * Cells: neighbours of 8, 12 or 16 bits close to one another, at least three in each message or page (first byte), at least
+//!   eight in all.
+//!
+//! Temperatures and charge show no behaviour of their own within minutes: they are not looked for.
+
+use std::collections::BTreeSet;
+
+use super::capture::{Capture, MessageKey, Payloads};
+use super::series::{Relation, Series};
+use super::signals::{LogSignal, SignalOrigin};
+use super::words::{Dimension, Words};
+use crate::can::CanId;
+use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
+use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
+
+/// Payloads to judge a message by.
+const MIN_PAYLOADS: usize = 20;
+/// Payloads judged of a message, or of each of its pages.
+const MAX_PAYLOADS: usize = 1500;
+/// Plausible voltages of a pack, V, and V per code.
+const PACK_V: (f64, f64) = (100.0, 950.0);
+const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
+/// Largest range of a pack voltage within a log, of its largest value.
+const MAX_SWING: f64 = 0.35;
+/// Different values that an alive voltage takes at least.
+const MIN_DISTINCT: usize = 5;
+/// A per code of a current.
+const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
+/// Advantage of the first of them, the most customary one, in the logarithm of the resistance.
+const CUSTOMARY: f64 = 0.25;
+/// Resistance of a usual pack, ohms per V: 0.1 ohm at 400 V.
+const USUAL_OHM_PER_V: f64 = 2.5e-4;
+/// Voltages that are compared with every other field, and pairs that are kept.
+const MAX_VOLTAGES: usize = 16;
+const MAX_CURRENTS: usize = 12;
+/// Correlation of changes, and standard deviations from chance: thousands of fields are compared.
+const MIN_CORRELATION: f64 = 0.6;
+const MIN_STRENGTH: f64 = 7.0;
+/// Plausible voltages of a cell, V; cells of a pack are at most so far apart.
+const CELL_V: (f64, f64) = (2.5, 4.4);
+const MAX_SPREAD_V: f64 = 0.25;
+/// Bits of a cell voltage and V per code.
+const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
+/// Fewest cells of a page, and in all.
+const MIN_IN_PAGE: usize = 3;
+const MIN_CELLS: usize = 8;
+/// Most pages of a message.
+const MAX_PAGES: usize = 64;
+
+/// A field of a message: its identifier, and the value of the first byte where that is a page.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct MessageField {
+    pub(super) id: CanId,
+    pub(super) page: Option<u8>,
+    pub(super) signal: Signal,
+}
+
+/// Name of a message without a DBC. Decimal: its digits are then one number.
+pub(super) fn message_name(id: CanId) -> String {
+    format!("Message{}", id.raw())
+}
+
+/// Fields that behave like a voltage, a current or cells.
+pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
+    let diagnostic: BTreeSet<CanId> = capture
+        .answers
+        .iter()
+        .flat_map(|(key, answers)| [Some(key.response), answers.request.map(|request| request.0)])
+        .flatten()
+        .collect();
+    let usual = capture.messages.iter();
+    let usual = usual.filter(|(key, payloads)| payloads.len() >= MIN_PAYLOADS && !diagnostic.contains(&key.1));
+    let messages = usual.map(|(key, payloads)| Samples::new(*key, payloads)).filter(|samples| samples.bytes >= 2);
+    let messages: Vec<Samples<'_>> = messages.collect();
+    let mut found = cells(&messages);
+    let of_cells: BTreeSet<MessageKey> = found.iter().filter_map(LogSignal::message).collect();
+    let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
+    let mut voltages: Vec<LogSignal> = others.flat_map(voltages_of).collect();
+    voltages.sort_by(|a, b| swing(&a.series).total_cmp(&swing(&b.series)).then_with(|| a.name.cmp(&b.name)));
+    voltages.truncate(MAX_VOLTAGES);
+    let compared: Vec<&LogSignal> = voltages.iter().chain(found.first()).collect();
+    let currents = currents(messages.iter().filter(|samples| !of_cells.contains(&samples.key)), &compared);
+    found.extend(currents);
+    found.extend(voltages);
+    found
+}
+
+/// Payloads of a message, not more than a judgement needs.
+struct Samples<'a> {
+    key: MessageKey,
+    /// Length of the shortest payload, at most that of a classic frame.
+    bytes: usize,
+    /// Values of the first byte where they are pages; otherwise one `None`.
+    pages: Vec<Option<u8>>,
+    payloads: Vec<(f64, &'a [u8])>,
+}
+
+impl<'a> Samples<'a> {
+    fn new(key: MessageKey, payloads: &'a Payloads) -> Self {
+        let bytes = payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0).min(8);
+        let pages = pages(payloads);
+        let payloads = if pages.len() > 1 {
+            // Thinned evenly, whole pages might be lost.
+            payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
+        } else {
+            payloads.iter().step_by(payloads.len().div_ceil(MAX_PAYLOADS).max(1)).collect()
+        };
+        Self { key, bytes, pages, payloads }
+    }
+
+    fn values(&self, layout: &SignalLayout, page: Option<u8>) -> Series {
+        let Ok(plan) = layout.plan() else { return Series::default() };
+        let of_page = self.payloads.iter().filter(|(_, data)| page.is_none() || data.first().copied() == page);
+        Series::collect(of_page.map(|(time_s, data)| (*time_s, plan.decode(data).ok())), 0)
+    }
+}
+
+fn swing(series: &Series) -> f64 {
+    (series.high() - series.low()) / series.high()
+}
+
+/// Layouts of 16 bits at every byte and 12 bits at every half byte, both byte orders.
+fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
+    let last = u16::try_from(8 * bytes).unwrap_or(0);
+    let mut found = Vec::new();
+    for (bits, step) in [(16, 8), (12, 4)] {
+        for first in (0..last).step_by(step) {
+            let value_type = if signed { ValueType::Signed } else { ValueType::Unsigned };
+            if first + bits <= last {
+                found.push(layout(first, bits, ByteOrder::LittleEndian, value_type, 1.0));
+                found.push(layout(first, bits, ByteOrder::BigEndian, value_type, 1.0));
+            }
+        }
+    }
+    found
+}
+
+/// A field by its first bit in the order of the wire: of little-endian fields counted from bit 0 of each byte up.
+fn layout(first: u16, bits: u16, byte_order: ByteOrder, value_type: ValueType, factor: f64) -> SignalLayout {
+    let start_bit = match byte_order {
+        ByteOrder::LittleEndian => first,
+        ByteOrder::BigEndian => first - first % 8 + (7 - first % 8),
+    };
+    SignalLayout {
+        start_bit,
+        length_bits: bits,
+        byte_order,
+        value_type,
+        factor,
+        offset: 0.0,
+        minimum: 0.0,
+        maximum: 0.0,
+    }
+}
+
+fn signal(
+    key: MessageKey,
+    page: Option<u8>,
+    name: String,
+    unit: &str,
+    layout: SignalLayout,
+    series: Series,
+) -> LogSignal {
+    let dimension = if unit == "A" { Dimension::Current } else { Dimension::Voltage };
+    let (full_name, unit) = (format!("{}.{name}", message_name(key.1)), unit.to_owned());
+    let signal = Signal {
+        name,
+        layout,
+        unit,
+        receivers: Vec::new(),
+        conditions: Vec::new(),
+        is_multiplexor: false,
+        values: Vec::new(),
+        comment: None,
+    };
+    LogSignal {
+        name: full_name,
+        bus: key.0,
+        origin: SignalOrigin::Field(Box::new(MessageField { id: key.1, page, signal })),
+        dimension,
+        words: Words::new(""),
+        is_pack_message: false,
+        series,
+        is_read_signed: false,
+        scale: 1.0,
+    }
+}
+
+/// Place of a field in a name: first bit and byte order.
+fn place(layout: &SignalLayout) -> String {
+    let order = if layout.byte_order == ByteOrder::LittleEndian { "little" } else { "big" };
+    format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
+}
+
+fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
+    let mut found = Vec::new();
+    for layout in layouts(samples.bytes, false) {
+        let codes = samples.values(&layout, None);
+        let is_alive = codes.bad == 0 && codes.distinct() >= MIN_DISTINCT && swing(&codes) <= MAX_SWING;
+        if !is_alive || codes.is_counter() {
+            continue;
+        }
+        for factor in PACK_SCALES {
+            if codes.low() * factor >= PACK_V.0 && codes.high() * factor <= PACK_V.1 {
+                let layout = SignalLayout { factor, ..layout };
+                let series = samples.values(&layout, None);
+                found.push(signal(samples.key, None, format!("Voltage_{}", place(&layout)), "V", layout, series));
+            }
+        }
+    }
+    found
+}
+
+/// The fields whose changes go best with those of a voltage, or of a cell.
+fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&LogSignal]) -> Vec<LogSignal> {
+    let mut found: Vec<(f64, LogSignal)> = Vec::new();
+    for samples in messages {
+        for layout in layouts(samples.bytes, true) {
+            let codes = samples.values(&layout, None);
+            if codes.is_constant() || codes.is_counter() {
+                continue;
+            }
+            let others = voltages.iter().filter(|voltage| !shares_bits(voltage, samples.key.1, &layout));
+            let related = others.filter_map(|voltage| Some((voltage.series.relation(&codes)?, voltage.series.mean())));
+            let best = related
+                .filter(|(relation, _)| is_strong(relation))
+                .max_by(|a, b| a.0.correlation.abs().total_cmp(&b.0.correlation.abs()));
+            let Some((relation, mean_v)) = best else { continue };
+            let distance = |factor: &f64| {
+                let unusual = (relation.slope.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
+                if *factor == CURRENT_SCALES[0] { unusual - CUSTOMARY } else { unusual }
+            };
+            let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+            let layout = SignalLayout { factor: factor.unwrap_or(1.0), ..layout };
+            let series = samples.values(&layout, None);
+            let name = format!("Current_{}", place(&layout));
+            found.push((relation.correlation.abs(), signal(samples.key, None, name, "A", layout, series)));
+        }
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
+    found.into_iter().take(MAX_CURRENTS).map(|(_, signal)| signal).collect()
+}
+
+fn is_strong(relation: &Relation) -> bool {
+    let strength = relation.correlation.abs();
+    strength >= MIN_CORRELATION && strength * (relation.steps as f64).sqrt() >= MIN_STRENGTH
+}
+
+/// Whether a field overlaps with a layout of the same message, on whatever interface: gateways repeat messages.
+fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
+    matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && overlap(&own.signal.layout, layout))
+}
+
+impl LogSignal {
+    /// The message of a field without a DBC.
+    fn message(&self) -> Option<MessageKey> {
+        match &self.origin {
+            SignalOrigin::Field(field) => Some((self.bus, field.id)),
+            SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) | SignalOrigin::Raw(..) => None,
+        }
+    }
+}
+
+/// Whether two fields have a bit in common.
+pub(super) fn overlap(a: &SignalLayout, b: &SignalLayout) -> bool {
+    let mask = |layout: &SignalLayout| {
+        let mut payload = [0_u8; 8];
+        let all = SignalLayout { value_type: ValueType::Unsigned, factor: 1.0, ..*layout };
+        let written = all.plan().is_ok_and(|plan| plan.encode_raw(&mut payload, plan.all_ones()).is_ok());
+        if written { u64::from_be_bytes(payload) } else { 0 }
+    };
+    mask(a) & mask(b) != 0
+}
+
+/// Rows of neighbours in messages and pages, all of one form, numbered through.
+fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
+    let mut best: Vec<LogSignal> = Vec::new();
+    for (bits, scales) in CELL_FORMS {
+        for factor in scales {
+            for byte_order in [ByteOrder::LittleEndian, ByteOrder::BigEndian] {
+                let found = cells_of_form(messages, bits, *factor, byte_order);
+                if found.len() >= MIN_CELLS && found.len() > best.len() {
+                    best = found;
+                }
+            }
+        }
+    }
+    best
+}
+
+fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: ByteOrder) -> Vec<LogSignal> {
+    let mut found: Vec<LogSignal> = Vec::new();
+    for samples in messages {
+        let end = u16::try_from(8 * samples.bytes).unwrap_or(0);
+        for page in &samples.pages {
+            // Page, then perhaps a byte of flags.
+            let first = if page.is_some() { 8 } else { 0 };
+            let starts = (first..first + 16).step_by(if bits == 12 { 4 } else { 8 });
+            let rows = starts.map(|start| {
+                let places = (start..end).step_by(usize::from(bits)).filter(|place| place + bits <= end);
+                let layouts = places.map(|place| layout(place, bits, byte_order, ValueType::Unsigned, factor));
+                row(samples, *page, layouts)
+            });
+            let longest = rows.rev().max_by_key(Vec::len).filter(|row| row.len() >= MIN_IN_PAGE);
+            let Some(row) = longest.filter(|row| continues(&found, samples.key, row)) else { continue };
+            for (layout, series) in row {
+                let name = format!("Cell{}", found.len() + 1);
+                found.push(signal(samples.key, *page, name, "V", layout, series));
+            }
+        }
+    }
+    found
+}
+
+/// Whether a row may be of the same pack as the cells so far.
+fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)]) -> bool {
+    cells
+        .first()
+        .is_none_or(|first| first.bus == key.0 && (first.series.mean() - row[0].1.mean()).abs() <= MAX_SPREAD_V)
+}
+
+/// The pages of a message: the values of its first byte where they count up; otherwise the message as a whole.
+fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
+    let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
+    let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
+    let is_counter = (2..=MAX_PAGES).contains(&values.len()) && span == values.len() && payloads.len() >= 3 * span;
+    if is_counter { values.into_iter().map(Some).collect() } else { vec![None] }
+}
+
+/// Neighbours from the first one on that are plausible and close together.
+fn row(
+    samples: &Samples<'_>,
+    page: Option<u8>,
+    layouts: impl Iterator<Item = SignalLayout>,
+) -> Vec<(SignalLayout, Series)> {
+    let mut row: Vec<(SignalLayout, Series)> = Vec::new();
+    for layout in layouts {
+        let series = samples.values(&layout, page);
+        let is_cell = series.low() >= CELL_V.0 && series.high() <= CELL_V.1 && series.bad == 0;
+        let is_near = row.first().is_none_or(|first| (series.mean() - first.1.mean()).abs() <= MAX_SPREAD_V);
+        if !is_cell || !is_near {
+            break;
+        }
+        row.push((layout, series));
+    }
+    // Bytes that never change are rather text or constants.
+    let is_alive = row.iter().any(|(_, series)| !series.is_constant());
+    if is_alive { row } else { Vec::new() }
+}
+
+/// A DBC of these fields; pages become a multiplexor.
+pub(super) fn database(fields: &[&MessageField]) -> Database {
+    let mut messages: Vec<Message> = Vec::new();
+    for field in fields {
+        let place = messages.iter().position(|message| message.id == field.id);
+        let place = place.unwrap_or_else(|| {
+            messages.push(empty_message(field));
+            messages.len() - 1
+        });
+        let mut signal = field.signal.clone();
+        let condition = |page: u8| MuxCondition { selector: 0, ranges: vec![(page.into(), page.into())] };
+        signal.conditions = field.page.map(condition).into_iter().collect();
+        messages[place].signals.push(signal);
+    }
+    let comment = "Found by packwatch discover from values alone: places and scales are guesses".to_owned();
+    Database { nodes: Vec::new(), comment: Some(comment), messages }
+}
+
+/// A message with its multiplexor, if it has pages.
+fn empty_message(field: &MessageField) -> Message {
+    let layout = layout(0, 8, ByteOrder::LittleEndian, ValueType::Unsigned, 1.0);
+    let page =
+        Signal { name: "Page".to_owned(), layout, unit: String::new(), is_multiplexor: true, ..field.signal.clone() };
+    Message {
+        id: field.id,
+        name: message_name(field.id),
+        len_bytes: 8,
+        sender: None,
+        format: FrameFormat::Classic,
+        e2e: None,
+        signals: field.page.map(|_| page).into_iter().collect(),
+        cycle_time_ms: None,
+        comment: None,
+    }
+}

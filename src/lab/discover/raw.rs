@@ -1,0 +1,268 @@
+//! Fields of diagnostic answers that no definition describes: which bytes behave like cell voltages, pack voltage, current or
+//! temperatures.
+//!
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbours of 8 or 16 bits that, at one of the customary scales,
+//! are all plausible voltages close to one another. Other fields are tried at every byte with customary scales; which of
+//! them is what is judged from their values, as for named signals.
+
+use std::collections::BTreeMap;
+
+use super::capture::{AnswerKey, Answers};
+use super::series::Series;
+use super::signals::{LogSignal, SignalOrigin};
+use super::words::{Dimension, Words};
+use crate::can::CanId;
+use crate::import::{DiagnosticSignal, NumberRange};
+use crate::quantity::BusIndex;
+
+/// Name of a cell, before its number.
+pub(super) const CELL: &str = "Cell";
+/// Fewest neighbours of a row of cells.
+const MIN_CELLS: usize = 8;
+/// Plausible voltages of a cell in use, V.
+const CELL_V: (f64, f64) = (2.0, 4.5);
+/// Cells of one pack are at most so far apart, V.
+const MAX_SPREAD_V: f64 = 0.35;
+/// V per code, 16 bits and 8 bits.
+const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
+/// Plausible voltages of a pack, V.
+const PACK_V: (f64, f64) = (100.0, 950.0);
+/// V per code of a pack voltage of 16 bits.
+const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
+/// Bits and A per code of a current.
+const CURRENT_FORMS: [(u32, &[f64]); 3] =
+    [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
+/// Largest plausible current, A.
+const MAX_CURRENT_A: f64 = 1500.0;
+/// Voltages of 16 bits from here on are the sign of a longer number, or no value.
+const SIGN_16: f64 = 65_280.0;
+/// Fewest sensors of a row of temperatures.
+const MIN_SENSORS: usize = 3;
+/// Sensors of one pack are at most so far apart, K.
+const MAX_SPREAD_C: f64 = 12.0;
+/// Answers to judge a field by.
+const MIN_ANSWERS: usize = 3;
+
+/// Rows of cells so far, by controller, first bit, length and scale: a row of the same form in the next answer continues it.
+#[derive(Debug, Default)]
+pub(super) struct CellRows(BTreeMap<RowForm, u32>);
+
+/// Controller, first bit, length and bits of the scale.
+type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, u64);
+
+/// Signals that may be in these answers, beside the bits (first, last) that are described.
+pub(super) fn signals(
+    key: &AnswerKey,
+    answers: &Answers,
+    described: &[(u32, u32)],
+    rows: &mut CellRows,
+) -> Vec<LogSignal> {
+    let bytes = answers.payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0);
+    if answers.payloads.len() < MIN_ANSWERS {
+        return Vec::new();
+    }
+    let is_free_of = |taken: &[(u32, u32)], bit: u32, length: u32| {
+        taken.iter().all(|(low, high)| bit > *high || bit + length <= *low)
+    };
+    let mut found = cells(key, answers, bytes, rows);
+    found.extend(temperatures(key, answers, bytes));
+    found.retain(|signal| signal.span().is_some_and(|(low, high)| is_free_of(described, low, high + 1 - low)));
+    let mut taken: Vec<(u32, u32)> = found.iter().filter_map(LogSignal::span).collect();
+    taken.extend(described);
+    let is_free = |bit: u32, length: u32| is_free_of(&taken, bit, length);
+    for byte in 0..u32::try_from(bytes).unwrap_or(0) {
+        let bit = 8 * byte;
+        let rest = 8 * (u32::try_from(bytes).unwrap_or(0) - byte);
+        let mut forms = vec![field("Temperature", bit, 8, true, 1.0), field("Temperature", bit, 8, false, 1.0)];
+        forms[1].offset = -40.0;
+        forms.extend(PACK_SCALES.iter().map(|scale| field("Voltage", bit, 16, false, *scale)));
+        let currents =
+            CURRENT_FORMS.iter().flat_map(|(length, scales)| scales.iter().map(move |scale| (*length, *scale)));
+        forms.extend(currents.map(|(length, scale)| field("Current", bit, length, true, scale)));
+        let fitting = forms.into_iter().filter(|form| form.length <= rest && is_free(bit, form.length));
+        found.extend(fitting.filter_map(|form| signal(key, answers, form)).filter(is_plausible));
+    }
+    found
+}
+
+impl LogSignal {
+    /// First and last bit of a field without a definition.
+    pub(super) fn span(&self) -> Option<(u32, u32)> {
+        let SignalOrigin::Raw(_, field) = &self.origin else { return None };
+        Some((field.bit, field.bit + field.length - 1))
+    }
+}
+
+/// A field with a name that says where it is.
+fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> DiagnosticSignal {
+    let unit = match what {
+        "Temperature" | "Sensor" => "degC",
+        "Current" => "A",
+        _ => "V",
+    };
+    DiagnosticSignal {
+        name: format!("{what}_{}", bit / 8),
+        bit,
+        length,
+        signed,
+        little_endian: false,
+        factor,
+        offset: 0.0,
+        unit: unit.to_owned(),
+        range: None,
+        not_available: Vec::new(),
+        numbers: None,
+    }
+}
+
+fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<LogSignal> {
+    let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, form.value(data)));
+    let series = Series::collect(readings, answers.payloads.len());
+    let dimension = match form.unit.as_str() {
+        "degC" => Dimension::Temperature,
+        "A" => Dimension::Current,
+        _ => Dimension::Voltage,
+    };
+    // Cells are numbered through all answers, other fields are named by their answer.
+    let mut form = form;
+    if !form.name.starts_with(CELL) {
+        form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
+    }
+    (series.values.len() >= MIN_ANSWERS).then(|| LogSignal {
+        name: format!("{}.{}", table_name(key), form.name),
+        bus: key.bus,
+        // Places say nothing about a meaning.
+        words: Words::new(""),
+        is_pack_message: false,
+        origin: SignalOrigin::Raw(*key, Box::new(form)),
+        dimension,
+        series,
+        is_read_signed: false,
+        scale: 1.0,
+    })
+}
+
+/// Name of the tables of a controller's answers: `Answer7BB`.
+pub(super) fn table_name(key: &AnswerKey) -> String {
+    let extension = key.extension.map(|byte| format!("_{byte:02X}")).unwrap_or_default();
+    format!("Answer{}{extension}", key.response)
+}
+
+fn is_plausible(signal: &LogSignal) -> bool {
+    let (SignalOrigin::Raw(_, field), Series { values, .. }) = (&signal.origin, &signal.series) else { return false };
+    let within = |low: f64, high: f64| values.iter().all(|value| (low..=high).contains(value));
+    match signal.dimension {
+        Dimension::Voltage => within(PACK_V.0, PACK_V.1) && signal.series.high() < SIGN_16 * field.factor,
+        Dimension::Current => within(-MAX_CURRENT_A, MAX_CURRENT_A) && !signal.series.is_constant(),
+        Dimension::Temperature => {
+            // 0 and 0xFF all the time are no value.
+            let is_absent = values.iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
+            within(-35.0, 75.0) && signal.series.largest_step() <= 2.0 && !is_absent
+        }
+        Dimension::Percent | Dimension::None | Dimension::Other => false,
+    }
+}
+
+/// The best row of temperatures: bytes at one distance that are close to one another and hardly change. A place without a
+/// sensor (0xFF) may lie between.
+fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
+    let mut best: Vec<LogSignal> = Vec::new();
+    let mut best_weight = 0;
+    for (distance, offset) in (1..=4).flat_map(|distance| [(distance, 0.0), (distance, -40.0)]) {
+        for first in 0..bytes {
+            let row = temperature_row(key, answers, (first, bytes), distance, offset);
+            let values: std::collections::BTreeSet<u64> =
+                row.iter().flat_map(|signal| &signal.series.values).map(|value| value.to_bits()).collect();
+            // Equal constants are rather bytes of other numbers.
+            let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
+            if row.len() >= MIN_SENSORS && weight > best_weight {
+                (best, best_weight) = (row, weight);
+            }
+        }
+    }
+    best
+}
+
+fn temperature_row(
+    key: &AnswerKey,
+    answers: &Answers,
+    (first, end): (usize, usize),
+    distance: usize,
+    offset: f64,
+) -> Vec<LogSignal> {
+    let is_absent = |byte: usize| answers.payloads.iter().all(|(_, data)| data.get(byte) == Some(&0xFF));
+    let mut row: Vec<LogSignal> = Vec::new();
+    for byte in (first..end).step_by(distance) {
+        if is_absent(byte) && !row.is_empty() {
+            continue;
+        }
+        // A record of which half is absent is no record.
+        if !row.is_empty() && (byte + 1 - distance..byte).any(is_absent) {
+            break;
+        }
+        let mut form = field("Sensor", u32::try_from(8 * byte).unwrap_or(u32::MAX), 8, offset == 0.0, 1.0);
+        (form.name, form.offset) = (format!("Row{first}Sensor{}", row.len() + 1), offset);
+        let next = signal(key, answers, form).filter(is_plausible);
+        let is_near = |signal: &LogSignal| {
+            row.first().is_none_or(|first| (signal.series.mean() - first.series.mean()).abs() <= MAX_SPREAD_C)
+        };
+        match next.filter(is_near) {
+            Some(signal) => row.push(signal),
+            None => break,
+        }
+    }
+    row
+}
+
+/// The longest row of cell voltages, each cell a signal.
+fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) -> Vec<LogSignal> {
+    let mut best: Option<(usize, DiagnosticSignal)> = None;
+    for (length, scales) in CELL_SCALES {
+        let width = length as usize / 8;
+        for scale in scales {
+            for first in 0..width {
+                let longest = best.as_ref().map_or(MIN_CELLS - 1, |best| best.0 * best.1.length as usize / 8);
+                if let Some((count, start)) = row(answers, bytes, first, width, *scale)
+                    && count >= MIN_CELLS
+                    && count * width > longest
+                {
+                    let bit = u32::try_from(8 * start).unwrap_or(u32::MAX);
+                    best = Some((count, field("Cell", bit, length, false, *scale)));
+                }
+            }
+        }
+    }
+    let Some((count, mut form)) = best else { return Vec::new() };
+    let count = u32::try_from(count).unwrap_or(1);
+    let form_key = (key.bus, key.response, key.extension, form.bit, form.length, form.factor.to_bits());
+    let before = rows.0.entry(form_key).or_default();
+    form.name = format!("{CELL}{{n}}");
+    form.numbers = Some(NumberRange { first: *before + 1, last: *before + count, step: form.length });
+    *before += count;
+    (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
+}
+
+/// Length and first byte of the longest run of plausible neighbours that begin at `first`, `first + width`, ...
+fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) -> Option<(usize, usize)> {
+    let is_cell = |start: usize| {
+        answers.payloads.iter().all(|(_, data)| {
+            let code = data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte));
+            (CELL_V.0..=CELL_V.1).contains(&(f64::from(code) * scale)) && code != u32::MAX >> (32 - 8 * width)
+        })
+    };
+    let value = |start: usize| {
+        let data = answers.payloads.iter().next().map_or(&[][..], |(_, data)| data);
+        scale * f64::from(data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte)))
+    };
+    let mut best: Option<(usize, usize)> = None;
+    let mut run: Option<(usize, usize)> = None;
+    for start in (first..bytes).step_by(width).filter(|start| start + width <= bytes) {
+        run = match run {
+            _ if !is_cell(start) => None,
+            Some((count, begin)) if (value(start) - value(begin)).abs() <= MAX_SPREAD_V => Some((count + 1, begin)),
+            _ => Some((1, start)),
+        };
+        best = best.max(run);
+    }
+    best
+}

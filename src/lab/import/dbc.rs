@@ -1,0 +1,208 @@
+//! A DBC's likely battery signals as the `[input]` part of a configuration: by name, unit and range alone.
+//!
+//! In: a parsed DBC and its name. Out: TOML with the best candidate of each input and the next ones as comments. No log is
+//! looked at: what the signals really carry is for `packwatch discover` and the owner to say; so the sign of the current is
+//! left open, and the part is no valid configuration until it is filled in.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use crate::can::dbc::{Database, Message, Signal};
+use crate::discover::groups::groups;
+use crate::discover::words::{Dimension, Words, dimension};
+use crate::error::LabError;
+
+/// Further candidates in comments.
+const FURTHER: usize = 4;
+/// Fewest points of a candidate: a unit, and a name that says quantity or battery.
+const MIN_POINTS: f64 = 3.0;
+/// Largest value that a cell voltage's bits may hold and still be one of a cell, V.
+const MAX_CELL_V: f64 = 10.0;
+
+/// An input of the configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum InputKind {
+    Current,
+    CellVoltage,
+    PackVoltage,
+    Temperature,
+    Soc,
+    Soh,
+}
+
+/// A candidate: points and name.
+type Ranked = (f64, String);
+
+/// Writes the part.
+///
+/// # Errors
+/// No signal looks like a current or a voltage of a battery.
+pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
+    let mut candidates: BTreeMap<InputKind, Vec<Ranked>> = BTreeMap::new();
+    for message in &database.messages {
+        for signal in &message.signals {
+            for (kind, points) in judge(message, signal) {
+                candidates.entry(kind).or_default().push((points, format!("{}.{}", message.name, signal.name)));
+            }
+        }
+    }
+    let cells = candidates.remove(&InputKind::CellVoltage).unwrap_or_default();
+    candidates.insert(InputKind::CellVoltage, with_patterns(cells));
+    for ranked in candidates.values_mut() {
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
+    }
+    let is_empty = |kind| candidates.get(&kind).is_none_or(Vec::is_empty);
+    if is_empty(InputKind::Current) && is_empty(InputKind::PackVoltage) && is_empty(InputKind::CellVoltage) {
+        let what = format!("{file}: no signal of {} messages looks like a battery's", database.messages.len());
+        return Err(LabError(what));
+    }
+    Ok(text(file, &candidates))
+}
+
+/// What a signal may be, with its points.
+fn judge(message: &Message, signal: &Signal) -> Vec<(InputKind, f64)> {
+    let words = Words::new(&signal.name);
+    let (dimension, scale) = dimension(&signal.unit);
+    if signal.layout.length_bits < 4 {
+        return Vec::new();
+    }
+    let mut place = f64::from(words.says_pack()) * 2.0 - f64::from(words.says_no_measurement()) * 3.0;
+    place += f64::from(Words::new(&message.name).says_pack() && !words.says_pack());
+    place -= f64::from(words.says_elsewhere()) * 3.0;
+    let extreme = f64::from(words.says_extreme());
+    let named = |unit: Dimension, says: bool, points: f64| {
+        let fits = dimension == unit || dimension == Dimension::None && says;
+        let by_name = 2.0 * f64::from(says);
+        fits.then_some(2.0 * f64::from(dimension == unit) + by_name + points)
+    };
+    let largest = largest(signal) * scale;
+    let is_cell = words.says_cell() && largest <= MAX_CELL_V;
+    let found = [
+        (InputKind::Current, named(Dimension::Current, words.says_current(), place - 2.0 * extreme)),
+        (InputKind::CellVoltage, named(Dimension::Voltage, is_cell, place - extreme).filter(|_| is_cell)),
+        (
+            InputKind::PackVoltage,
+            named(Dimension::Voltage, words.says_voltage(), place - 2.0 * extreme)
+                .filter(|_| largest > 60.0 && !words.says_cell()),
+        ),
+        (
+            InputKind::Temperature,
+            named(Dimension::Temperature, words.says_temperature(), place)
+                .filter(|_| dimension == Dimension::Temperature),
+        ),
+        (InputKind::Soc, named(Dimension::Percent, words.says_soc(), place - extreme).filter(|_| words.says_soc())),
+        (InputKind::Soh, named(Dimension::Percent, words.says_soh(), place).filter(|_| words.says_soh())),
+    ];
+    let good = found.into_iter().filter_map(|(kind, points)| Some((kind, points?)));
+    good.filter(|(_, points)| *points >= MIN_POINTS).collect()
+}
+
+/// Largest value: the stated one, else the largest of the bits.
+fn largest(signal: &Signal) -> f64 {
+    let layout = &signal.layout;
+    let top = 2_f64.powi(i32::from(layout.length_bits)) * layout.factor.abs() + layout.offset;
+    if layout.has_range() { layout.maximum.min(top) } else { top }
+}
+
+/// Signals whose names differ in a number as one pattern, before those that stand alone.
+fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
+    let names: Vec<(String, &str)> = cells.iter().map(|(_, name)| (String::new(), name.as_str())).collect();
+    let found = groups(&names);
+    let mut ranked: Vec<Ranked> = Vec::new();
+    let mut grouped = std::collections::BTreeSet::new();
+    for group in found.iter().filter(|group| group.members.len() >= 3) {
+        let first = group.members[0].1;
+        // Many alike are what cells look like.
+        ranked.push((cells[first].0 + 4.0, group.pattern.clone()));
+        grouped.extend(group.members.iter().map(|member| member.1));
+    }
+    let alone = cells.into_iter().enumerate().filter(|(index, _)| !grouped.contains(index));
+    ranked.extend(alone.map(|(_, ranked)| ranked));
+    ranked
+}
+
+fn text(file: &str, candidates: &BTreeMap<InputKind, Vec<Ranked>>) -> String {
+    let name: String = file.chars().filter(|c| !c.is_control()).collect();
+    let mut text = format!(
+        "# Likely battery signals of {name}, by name, unit and range alone, written by `packwatch import dbc`.\n\
+         # `packwatch discover LOG --dbc FILE` judges them by what they do in a log.\n\n\
+         [input]\ndbc = [{}]\n",
+        toml::Value::String(file.to_owned())
+    );
+    let has_cells =
+        candidates.get(&InputKind::CellVoltage).is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
+    for (kind, ranked) in candidates {
+        // Only one of the two voltages may be there.
+        let is_active = match kind {
+            InputKind::CellVoltage => has_cells,
+            InputKind::PackVoltage => !has_cells,
+            _ => true,
+        };
+        let Some((_, best)) = ranked.first() else { continue };
+        let mark = if is_active { "" } else { "# " };
+        let _ = write!(text, "\n{mark}{}\n{mark}signal = \"{best}\"\n", kind.table());
+        if *kind == InputKind::Current {
+            text.push_str(
+                "positive = \"?\"                  # charge or discharge: what does a positive value mean?\n",
+            );
+        }
+        for (_, other) in ranked.iter().skip(1).take(FURTHER) {
+            let _ = writeln!(text, "# or: {other}");
+        }
+    }
+    text
+}
+
+impl InputKind {
+    fn table(self) -> &'static str {
+        match self {
+            Self::Current => "[input.current]",
+            Self::CellVoltage => "[input.cell_voltage]",
+            Self::PackVoltage => "[input.pack_voltage]",
+            Self::Temperature => "[[input.temperature]]",
+            Self::Soc => "[input.reported_soc]",
+            Self::Soh => "[input.reported_soh]",
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    const HEAD: &str = "VERSION \"\"\nNS_ :\nBS_:\nBU_: A\n";
+
+    fn imported(messages: &str) -> Result<String, LabError> {
+        import(&Database::parse(&format!("{HEAD}{messages}")).unwrap(), "car.dbc")
+    }
+
+    #[test]
+    fn the_best_of_each_input_is_written_and_the_others_are_comments() {
+        let text = imported(
+            "BO_ 1 HV: 8 A\n SG_ BattCurrent : 0|16@1- (0.1,0) [0|0] \"A\" A\n SG_ BattVoltage : 16|16@1+ (0.1,0) [0|0] \"V\" A\n \
+             SG_ MotorCurrent : 32|16@1- (0.1,0) [0|0] \"A\" A\n SG_ SOC : 48|8@1+ (0.5,0) [0|100] \"%\" A\n\
+             BO_ 2 Cells: 8 A\n SG_ Cell1 : 0|16@1+ (0.001,0) [0|5] \"V\" A\n SG_ Cell2 : 16|16@1+ (0.001,0) [0|5] \"V\" A\n \
+             SG_ Cell3 : 32|16@1+ (0.001,0) [0|5] \"V\" A\n SG_ BattTemp : 48|8@1+ (1,-40) [0|0] \"degC\" A\n",
+        )
+        .unwrap();
+        for part in [
+            "dbc = [\"car.dbc\"]",
+            "[input.current]\nsignal = \"HV.BattCurrent\"\npositive = \"?\"",
+            "[input.cell_voltage]\nsignal = \"Cells.Cell{n}\"",
+            "# [input.pack_voltage]\n# signal = \"HV.BattVoltage\"",
+            "[[input.temperature]]\nsignal = \"Cells.BattTemp\"",
+            "[input.reported_soc]\nsignal = \"HV.SOC\"",
+        ] {
+            assert!(text.contains(part), "{part}\n{text}");
+        }
+        assert!(!text.contains("MotorCurrent"), "{text}");
+        assert!(text.parse::<toml::Table>().is_ok(), "{text}");
+    }
+
+    #[test]
+    fn a_dbc_without_a_battery_is_an_error() {
+        let fault = imported("BO_ 1 Doors: 8 A\n SG_ Open : 0|8@1+ (1,0) [0|0] \"\" A\n").unwrap_err().0;
+        assert!(fault.contains("car.dbc: no signal of 1 messages"), "{fault}");
+    }
+}

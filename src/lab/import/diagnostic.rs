@@ -1,0 +1,177 @@
+//! `[[input.diagnostic]]` as TOML: one answer with its signals, one signal a line.
+//!
+//! Numbers are written with the shortest decimals that read back equal. Values are in the unit the signal names.
+
+use std::fmt;
+
+use crate::can::CanId;
+
+/// One `[[input.diagnostic]]`: a request, its answer, the signals in it.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct DiagnosticTable {
+    /// Before the dot of the signals' names; several tables may share it.
+    pub(crate) name: String,
+    /// Identifier of requests.
+    pub(crate) request: CanId,
+    /// Identifier of answers.
+    pub(crate) response: CanId,
+    /// First data byte of requests and of answers, with extended addressing.
+    pub(crate) extension: Option<(u8, u8)>,
+    /// 0x01, 0x21 or 0x22.
+    pub(crate) service: u8,
+    /// 2 bytes for 0x22, otherwise 1.
+    pub(crate) identifier: u16,
+    /// Comment lines inside the table, without `#`.
+    pub(crate) remarks: Vec<String>,
+    /// In the order of their bits.
+    pub(crate) signals: Vec<DiagnosticSignal>,
+}
+
+/// One signal, or a numbered series of equal ones.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct DiagnosticSignal {
+    /// With `{n}` if `numbers` is given.
+    pub(crate) name: String,
+    /// First bit, counted from the most significant bit after the echoed service and identifier.
+    pub(crate) bit: u32,
+    /// Bits, 1 to 64.
+    pub(crate) length: u32,
+    /// Two's complement.
+    pub(crate) signed: bool,
+    /// Least significant byte first.
+    pub(crate) little_endian: bool,
+    /// Units per code.
+    pub(crate) factor: f64,
+    /// Value of code 0.
+    pub(crate) offset: f64,
+    /// May be empty.
+    pub(crate) unit: String,
+    /// Smallest and largest allowed value.
+    pub(crate) range: Option<(f64, f64)>,
+    /// Codes that say "not available".
+    pub(crate) not_available: Vec<u64>,
+    /// The series.
+    pub(crate) numbers: Option<NumberRange>,
+}
+
+/// Numbers of a series, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct NumberRange {
+    /// First number.
+    pub(crate) first: u32,
+    /// Last number.
+    pub(crate) last: u32,
+    /// Bits from one signal to the next.
+    pub(crate) step: u32,
+}
+
+impl DiagnosticTable {
+    /// Signals, each of a series counted.
+    pub(crate) fn signal_count(&self) -> usize {
+        self.signals.iter().map(|signal| signal.count() as usize).sum()
+    }
+}
+
+impl DiagnosticSignal {
+    /// Signals of the series; 1 without.
+    pub(crate) fn count(&self) -> u32 {
+        self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
+    }
+
+    /// First and last bit of each signal of the series.
+    pub(crate) fn spans(&self) -> impl Iterator<Item = (u32, u32)> {
+        let step = self.numbers.map_or(0, |numbers| numbers.step);
+        (0..self.count()).map(move |n| (self.bit + n * step, self.bit + n * step + self.length - 1))
+    }
+
+    /// One signal of the series, counted from 0.
+    pub(crate) fn of_series(&self, index: u32) -> Self {
+        let Some(NumberRange { first, step, .. }) = self.numbers else { return self.clone() };
+        let name = self.name.replace("{n}", &(first + index).to_string());
+        Self { name, bit: self.bit + index * step, numbers: None, ..self.clone() }
+    }
+
+    /// The same bits as two's complement, without a range.
+    pub(crate) fn as_signed(&self) -> Self {
+        Self { signed: true, range: None, ..self.clone() }
+    }
+
+    /// Its value in the data behind the echoed service and identifier; `None` = beyond their end, not available or out of the
+    /// range.
+    pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
+        let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
+        let bytes = data.get(usize::try_from(first).ok()?..=usize::try_from(last).ok()?)?;
+        let join = |word: u128, byte: &u8| word << 8 | u128::from(*byte);
+        let word = if self.little_endian { bytes.iter().rev().fold(0, join) } else { bytes.iter().fold(0, join) };
+        let below = 8 * (last + 1) - (self.bit + self.length);
+        let code = u64::try_from((word >> below) & (u128::MAX >> (128 - self.length))).ok()?;
+        let unused = 64 - self.length;
+        let number = if self.signed { ((code << unused).cast_signed() >> unused) as f64 } else { code as f64 };
+        let value = number * self.factor + self.offset;
+        // Half a code: limits are rounded decimals.
+        let room = self.factor.abs() / 2.0;
+        let is_inside = self.range.is_none_or(|(low, high)| value >= low - room && value <= high + room);
+        (is_inside && !self.not_available.contains(&code)).then_some(value)
+    }
+
+    /// Smallest and largest code.
+    pub(crate) fn codes(&self) -> (f64, f64) {
+        let top = 2_f64.powi(i32::try_from(self.length).unwrap_or(64));
+        if self.signed { (-top / 2.0, top / 2.0 - 1.0) } else { (0.0, top - 1.0) }
+    }
+
+    /// Smallest and largest value the bits can hold.
+    pub(crate) fn representable(&self) -> (f64, f64) {
+        let (low, high) = self.codes();
+        let (a, b) = (low * self.factor + self.offset, high * self.factor + self.offset);
+        (a.min(b), a.max(b))
+    }
+}
+
+impl fmt::Display for DiagnosticTable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "[[input.diagnostic]]\nname = \"{}\"", self.name)?;
+        writeln!(f, "request = 0x{:X}\nresponse = 0x{:X}", self.request.raw(), self.response.raw())?;
+        if let Some((request, response)) = self.extension {
+            writeln!(f, "request_extension = 0x{request:02X}\nresponse_extension = 0x{response:02X}")?;
+        }
+        let digits = if self.service == 0x22 { 4 } else { 2 };
+        writeln!(f, "service = 0x{:02X}\nidentifier = 0x{:0digits$X}", self.service, self.identifier)?;
+        self.remarks.iter().try_for_each(|remark| writeln!(f, "# {remark}"))?;
+        writeln!(f, "signals = [")?;
+        self.signals.iter().try_for_each(|signal| writeln!(f, "  {signal},"))?;
+        writeln!(f, "]")
+    }
+}
+
+impl fmt::Display for DiagnosticSignal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{{ name = \"{}\"", self.name)?;
+        if let Some(NumberRange { first, last, step }) = self.numbers {
+            write!(f, ", numbers = \"{first}-{last}\", step = {step}")?;
+        }
+        write!(f, ", bit = {}, length = {}", self.bit, self.length)?;
+        if self.signed {
+            write!(f, ", signed = true")?;
+        }
+        if self.little_endian {
+            write!(f, ", byte_order = \"little\"")?;
+        }
+        if self.factor != 1.0 {
+            write!(f, ", factor = {}", self.factor)?;
+        }
+        if self.offset != 0.0 {
+            write!(f, ", offset = {}", self.offset)?;
+        }
+        if !self.unit.is_empty() {
+            write!(f, ", unit = \"{}\"", self.unit)?;
+        }
+        if let Some((minimum, maximum)) = self.range {
+            write!(f, ", minimum = {minimum}, maximum = {maximum}")?;
+        }
+        if !self.not_available.is_empty() {
+            write!(f, ", not_available = {:?}", self.not_available)?;
+        }
+        write!(f, " }}")
+    }
+}

@@ -1,0 +1,292 @@
+//! An OBDb signal set (one JSON for each car model) as `[[input.diagnostic]]` tables.
+//!
+//! In: the text of the JSON, a model year, a name. Out: TOML, one table for each command in the order of controllers, one
+//! signal a line. The source's licence, CC BY-SA 4.0, holds for the TOML too and stands in its head.
+//!
+//! Signals are named `NAME.REST`: REST is the `id` without the word that all ids of the file begin with, NAME is that word or
+//! the given name. Bad input: a file that is not such a JSON is an error; a command or signal that cannot be converted is an
+//! [`Exclusion`], the rest is converted; an unknown field is a warning.
+
+mod address;
+mod document;
+mod signal;
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+
+use serde_json::Value;
+
+use super::{DiagnosticSignal, DiagnosticTable, Exclusion, ExclusionReason, ImportResult, series};
+use crate::error::LabError;
+use address::Addresses;
+use document::{CommandDocument, SignalDocument, SignalSetDocument};
+
+/// Name of the signals' group when neither the ids nor the user give one.
+const DEFAULT_NAME: &str = "Car";
+
+/// What to convert.
+#[derive(Debug, Clone, Default)]
+pub struct ObdbSettings {
+    /// Name of the file, for messages and the head.
+    pub source: String,
+    /// Leave out commands of other model years; without it all are converted.
+    pub year: Option<i64>,
+    /// Before the dot of every signal's name.
+    pub name: Option<String>,
+}
+
+/// Converts the text of a signal set.
+///
+/// # Errors
+/// The text is no such JSON, or nothing in it can be converted; the error has place, found and allowed.
+pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
+    let (document, converter) = convert(text, settings)?;
+    let Converter { tables, exclusions, warnings, .. } = converter;
+    let name = tables.first().map_or("", |table| &table.name);
+    let mut result = ImportResult { text: head(name, settings, &document), exclusions, warnings, signals: 0 };
+    result.signals = tables.iter().map(DiagnosticTable::signal_count).sum();
+    for table in &tables {
+        let _ = write!(result.text, "\n{table}");
+    }
+    result.text.push_str(&tail(&result));
+    Ok(result)
+}
+
+/// The tables alone.
+pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<DiagnosticTable>, LabError> {
+    Ok(convert(text, settings)?.1.tables)
+}
+
+/// Reads the text, and converts it to at least one table.
+fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Converter), LabError> {
+    let source = &settings.source;
+    if let Some(name) = settings.name.as_ref().filter(|name| !is_name(name)) {
+        return Err(LabError(format!("name is {name:?}, must be letters, digits and _")));
+    }
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let document: SignalSetDocument = serde_json::from_str(text).map_err(|error| {
+        LabError(format!("{source}:{}:{}: no OBDb signal set: {error}", error.line(), error.column()))
+    })?;
+    let mut converter = Converter { year: settings.year, ..Converter::default() };
+    converter.convert(&document);
+    let Converter { tables, exclusions, .. } = &mut converter;
+    if tables.is_empty() {
+        let first = exclusions.first().map_or_else(|| "commands is empty".to_owned(), ToString::to_string);
+        return Err(LabError(format!("{source}: nothing can be converted, {} left out; {first}", exclusions.len())));
+    }
+    rename(tables, settings.name.as_deref());
+    tables.sort_by_key(|table| (table.request, table.response, table.extension));
+    Ok((document, converter))
+}
+
+/// Whether a text can stand in the name of a signal.
+fn is_name(text: &str) -> bool {
+    !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}
+
+/// The tables so far, and what was left out.
+#[derive(Debug, Default)]
+struct Converter {
+    year: Option<i64>,
+    tables: Vec<DiagnosticTable>,
+    /// Signals by id, and requests: the place that defined them.
+    known: HashMap<String, String>,
+    exclusions: Vec<Exclusion>,
+    warnings: Vec<String>,
+}
+
+impl Converter {
+    fn convert(&mut self, document: &SignalSetDocument) {
+        let fields = document.unknown().into_iter().map(|field| format!("unknown field \"{field}\", ignored"));
+        self.warnings.extend(fields);
+        for (index, value) in document.commands.iter().enumerate() {
+            if let Err(exclusion) = self.command(index, value) {
+                self.exclusions.push(exclusion);
+            }
+        }
+        for (index, synthetic) in document.synthetics.iter().enumerate() {
+            let id = synthetic.get("id").and_then(Value::as_str).unwrap_or("without id").escape_default();
+            let detail = format!("{id}; must be a field of an answer");
+            let place = format!("synthetics[{index}]");
+            self.exclusions.push(Exclusion { reason: ExclusionReason::Synthetic, place, detail });
+        }
+    }
+
+    fn command(&mut self, index: usize, value: &Value) -> Result<(), Exclusion> {
+        let place = format!("commands[{index}]");
+        let exclusion = |reason, detail| Exclusion { reason, place: place.clone(), detail };
+        let command: CommandDocument = serde_json::from_value(value.clone())
+            .map_err(|error| exclusion(ExclusionReason::InvalidField, error.to_string().escape_debug().to_string()))?;
+        let (service, identifier) = request(&command).map_err(|(reason, detail)| exclusion(reason, detail))?;
+        let hdr = &command.address.hdr;
+        let place = format!("{place} ({} {service:02X} {identifier:04X})", hdr.escape_default());
+        let exclusion = |reason, detail| Exclusion { reason, place: place.clone(), detail };
+        let fields = command.unknown().into_iter();
+        self.warnings
+            .extend(fields.map(|field| format!("{place}: unknown field \"{}\", ignored", field.escape_debug())));
+        if let (Some(filter), Some(year)) = (&command.filter, self.year)
+            && !filter.contains(year)
+        {
+            return Err(exclusion(ExclusionReason::OtherYear, format!("exists {filter}, asked for {year}")));
+        }
+        let Addresses { request, response, extension } =
+            Addresses::new(&command.address).map_err(|detail| exclusion(ExclusionReason::Address, detail))?;
+        let key = format!("{request} {response} {extension:?} {service:02X} {identifier:04X}");
+        if let Some(before) = self.known.get(&key) {
+            let detail = format!("the same request as {before}; --year may choose one of them");
+            return Err(exclusion(ExclusionReason::Duplicate, detail));
+        }
+        self.known.insert(key, place.clone());
+        let signals = self.signals(&place, &command.signals);
+        if signals.is_empty() {
+            return Ok(());
+        }
+        let remarks = remarks(&command);
+        let name = String::new();
+        self.tables.push(DiagnosticTable { name, request, response, extension, service, identifier, remarks, signals });
+        Ok(())
+    }
+
+    /// Signals of one command in the order of their bits, each with bits of its own.
+    fn signals(&mut self, place: &str, values: &[Value]) -> Vec<DiagnosticSignal> {
+        let mut signals: Vec<DiagnosticSignal> = Vec::new();
+        for (index, value) in values.iter().enumerate() {
+            let id = value.get("id").and_then(Value::as_str).unwrap_or("without id").escape_default();
+            let place = format!("{place}.signals[{index}] ({id})");
+            match self.signal(&place, value, &signals) {
+                Ok(signal) => signals.push(signal),
+                Err((reason, detail)) => self.exclusions.push(Exclusion { reason, place, detail }),
+            }
+        }
+        signals.sort_by_key(|signal| signal.bit);
+        signals
+    }
+
+    fn signal(
+        &mut self,
+        place: &str,
+        value: &Value,
+        others: &[DiagnosticSignal],
+    ) -> Result<DiagnosticSignal, (ExclusionReason, String)> {
+        let document: SignalDocument = serde_json::from_value(value.clone())
+            .map_err(|error| (ExclusionReason::InvalidField, error.to_string().escape_debug().to_string()))?;
+        let fields = document.unknown().into_iter();
+        self.warnings
+            .extend(fields.map(|field| format!("{place}: unknown field \"{}\", ignored", field.escape_debug())));
+        let signal = signal::convert(&document)?;
+        let overlaps =
+            |other: &&DiagnosticSignal| signal.bit < other.bit + other.length && other.bit < signal.bit + signal.length;
+        if let Some(other) = others.iter().find(overlaps) {
+            let detail = format!(
+                "bits {} to {}, {} has {} to {}",
+                signal.bit,
+                signal.bit + signal.length - 1,
+                other.name,
+                other.bit,
+                other.bit + other.length - 1
+            );
+            return Err((ExclusionReason::Overlap, detail));
+        }
+        if let Some(before) = self.known.get(&signal.name) {
+            return Err((ExclusionReason::Duplicate, format!("id of {before} already; --year may choose one of them")));
+        }
+        self.known.insert(signal.name.clone(), place.to_owned());
+        Ok(signal)
+    }
+}
+
+/// Service and identifier of a command.
+fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, String)> {
+    let mut entries = command.cmd.iter();
+    let (Some((service, identifier)), None) = (entries.next(), entries.next()) else {
+        let detail = format!("cmd has {} services, must have one", command.cmd.len());
+        return Err((ExclusionReason::InvalidField, detail));
+    };
+    let (service, digits) = match service.as_str() {
+        "01" => (0x01, 2),
+        "21" => (0x21, 2),
+        "22" => (0x22, 4),
+        other => {
+            let detail = format!("service {}, must be 01, 21 or 22", other.escape_debug());
+            return Err((ExclusionReason::OtherService, detail));
+        }
+    };
+    let is_identifier = identifier.len() == digits && identifier.bytes().all(|c| c.is_ascii_hexdigit());
+    let number = u16::from_str_radix(identifier, 16).ok().filter(|_| is_identifier);
+    let number = number.ok_or_else(|| {
+        let found = identifier.escape_debug();
+        let detail =
+            format!("identifier is \"{found}\", must be {digits} hexadecimal digits for service {service:02X}");
+        (ExclusionReason::InvalidField, detail)
+    })?;
+    Ok((service, number))
+}
+
+/// What a person should know before polling.
+fn remarks(command: &CommandDocument) -> Vec<String> {
+    let mut remarks = Vec::new();
+    if let Some(seconds) = command.freq {
+        remarks.push(format!("OBDb asks for it every {seconds} s; every_s = {seconds} would do so with [poll]"));
+    }
+    if let Some(filter) = &command.filter {
+        remarks.push(format!("model years: {filter}"));
+    }
+    if let Some(session) = &command.din {
+        remarks.push(format!("OBDb enters diagnostic session {} before; packwatch never does", session.escape_debug()));
+    }
+    remarks
+}
+
+/// Gives the tables their name, shortens the signals' names, joins numbered ones.
+fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) {
+    let first_word = |signal: &DiagnosticSignal| signal.name.split_once('_').map(|(word, _)| word.to_owned());
+    let words = tables.iter().flat_map(|table| &table.signals).map(first_word);
+    let word = words.reduce(|a, b| if a == b { a } else { None }).flatten().filter(|word| !word.is_empty());
+    let name = name.map(str::to_owned).or_else(|| word.clone()).unwrap_or_else(|| DEFAULT_NAME.to_owned());
+    for table in tables {
+        table.name.clone_from(&name);
+        for signal in &mut table.signals {
+            let short = word.as_ref().and_then(|word| signal.name.strip_prefix(word)?.strip_prefix('_'));
+            if let Some(short) = short.filter(|short| !short.is_empty()).map(str::to_owned) {
+                signal.name = short;
+            }
+        }
+        table.signals = series::join(std::mem::take(&mut table.signals));
+    }
+}
+
+fn head(name: &str, settings: &ObdbSettings, document: &SignalSetDocument) -> String {
+    let year = settings.year.map_or_else(|| "all model years".to_owned(), |year| format!("model year {year}"));
+    let mut text = format!(
+        "# Diagnostic inputs, converted by `packwatch import obdb`: {}, {year}.\n\
+         # Source: OBDb (https://github.com/OBDb), by the OBDb contributors. Licence of the source, and so of this file:\n\
+         # CC BY-SA 4.0 (https://creativecommons.org/licenses/by-sa/4.0/). Changed: form, names, units.\n\
+         #\n\
+         # A signal is named \"{name}.NAME\" in [input.*]; {{n}} counts through a series. Value = code * factor + offset.\n\
+         # Nothing is sent: answers to other testers are decoded. A signal outside minimum and maximum is a bad reading.\n",
+        settings.source.escape_debug(),
+    );
+    if let Some(level) = &document.diagnostic_level {
+        let _ = writeln!(
+            text,
+            "# OBDb asks in diagnostic session {}; packwatch never changes the session.",
+            level.escape_debug()
+        );
+    }
+    text
+}
+
+fn tail(result: &ImportResult) -> String {
+    if result.exclusions.is_empty() {
+        return String::new();
+    }
+    let mut text = format!("\n# Left out: {}\n", result.exclusions.len());
+    for exclusion in &result.exclusions {
+        // Texts of the file must not end the comment.
+        let line: String = exclusion.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        let _ = writeln!(text, "# {line}");
+    }
+    text
+}

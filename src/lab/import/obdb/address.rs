@@ -1,0 +1,148 @@
+//! OBDb's addresses as CAN identifiers of requests and answers.
+//!
+//! | `hdr` | request | answer |
+//! | --- | --- | --- |
+//! | 3 digits | 11 bits, `hdr` | `rax`; without it `hdr` + 8, for 7E0 to 7E7 only (ISO 15765-4) |
+//! | the same with `eax` | first data byte `eax` | first data byte `tst`, without it the low byte of `hdr` (6F1: F1) |
+//! | 4 digits, `TTAA` | 29 bits, `pri` (18) `TTAA` `tst` (F1) | `pri` DA `tst` `rax`; without it AA, for TT = DA only (ISO 15765-2, normal fixed) |
+//!
+//! Anything else is refused with the reason.
+
+use super::document::AddressDocument;
+use crate::can::CanId;
+
+/// The tester's address on 29 bits if none is stated.
+const TESTER: u32 = 0xF1;
+/// Priority, first byte of the identifier, if none is stated.
+const PRIORITY: u32 = 0x18;
+/// `TT` of requests to one controller.
+const PHYSICAL: u32 = 0xDA;
+/// Distance of answers from requests at the identifiers that ISO 15765-4 fixes.
+const FIXED_DISTANCE: u32 = 8;
+
+/// Identifiers of one command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Addresses {
+    pub(super) request: CanId,
+    pub(super) response: CanId,
+    /// First data byte of requests and of answers.
+    pub(super) extension: Option<(u8, u8)>,
+}
+
+impl Addresses {
+    /// Converts; `Err` says what was found and what is allowed.
+    pub(super) fn new(document: &AddressDocument) -> Result<Self, String> {
+        if let Some(protocol) = document.proto.as_deref().filter(|name| !name.starts_with("15765-4")) {
+            return Err(format!("proto is {protocol}, must be 15765-4 (CAN)"));
+        }
+        match document.hdr.len() {
+            3 => standard(document),
+            4 => extended(document),
+            _ => Err(format!("hdr is \"{}\", must have 3 or 4 hexadecimal digits", document.hdr)),
+        }
+    }
+}
+
+fn standard(document: &AddressDocument) -> Result<Addresses, String> {
+    let request = hexadecimal("hdr", &document.hdr)?;
+    let response = match &document.rax {
+        Some(rax) => hexadecimal("rax", rax)?,
+        None if (0x7E0..=0x7E7).contains(&request) => request + FIXED_DISTANCE,
+        None => return Err(format!("hdr is {} without rax, must be 7E0 to 7E7 for that", document.hdr)),
+    };
+    let extension = match (byte("eax", document.eax.as_ref())?, byte("tst", document.tst.as_ref())?) {
+        (None, _) => None,
+        (Some(target), tester) => Some((target, tester.unwrap_or(request.to_le_bytes()[0]))),
+    };
+    let id = |field: &str, id: u32| {
+        CanId::standard(id).ok_or_else(|| format!("{field} is {id:X}, must be at most 7FF with a hdr of 3 digits"))
+    };
+    Ok(Addresses { request: id("hdr", request)?, response: id("rax", response)?, extension })
+}
+
+fn extended(document: &AddressDocument) -> Result<Addresses, String> {
+    if document.eax.is_some() {
+        return Err("eax with a hdr of 4 digits, must have 3".to_owned());
+    }
+    let middle = hexadecimal("hdr", &document.hdr)?;
+    let priority = byte("pri", document.pri.as_ref())?.map_or(PRIORITY, u32::from);
+    let tester = byte("tst", document.tst.as_ref())?.map_or(TESTER, u32::from);
+    let sender = match &document.rax {
+        // Longer forms write more of the identifier; the last byte is the controller's address.
+        Some(rax) => hexadecimal("rax", rax)? & 0xFF,
+        None if middle >> 8 == PHYSICAL => middle & 0xFF,
+        None => return Err(format!("hdr is {} without rax, must be DA and the address for that", document.hdr)),
+    };
+    let id = |number: u32| {
+        CanId::extended(number).ok_or_else(|| format!("pri is {priority:02X}, must be at most 1F: 29 bits"))
+    };
+    let request = id(priority << 24 | middle << 8 | tester)?;
+    let response = id(priority << 24 | PHYSICAL << 16 | tester << 8 | sender)?;
+    Ok(Addresses { request, response, extension: None })
+}
+
+/// A number of at most 24 bits.
+fn hexadecimal(field: &str, text: &str) -> Result<u32, String> {
+    let number = u32::from_str_radix(text, 16).ok().filter(|number| *number <= 0xFF_FFFF && !text.starts_with('+'));
+    number.ok_or_else(|| format!("{field} is \"{text}\", must be 1 to 6 hexadecimal digits"))
+}
+
+fn byte(field: &str, text: Option<&String>) -> Result<Option<u8>, String> {
+    let Some(text) = text else { return Ok(None) };
+    let number = hexadecimal(field, text)?;
+    u8::try_from(number).map(Some).map_err(|_| format!("{field} is \"{text}\", must be one byte"))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    type Numbers = (u32, u32, Option<(u8, u8)>);
+
+    fn addresses(fields: [Option<&str>; 6]) -> Result<Numbers, String> {
+        let [hdr, rax, eax, pri, tst, proto] = fields.map(|field| field.map(str::to_owned));
+        let document = AddressDocument { hdr: hdr.unwrap(), rax, eax, pri, tst, proto };
+        Addresses::new(&document)
+            .map(|found| (found.request.dbc_number(), found.response.dbc_number(), found.extension))
+    }
+
+    #[test]
+    fn identifiers_of_11_bits() {
+        let none = None;
+        assert_eq!(addresses([Some("79B"), Some("7BB"), none, none, none, none]), Ok((0x79B, 0x7BB, None)));
+        assert_eq!(addresses([Some("7E4"), none, none, none, none, none]), Ok((0x7E4, 0x7EC, None)));
+        let bmw = addresses([Some("6F1"), Some("607"), Some("07"), none, none, none]);
+        assert_eq!(bmw, Ok((0x6F1, 0x607, Some((0x07, 0xF1)))));
+    }
+
+    #[test]
+    fn identifiers_of_29_bits() {
+        let none = None;
+        let honda = addresses([Some("DA01"), Some("01"), none, none, none, none]);
+        assert_eq!(honda, Ok((0x98DA_01F1, 0x98DA_F101, None)));
+        assert_eq!(addresses([Some("DA10"), none, none, none, none, none]), Ok((0x98DA_10F1, 0x98DA_F110, None)));
+        let other = addresses([Some("DB33"), Some("F11D"), none, Some("0C"), Some("FA"), Some("15765-4-29bit")]);
+        assert_eq!(other, Ok((0x8CDB_33FA, 0x8CDA_FA1D, None)));
+    }
+
+    #[test]
+    fn other_forms_are_refused_with_what_is_allowed() {
+        let none = None;
+        for (fields, part) in [
+            ([Some("7DF"), none, none, none, none, none], "7E0 to 7E7"),
+            ([Some("9FF"), Some("7EC"), none, none, none, none], "at most 7FF"),
+            ([Some("7E4"), Some("18DA"), none, none, none, none], "at most 7FF"),
+            ([Some("7E4"), Some("xyz"), none, none, none, none], "hexadecimal"),
+            ([Some("DB33"), none, none, none, none, none], "DA and the address"),
+            ([Some("DA10"), none, none, Some("FF"), none, none], "29 bits"),
+            ([Some("DA10"), none, Some("07"), none, none, none], "must have 3"),
+            ([Some("686A"), none, none, none, none, Some("9141-2")], "CAN"),
+            ([Some(""), none, none, none, none, none], "3 or 4"),
+            ([Some("6F1"), Some("607"), Some("107"), none, none, none], "one byte"),
+        ] {
+            let fault = addresses(fields).unwrap_err();
+            assert!(fault.contains(part), "{fields:?}: {fault}");
+        }
+    }
+}
