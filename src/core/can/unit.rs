@@ -16,6 +16,11 @@ pub enum Quantity {
     Other(&'static str),
 }
 
+impl Quantity {
+    /// %.
+    pub const PERCENTAGE: Self = Self::Other("a percentage");
+}
+
 /// A unit that is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalUnit {

@@ -231,7 +231,8 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
         Channel::Current => Some((Quantity::Current, "A")),
         Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage => Some((Quantity::Voltage, "V")),
         Channel::Temperature(_) => Some((Quantity::Temperature, "degrees C")),
-        _ => None,
+        Channel::ReportedSoc | Channel::ReportedSoh => Some((Quantity::PERCENTAGE, "% or a fraction")),
+        Channel::PackIdentity | Channel::Contactor => None,
     }
 }
 
@@ -248,6 +249,9 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
         }
         seen.push(text);
         let name = name(resolved, resolved.signal);
+        if unit.quantity == Quantity::PERCENTAGE && quantity == unit.quantity {
+            continue; // its scale is 0.01 where none is written
+        }
         if unit.quantity == quantity {
             let is_held = needed_values(resolved.channel, pack).is_none_or(|(low, high)| {
                 let held = held(resolved, unit.factor, unit.offset);

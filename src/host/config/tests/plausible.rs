@@ -180,6 +180,18 @@ fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
 }
 
 #[test]
+fn a_reported_state_must_be_a_share() {
+    let with_soc = ("[[input.temperature]]", "[input.reported_soc]\nsignal = \"Status.Spare\"\n[[input.temperature]]");
+    let spare = |unit: &str| ("(1,0) [0|0] \"\" A\nBO_ 272".to_owned(), format!("(1,0) [0|0] \"{unit}\" A\nBO_ 272"));
+    let (from, percent) = spare("%");
+    assert_eq!(warnings(&[with_soc], &[(&from, &percent)]), [""; 0]);
+    let (from, volt) = spare("V");
+    let fault = "pack.toml:14: input.reported_soc.signal = \"Status.Spare\", the unit of Status.Spare is \"V\", a voltage, must \
+                 be % or a fraction (scale = 1.0 if the DBC is wrong)";
+    assert_eq!(faults(&[with_soc], &[(&from, &volt)]), [fault]);
+}
+
+#[test]
 fn a_written_scale_overrules_the_unit_with_a_warning() {
     let mv = [("(0.001,0) [0|5] \"V\"", "(1,0) [0|0] \"mV\"")];
     assert_eq!(warnings(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.001\n")], &mv), [""; 0]);

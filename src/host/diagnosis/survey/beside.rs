@@ -39,7 +39,7 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
         return None;
     }
     let is_volt = unit.is_some_and(|unit| unit.quantity == Quantity::Voltage);
-    let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::Other("a percentage"));
+    let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::PERCENTAGE);
     let is_pack = |text: &str| has(text, &["pack", "total", "batt", "stack", "hv", "bms"]);
     let is_elsewhere = has(&own, &["link", "dc", "iso", "contactor", "charg"]);
     if is_volt && !is_elsewhere && (is_pack(&own) || is_pack(&name) && has(&own, &["volt", "sum"])) {
