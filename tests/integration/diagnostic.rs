@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use packwatch::can::encode::InputEncoder;
+use packwatch::can::isotp::segment;
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{Input, Monitor, Outputs};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
@@ -126,4 +127,38 @@ fn the_values_of_an_answer_are_of_its_first_frame() {
     monitor.settle(&mut out);
     let measured: Vec<_> = out.estimates.iter().map(|estimate| (estimate.time, estimate.measured.current_a)).collect();
     assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 8]);
+}
+
+/// As in a public definition of a car: the pack's voltage lacks a division by ten, and is limited to what the author expected.
+#[test]
+fn the_doctor_compares_the_cells_of_answers_with_a_pack_voltage_that_is_off_by_ten() {
+    let folder = tempfile::tempdir().unwrap();
+    let pack = LEAF.replace(
+        r#"{ name = "PackVoltage", bit = 144, length = 16, factor = 0.01, unit = "V", minimum = 200, maximum = 450 }"#,
+        r#"{ name = "PackVoltage", bit = 144, length = 16, factor = 0.1, unit = "V", minimum = 200, maximum = 450 }"#,
+    );
+    let config = written(folder.path(), &pack);
+    let mut group_1 = [&[0x61, 1][..], &[0; 51]].concat();
+    group_1[20..22].copy_from_slice(&35_520_u16.to_be_bytes()); // 355.20 V, of 96 cells of 3.7 V
+    let group_2 = [&[0x61, 2][..], &3700_u16.to_be_bytes().repeat(96)].concat();
+    let mut log = String::new();
+    let mut ms = 0;
+    let mut line = |id: &str, payload: &[u8]| {
+        ms += 10;
+        let data: String = payload.iter().map(|byte| format!("{byte:02X}")).collect();
+        log.push_str(&format!("({}.{:03}000) can0 {id}#{data}\n", ms / 1000, ms % 1000));
+    };
+    for _ in 0..60 {
+        for (group, message) in [(1, &group_1), (2, &group_2)] {
+            line("79B", &[2, 0x21, group, 0, 0, 0, 0, 0]);
+            segment(None, message, 0).iter().for_each(|payload| line("7BB", payload));
+        }
+    }
+    let path = folder.path().join("car.log");
+    fs::write(&path, log).unwrap();
+    let mut doctor = Command::cargo_bin("packwatch").unwrap();
+    let output = doctor.args(["doctor", "-c", config.to_str().unwrap(), path.to_str().unwrap()]).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.contains("WARNING   Leaf.PackVoltage is off by 10"), "{text}");
+    assert!(text.contains("96 of 96 cell voltages"), "{text}");
 }

@@ -89,6 +89,28 @@ pub struct SignalPlan {
     pub offset: f64,
 }
 
+impl SignalPlan {
+    /// Whether another signal is read, at least in part, from the same bits.
+    pub(super) fn shares_bits(&self, other: &Self) -> bool {
+        let (a, b) = (&self.binding, &other.binding);
+        let is_together = (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux);
+        is_together
+            && match (self.answer, other.answer) {
+                (None, None) => self.layout.overlaps(&other.layout),
+                (Some(a), Some(b)) => {
+                    let bits = |answer: AnswerSource, layout: &SignalLayout| {
+                        let (first, last) = layout.span();
+                        let begin = 8 * answer.first_byte as u64;
+                        (begin + u64::from(first), begin + u64::from(last))
+                    };
+                    let (ours, theirs) = (bits(a, &self.layout), bits(b, &other.layout));
+                    a.question == b.question && ours.0 <= theirs.1 && theirs.0 <= ours.1
+                }
+                (None, Some(_)) | (Some(_), None) => false,
+            }
+    }
+}
+
 /// Position of a signal in a diagnostic answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AnswerSource {

@@ -228,7 +228,7 @@ fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, Str
 fn remarks(command: &CommandDocument) -> Vec<String> {
     let mut remarks = Vec::new();
     if let Some(seconds) = command.freq {
-        remarks.push(format!("OBDb asks for it every {seconds} s; every_s = {seconds} would do so with [poll]"));
+        remarks.push(format!("OBDb asks for it every {seconds} s; drive_every_s = {seconds} would do so with [poll]"));
     }
     if let Some(filter) = &command.filter {
         remarks.push(format!("model years: {filter}"));

@@ -9,6 +9,8 @@ use crate::quantity::Channel;
 
 /// Deviation of the sum of the cells that sensors explain.
 const SUM_TOLERANCE: f64 = 0.03;
+/// The same where some cells may be wrong or missing, for a decimal place.
+const UNCLEAR_TOLERANCE: f64 = 0.2;
 /// Ratios outside are another voltage: an auxiliary battery, a link behind open contactors.
 const SAME_VOLTAGE: std::ops::Range<f64> = 0.2..20.0;
 /// States of charge that differ by more are worth knowing.
@@ -17,9 +19,8 @@ const SOC_DIFFERS: f64 = 0.03;
 const SOC_DISAGREES: f64 = 0.1;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
-    if !judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped, Topic::Silent, Topic::CellCount]) {
-        pack_voltage(judge);
-    }
+    let is_clear = !judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped, Topic::Silent, Topic::CellCount]);
+    pack_voltage(judge, is_clear);
     states_of_charge(judge);
 }
 
@@ -30,25 +31,33 @@ fn beside<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
 
-fn pack_voltage(judge: &mut Judge<'_>) {
+/// `is_clear`: every cell is read as it should be. A decimal place shows otherwise too.
+fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let medians_v = judge.signals(Kind::Voltage).into_iter().map(|(_, series)| series.values.median());
     let Some(medians_v) = medians_v.collect::<Option<Vec<f64>>>().filter(|_| !judge.plan.pack.is_total) else { return };
     let sum_v: f64 = medians_v.iter().sum();
+    if sum_v <= 0.0 {
+        return;
+    }
     let candidates = beside(judge, Channel::PackVoltage).into_iter();
     let candidates = candidates.filter(|(_, pack_v)| SAME_VOLTAGE.contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
     let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
     let (cells, sum, pack) = (judge.plan.pack.cells, number(sum_v), number(pack_v));
-    if (pack_v / sum_v - 1.0).abs() <= SUM_TOLERANCE {
+    if is_clear && (pack_v / sum_v - 1.0).abs() <= SUM_TOLERANCE {
         return judge.fine(format!("the {cells} cells add up to {sum} V; {} is {pack} V", signal.name));
     }
     let power = (pack_v / sum_v).log10().round();
-    if power != 0.0 && ((pack_v / sum_v) / 10.0_f64.powf(power) - 1.0).abs() <= SUM_TOLERANCE {
+    let tolerance = if is_clear { SUM_TOLERANCE } else { UNCLEAR_TOLERANCE };
+    if power != 0.0 && ((pack_v / sum_v) / 10.0_f64.powf(power) - 1.0).abs() <= tolerance {
         let times = number(10.0_f64.powf(power));
         warning(judge, Topic::PackVoltage, format!("{} is off by {times}", signal.name))
             .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
             .why("the voltages of cells in series add up; a factor of ten is a decimal place of its definition")
-            .change(&signal.table, "factor", format!("{times} times smaller in the definition of {}", signal.name));
+            .advice(format!("divide the factor of {} by {times}, where it is defined", signal.name));
+        return;
+    }
+    if !is_clear {
         return;
     }
     let counted = (f64::from(cells) * pack_v / sum_v).round();

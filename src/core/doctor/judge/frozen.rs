@@ -12,6 +12,8 @@ use crate::quantity::Channel;
 const FEWEST_READINGS: u64 = 20;
 /// Fewest steps to judge a single cell by.
 const FEWEST_STEPS: usize = 4;
+/// Steps of a voltage above which equal cells say nothing, V: balanced cells differ by less.
+const COARSE_V: f64 = 0.005;
 /// Standard deviations from which two slopes differ.
 const SURE: f64 = 6.0;
 
@@ -64,11 +66,8 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let mut reported: Vec<Channel> = Vec::new();
     for (index, (signal, _)) in voltages.iter().enumerate() {
-        let reads_same_bits = |other: &&SignalPlan| {
-            let (a, b) = (&signal.binding, &other.binding);
-            (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux) && signal.layout.overlaps(&other.layout)
-        };
-        let Some(other) = voltages[..index].iter().map(|(other, _)| *other).find(reads_same_bits) else { continue };
+        let same_bits = |other: &&SignalPlan| signal.shares_bits(other);
+        let Some(other) = voltages[..index].iter().map(|(other, _)| *other).find(same_bits) else { continue };
         let pair = [other.binding.channel, signal.binding.channel];
         reported.extend(pair);
         error(judge, Topic::Swapped, format!("{} read the same bits", channels(&pair)))
@@ -76,6 +75,11 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
             .why("two cells have a voltage each")
             .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
             .advice("compare the start bits in the DBC with the sender's documentation");
+    }
+    // Cells of coarse resolution agree without being one.
+    let step_v = |(signal, _): &SignalSeries<'_>| (signal.layout.factor * signal.scale).abs() * judge.voltage_factor;
+    if voltages.iter().any(|voltage| step_v(voltage) > COARSE_V) {
+        return;
     }
     let [fast, slow] = judge.doctor.responses().each_ref().map(|response| response.equal_cells.groups(FEWEST_BLOCKS));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {

@@ -41,7 +41,8 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
     let is_volt = unit.is_some_and(|unit| unit.quantity == Quantity::Voltage);
     let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::PERCENTAGE);
     let is_pack = |text: &str| has(text, &["pack", "total", "batt", "stack", "hv", "bms"]);
-    let is_elsewhere = has(&own, &["link", "dc", "iso", "contactor", "charg"]);
+    let is_elsewhere =
+        has(&own, &["link", "dcdc", "iso", "contactor", "charg"]) || own.contains("dc") && !is_pack(&own);
     if is_volt && !is_elsewhere && (is_pack(&own) || is_pack(&name) && has(&own, &["volt", "sum"])) {
         (!raw.is_pack_total()).then_some(Channel::PackVoltage)
     } else if is_share && (own.ends_with("soc") || own.starts_with("soc") || has(&own, &["stateofcharge"])) {
@@ -95,6 +96,7 @@ mod tests {
         let voltage = Some(Channel::PackVoltage);
         assert_eq!(channel("PackStatus", "PackVoltage", "V"), voltage);
         assert_eq!((channel("Bms", "Volt", "V"), channel("X", "HV_Batt_U", "V")), (voltage, voltage));
+        assert_eq!(channel("Car", "BATTERY_DC_VOLTAGE", "V"), voltage);
         for other in ["PackVoltageMax", "DcLinkVoltage", "ChargeVoltageLimit", "CellVoltage1"] {
             assert_eq!(channel("Bms", other, "V"), None, "{other}");
         }
