@@ -18,9 +18,9 @@ mod capacity_peers;
 mod check_cli;
 mod contactor;
 mod dbc_vectors;
+mod diagnostic;
 #[cfg(feature = "lab")]
 mod discover_cli;
-mod diagnostic;
 mod doctor;
 mod e2e_peer;
 #[cfg(feature = "lab")]
