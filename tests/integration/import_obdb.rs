@@ -62,7 +62,8 @@ impl ImportedCar {
              signal = \"Other.Current\"\npositive = \"charge\"\n[input.cell_voltage]\nsignal = \"Other.Cell{{n}}\"\n"
         );
         for (number, (name, _)) in (1..).zip(&signals) {
-            writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\ncells = \"{number}\"").unwrap();
+            // The scale says that the unit is on purpose.
+            writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\nscale = 1.0\ncells = \"{number}\"").unwrap();
         }
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("pack.toml");
