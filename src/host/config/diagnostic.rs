@@ -252,7 +252,9 @@ fn numbered(keys: &AnswerSignalKeys, faults: &mut Faults) -> Vec<(String, u64)> 
 }
 
 fn check_numbers(keys: &AnswerSignalKeys, faults: &mut Faults) {
-    let is_whole = keys.bit % 8 == 0 && keys.length % 8 == 0 && keys.step.is_none_or(|step| step % 8 == 0);
+    let is_whole = keys.bit.is_multiple_of(8)
+        && keys.length.is_multiple_of(8)
+        && keys.step.is_none_or(|step| step.is_multiple_of(8));
     if keys.byte_order == WireOrder::Little && !is_whole {
         keys.place.fault(faults, "byte_order", "must be \"big\" for a signal that is not of whole bytes");
     }

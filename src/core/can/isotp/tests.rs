@@ -8,6 +8,9 @@ fn at(ms: i64) -> Timestamp {
     Timestamp::from_nanos(ms * 1_000_000)
 }
 
+/// What is done to the frames of a message.
+type Harm = fn(&mut Vec<Vec<u8>>);
+
 /// Payloads of one sender, a millisecond apart; the messages and faults they give.
 fn receive(extension: Option<u8>, payloads: &[Vec<u8>]) -> (Vec<Vec<u8>>, Vec<IsoTpFault>) {
     let mut receiver = Receiver::new(extension);
@@ -63,7 +66,7 @@ fn each_fault_is_named_once_and_the_next_message_is_whole() {
         frames.extend(payloads(&message(30)));
         receive(None, &frames)
     };
-    let cases: [(&str, fn(&mut Vec<Vec<u8>>), &[IsoTpFault], usize); 9] = [
+    let cases: [(&str, Harm, &[IsoTpFault], usize); 9] = [
         ("missing", |f| drop(f.remove(2)), &[WrongSequence], 1),
         ("doubled", |f| f.insert(2, f[2].clone()), &[WrongSequence], 1),
         ("out of order", |f| f.swap(1, 2), &[WrongSequence], 1),
