@@ -8,7 +8,7 @@
 //! | --- | --- | --- |
 //! | `src/core` | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
 //! | | [`filter`] | unscented and linear Kalman filters, vector arithmetic: pure numbers |
-//! | | [`can`] | frame, signal, DBC, decode, encode, end-to-end protection, flood limit, J1939 |
+//! | | [`can`] | frame, signal, DBC, decode, encode, end-to-end protection, flood limit, ISO-TP and diagnostics, J1939 |
 //! | | [`sample`] | plausibility of readings, alignment of values of different times and rates |
 //! | | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
 //! | | [`health`] | charge/discharge transitions, capacity, recharge period, usable capacity, remaining life |
@@ -28,7 +28,7 @@
 //!
 //! # The path of a frame
 //! `host/io/socket` receives it, `host/service/live.rs` passes it on, then [`monitor`]: `intake` (protection, flood) → `can/decode`
-//! → `sampling` → `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay enters
+//! (a diagnostic answer: `can/isotp`, `can/diagnostic`) → `sampling` → `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay enters
 //! at `host/replay.rs` instead; all after it is the same.
 //!
 //! # To change something, open
@@ -41,6 +41,8 @@
 //! | a new event | `core/monitor/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
 //! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
+//! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/diagnostic.rs`; `core/can/poll.rs` |
+//! | when the buses sleep | `core/monitor/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
