@@ -195,6 +195,9 @@ fn page(discovery: &Discovery) -> String {
     if discovery.ignored_frames > 0 {
         text += &format!("{} frames ignored: too many identifiers\n", discovery.ignored_frames);
     }
+    for remark in &discovery.remarks {
+        text += &format!("{remark}\n");
+    }
     for quantity in Quantity::ALL {
         text += &format!("\n{}\n", quantity.name());
         let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
