@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering;
 use serde_json::json;
 
 use super::Failure;
-use super::import::{database, read};
+use super::import::{database, named_from, read};
 use super::output::{failure, print, print_json, table, unless_closed};
 use super::replay::Bar;
 use crate::config;
@@ -147,18 +147,6 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
     written.map_err(failure)
 }
 
-/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
-fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
-    let whole =
-        |path: &Path| std::path::absolute(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())));
-    let (config, file) = (whole(config)?, whole(file)?);
-    let name = match config.parent() {
-        Some(folder) => file.strip_prefix(folder).unwrap_or(&file),
-        None => &file,
-    };
-    Ok(name.display().to_string())
-}
-
 /// Passes every frame on; returns the names of the interfaces.
 fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
     let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
@@ -194,6 +182,9 @@ fn page(discovery: &Discovery) -> String {
     );
     if discovery.ignored_frames > 0 {
         text += &format!("{} frames ignored: too many identifiers\n", discovery.ignored_frames);
+    }
+    for remark in &discovery.remarks {
+        text += &format!("{remark}\n");
     }
     for quantity in Quantity::ALL {
         text += &format!("\n{}\n", quantity.name());

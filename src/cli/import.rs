@@ -81,8 +81,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
 fn import_dbc(args: &DbcArgs) -> Result<(), Failure> {
     check_place(&args.output.output, std::iter::once(&args.file)).map_err(Failure::new)?;
-    let text = dbc::import(&database(&args.file)?, &args.file.display().to_string()).map_err(failure)?;
-    write(&args.output.output, &text)
+    let output = &args.output.output;
+    let name = match output == Path::new("-") {
+        true => args.file.display().to_string(),
+        false => named_from(output, &args.file)?,
+    };
+    let text = dbc::import(&database(&args.file)?, &name).map_err(failure)?;
+    write(output, &text)
 }
 
 /// A DBC file, read.
@@ -110,6 +115,18 @@ pub(super) fn read(file: &Path) -> Result<String, Failure> {
         return Err(fault(format!("has {bytes} bytes, must be at most {MAX_BYTES}")));
     }
     std::fs::read_to_string(file).map_err(|error| fault(format!("cannot be read: {error}")))
+}
+
+/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
+pub(super) fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
+    let whole =
+        |path: &Path| std::path::absolute(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())));
+    let (config, file) = (whole(config)?, whole(file)?);
+    let name = match config.parent() {
+        Some(folder) => file.strip_prefix(folder).unwrap_or(&file),
+        None => &file,
+    };
+    Ok(name.display().to_string())
 }
 
 fn report(source: &str, result: &ImportResult) {

@@ -103,6 +103,8 @@ pub struct Discovery {
     pub seconds: f64,
     /// Signals that have values in the log.
     pub signals: usize,
+    /// Voltages and currents of the battery that are in the log and never have a value.
+    pub remarks: Vec<String>,
     #[serde(skip)]
     log_signals: Vec<LogSignal>,
 }
@@ -184,7 +186,7 @@ impl Discoverer {
 
     /// Judges what was taken; `interfaces` are the names of the interfaces by number.
     pub fn finish(&self, interfaces: &[String]) -> Discovery {
-        let signals = signals::signals(&self.capture, &self.descriptions);
+        let (signals, remarks) = signals::signals(&self.capture, &self.descriptions);
         Discovery {
             candidates: judge::candidates(&signals, interfaces),
             frames: self.capture.frames,
@@ -192,6 +194,7 @@ impl Discoverer {
             answers: self.capture.answers.len(),
             seconds: self.capture.seconds(),
             signals: signals.len(),
+            remarks,
             log_signals: signals,
         }
     }

@@ -14,6 +14,9 @@ use crate::quantity::BusIndex;
 /// Fewest valid values of a signal; fewer are a coincidence.
 const MIN_VALUES: usize = 2;
 
+/// Most remarks.
+const MAX_REMARKS: usize = 20;
+
 /// Where a signal is described.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum SignalOrigin {
@@ -54,8 +57,8 @@ pub(super) struct Descriptions {
     pub(super) tables: Vec<DiagnosticTable>,
 }
 
-/// Every signal of the log with values, in a fixed order.
-pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<LogSignal> {
+/// Every signal of the log with values, in a fixed order, and remarks about described ones of the battery without any.
+pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<LogSignal>, Vec<String>) {
     let mut signals = Vec::new();
     let mut rows = raw::CellRows::default();
     for (key, payloads) in &capture.messages {
@@ -77,7 +80,22 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> Vec<Log
     if descriptions.databases.is_empty() {
         signals.extend(fields::signals(capture));
     }
-    signals
+    let (usable, empty): (Vec<LogSignal>, Vec<LogSignal>) = signals.into_iter().partition(has_values);
+    let remarks = empty.iter().filter_map(remark).take(MAX_REMARKS).collect();
+    (usable, remarks)
+}
+
+/// What is wrong with a voltage or current of the battery that is in the log and never has a value.
+fn remark(signal: &LogSignal) -> Option<String> {
+    let is_battery = signal.words.says_pack() || signal.is_pack_message;
+    let is_wanted = matches!(signal.dimension, Dimension::Voltage | Dimension::Current);
+    let readings = signal.series.bad;
+    (is_battery && is_wanted && readings >= MIN_VALUES).then(|| {
+        format!(
+            "{}: all {readings} readings are outside its range or not available: is its definition right?",
+            signal.name
+        )
+    })
 }
 
 fn is_answer(table: &DiagnosticTable, key: &AnswerKey) -> bool {
@@ -114,7 +132,7 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             scale,
         })
     };
-    message.signals.iter().filter_map(of_signal).filter(has_values).collect()
+    message.signals.iter().filter_map(of_signal).collect()
 }
 
 /// Whether the multiplexors select the signal.
@@ -147,7 +165,7 @@ fn of_definition(
             scale,
         }
     });
-    each.filter(has_values).collect()
+    each.collect()
 }
 
 /// Values of a defined signal. A current that its definition calls unsigned is read as a signed number where that brings

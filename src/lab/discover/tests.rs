@@ -165,6 +165,7 @@ fn a_request_that_was_not_heard_is_a_guess_that_is_named() {
 fn a_definition_that_calls_a_signed_current_unsigned_is_seen() {
     let text = r#"{"commands": [{"hdr": "7E4", "rax": "7EC", "cmd": {"22": "0101"}, "freq": 1, "signals": [
         {"id": "X_HVBAT_CURR", "name": "", "fmt": {"bix": 0, "len": 16, "max": 6553.5, "div": 10, "unit": "amps"}},
+        {"id": "X_HVBAT_DC_VOLT", "name": "", "fmt": {"bix": 32, "len": 16, "max": 100, "min": 50, "unit": "volts"}},
         {"id": "X_HVBAT_VOLT", "name": "", "fmt": {"bix": 16, "len": 16, "max": 1000, "div": 10, "unit": "volts"}}]}]}"#;
     let mut discoverer = Discoverer::default();
     discoverer.add_obdb(text, &ObdbSettings::default()).unwrap();
@@ -173,17 +174,46 @@ fn a_definition_that_calls_a_signed_current_unsigned_is_seen() {
         let mut message = vec![0x62, 0x01, 0x01];
         message.extend(((load_a * 10.0) as i16).to_be_bytes());
         message.extend((((380.0 - 0.08 * load_a) * 10.0).round() as u16).to_be_bytes());
+        message.extend([0x0F, 0xA0]);
         let at = i64::from(step) * 1000;
         discoverer.handle(time(at), BusIndex(0), &frame(0x7E4, &[3, 0x22, 1, 1, 0, 0, 0, 0]));
-        discoverer.handle(time(at + 5), BusIndex(0), &frame(0x7EC, &segment(None, &message, 0)[0]));
+        for (number, payload) in (1..).zip(segment(None, &message, 0)) {
+            discoverer.handle(time(at + number), BusIndex(0), &frame(0x7EC, &payload));
+        }
     }
     let discovery = discover(&discoverer);
     let current = &discovery.candidates[0];
     assert_eq!((current.signal.as_str(), current.positive), ("X.HVBAT_CURR", Some(PositiveDirection::Discharge)));
     assert!(current.low < -50.0 && current.reasons.iter().any(|reason| reason.contains("unsigned")), "{current:?}");
+    assert_eq!(discovery.remarks.len(), 1);
+    assert!(
+        discovery.remarks[0].starts_with("X.HVBAT_DC_VOLT: all 60 readings are outside"),
+        "{:?}",
+        discovery.remarks
+    );
     let settings = PackSettings { cells: Some(98), cell_model: "cell.toml".to_owned(), ..PackSettings::default() };
     let text = discoverer.configuration(&discovery, &settings).unwrap().text;
     assert!(text.contains("name = \"HVBAT_CURR\", bit = 0, length = 16, signed = true"), "{text}");
+}
+
+#[test]
+fn answers_with_extended_addresses_are_read() {
+    let text = r#"{"commands": [{"hdr": "6F1", "rax": "607", "eax": "07", "cmd": {"22": "DDBC"}, "freq": 1, "signals": [
+        {"id": "I3_HVBAT_SOC", "name": "", "fmt": {"len": 16, "max": 100, "div": 10, "unit": "percent"}}]}]}"#;
+    let mut discoverer = Discoverer::default();
+    discoverer.add_obdb(text, &ObdbSettings::default()).unwrap();
+    for step in 0..20_u8 {
+        let at = i64::from(step) * 1000;
+        discoverer.handle(time(at), BusIndex(0), &frame(0x6F1, &[0x07, 0x03, 0x22, 0xDD, 0xBC, 0, 0, 0]));
+        let message = [0x62, 0xDD, 0xBC, 0x02, step, 3, 0x8F, 0, 0x50];
+        for (number, payload) in (1..).zip(segment(Some(0xF1), &message, 0xFF)) {
+            discoverer.handle(time(at + number), BusIndex(0), &frame(0x607, &payload));
+        }
+    }
+    let discovery = discover(&discoverer);
+    assert_eq!((discovery.answers, names(&discovery, Quantity::Soc)), (1, vec!["I3.HVBAT_SOC"]));
+    let soc = discovery.candidates.iter().find(|candidate| candidate.quantity == Quantity::Soc).unwrap();
+    assert_eq!((soc.low, soc.high), (51.2, 53.1));
 }
 
 #[test]
