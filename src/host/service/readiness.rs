@@ -44,6 +44,7 @@ pub(super) struct Readiness {
     is_ready: bool,
     lost: Vec<Channel>,
     inputs: usize,
+    is_asleep: bool,
     store_works: bool,
     /// Why the last reload was rejected.
     refused: Option<String>,
@@ -66,6 +67,7 @@ impl Readiness {
             is_ready: false,
             lost: Vec::new(),
             inputs: 0,
+            is_asleep: false,
             store_works: true,
             refused: None,
             restored,
@@ -131,6 +133,9 @@ impl Readiness {
     }
 
     fn check_inputs(&mut self, monitor: &Monitor) {
+        let is_asleep = monitor.asleep_since().is_some();
+        self.is_changed |= is_asleep != self.is_asleep;
+        self.is_asleep = is_asleep;
         if self.inputs == monitor.inputs() && monitor.lost_inputs().eq(self.lost.iter().copied()) {
             return;
         }
@@ -169,6 +174,7 @@ impl Readiness {
         let mut line = match self.first_after {
             None if !self.is_ready => "waiting for the first frame".to_owned(),
             None => format!("running without input: no frame in {} s", self.timeout.as_secs_f64()),
+            Some(_) if self.is_asleep => "running: the buses sleep".to_owned(),
             Some(_) if !self.lost.is_empty() && self.lost.len() == self.inputs => "running without input".to_owned(),
             Some(after) => {
                 let plural = if count == 1 { "" } else { "s" };

@@ -3,7 +3,7 @@
 use super::*;
 use crate::can::{CanId, Frame};
 use crate::config;
-use crate::monitor::{Input, Outputs};
+use crate::monitor::{Input, MonitorConfig, Outputs};
 use crate::quantity::{BusIndex, Timestamp};
 use std::path::Path;
 
@@ -17,8 +17,13 @@ struct Scene {
 
 impl Scene {
     fn new(restored: Option<String>) -> Self {
+        Self::with(restored, |_| {})
+    }
+
+    fn with(restored: Option<String>, edit: impl FnOnce(&mut MonitorConfig)) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml");
-        let config = config::load(&path).expect("the example is good");
+        let mut config = config::load(&path).expect("the example is good");
+        edit(&mut config.monitor);
         let names: Vec<_> = ["can0", "can1"].map(str::to_owned).to_vec();
         let began = Instant::now();
         let readiness = Readiness::new(&names, Duration::from_secs(10), restored, began);
@@ -108,12 +113,24 @@ fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
 
 #[test]
 fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
-    let mut scene = Scene::new(None);
+    let mut scene = Scene::with(None, |config| config.asleep_after_s = None);
     let frame = good_frame();
     scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
     // Longer than a temperature may be old.
     let line = scene.wait(130).expect("signals were lost");
     assert!(line.starts_with("running without input; 3 of 3 signals lost (pack current, "), "{line}");
+    for _ in 0..20 {
+        scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    }
+    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
+}
+
+#[test]
+fn a_parked_vehicle_sleeps_and_has_lost_nothing() {
+    let mut scene = Scene::new(None);
+    let frame = good_frame();
+    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    assert_eq!(scene.wait(130).as_deref(), Some("running: the buses sleep"));
     for _ in 0..20 {
         scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
     }
