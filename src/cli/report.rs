@@ -9,7 +9,7 @@ use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
 
-use crate::config::{self, Config};
+use crate::config::{self, Config, ConfigFiles};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
@@ -52,7 +52,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
-    let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
+    let config_text = args.config.as_deref().map(config_text).transpose();
     let reference = args.reference.as_deref().map(report::read_reference).transpose();
     let reference = reference.map_err(failure)?;
     let (data, provenance) = match (&args.state, &config) {
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let context = PageContext {
         title: args.title(),
         config: config.as_ref(),
-        config_text: config_text.map_err(failure)?,
+        config_text: config_text?,
         reference: reference.unwrap_or_default(),
         provenance,
     };
@@ -74,6 +74,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Some(folder) = &args.plots else { return Ok(()) };
     create_folder(folder)?;
     report::write_plots(folder, &data, &context).map(drop).map_err(failure)
+}
+
+/// The configuration as it is written; with drop-ins, merged.
+fn config_text(path: &Path) -> Result<String, Failure> {
+    match ConfigFiles::find(path)?.drop_ins.is_empty() {
+        true => fs::read_to_string(path).map_err(failure),
+        false => Ok(config::merged(path)?),
+    }
 }
 
 impl Args {

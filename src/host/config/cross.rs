@@ -41,7 +41,8 @@ fn interfaces(raw: &RawTables, faults: &mut Faults) {
             interface.place.fault(faults, "name", &what);
         }
         if let Some(first) = raw.interfaces[..index].iter().find(|other| other.name == *name) {
-            let what = format!("must be unique, is also the name in line {}", first.place.line_of("name"));
+            let first = first.place.line_of("name").beside(interface.place.line_of("name"));
+            let what = format!("must be unique, is also the name in {first}");
             interface.place.fault(faults, "name", &what);
         }
     }
@@ -71,15 +72,22 @@ fn voltages(raw: &RawTables, faults: &mut Faults) {
     match (raw.is_written::<CellVoltageInput>(), raw.is_written::<PackVoltageInput>()) {
         (false, false) if raw.broken => {}
         (false, false) => {
-            let line = raw.input.as_ref().map_or(1, |input| input.place.line);
-            faults.add(&raw.file, line, "input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]");
+            let text = "input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]";
+            note_at(raw.input.as_ref().map(|input| &input.place), text, raw, faults);
         }
         (true, true) => {
-            let line = raw.pack_voltage.as_ref().map_or(1, |input| input.place.line);
             let text = "input.pack_voltage stands beside [input.cell_voltage], must be one of them";
-            faults.add(&raw.file, line, text);
+            note_at(raw.pack_voltage.as_ref().map(|input| &input.place), text, raw, faults);
         }
         (true, false) | (false, true) => {}
+    }
+}
+
+/// Notes `text` about a table; about the file, where it could not be read.
+fn note_at(place: Option<&TablePlace>, text: &str, raw: &RawTables, faults: &mut Faults) {
+    match place {
+        Some(place) => faults.add_at(&place.at, text),
+        None => faults.add(&raw.file, 1, text),
     }
 }
 
@@ -96,7 +104,7 @@ fn temperatures(pack: &Pack, raw: &RawTables, faults: &mut Faults) {
     if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {
             let text = format!("{} is one too many, must be one: the pack is estimated as one cell", sensor.place.path);
-            faults.add(&sensor.place.file, sensor.place.line, text);
+            faults.add_at(&sensor.place.at, text);
         }
         for sensor in raw.temperatures.iter().filter(|sensor| sensor.cells.is_some()) {
             sensor.place.fault(faults, "cells", "must not be given: the pack is estimated as one cell");
@@ -113,7 +121,8 @@ fn temperatures(pack: &Pack, raw: &RawTables, faults: &mut Faults) {
             cells.iter().any(|cell| others.contains(cell))
         };
         if let Some(other) = raw.temperatures[..index].iter().find(shared) {
-            let what = format!("must not name cells of {} (line {})", other.place.path, other.place.line);
+            let line = other.place.at.beside(sensor.place.line_of("cells"));
+            let what = format!("must not name cells of {} ({line})", other.place.path);
             sensor.place.fault(faults, "cells", &what);
         }
     }

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::keys::TemperatureInput;
 use super::resolve::{ResolvedSignal, channel_words};
 use super::tables::RawTables;
-use super::{Config, InterfaceConfig, protect};
+use super::{Config, ConfigFiles, InterfaceConfig, protect};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
@@ -18,6 +18,8 @@ use crate::sample::VoltageSource;
 pub struct Description {
     /// The configuration file.
     pub file: String,
+    /// Its drop-ins, in the order in which they are merged.
+    pub drop_ins: Vec<String>,
     /// The cell model.
     pub cell: String,
     /// Assumptions about the pack, in sentences.
@@ -113,6 +115,7 @@ pub struct OutputUse {
 
 /// Describes a checked configuration and the signals found for it.
 pub(super) fn describe(
+    files: &ConfigFiles,
     raw: &RawTables,
     config: &Config,
     found: &[ResolvedSignal<'_>],
@@ -134,6 +137,7 @@ pub(super) fn describe(
     );
     Description {
         file: config.path.display().to_string(),
+        drop_ins: files.drop_ins.iter().map(|file| file.display().to_string()).collect(),
         cell,
         pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),

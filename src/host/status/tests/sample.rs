@@ -28,7 +28,11 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         wall_time: time,
         started: time.plus_secs(-11_520.0),
         uptime_s: 11_520.0,
-        config: Some(ConfigFile { path: "pack.toml".to_owned(), sha256: "0123456789abcdef".repeat(4) }),
+        config: Some(ConfigFile {
+            path: "pack.toml".to_owned(),
+            drop_ins: Vec::new(),
+            sha256: "0123456789abcdef".repeat(4),
+        }),
         state: Validity::Valid,
         interfaces: vec![interface("can0", LinkState::Up), interface("can1", LinkState::Missing)],
         pack: pack(cells),
