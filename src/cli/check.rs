@@ -53,6 +53,9 @@ fn show(description: &Description, page: &mut String) {
     for file in &description.drop_ins {
         page.push_str(&format!("  with {file}\n"));
     }
+    if description.vehicle.is_stated() {
+        page.push_str(&format!("\nvehicle\n  {}\n", description.vehicle));
+    }
     page.push_str(&format!("\ncell\n  {}\n", description.cell));
     list("pack", &description.pack, "", page);
     page.push_str("\ninterfaces\n");

@@ -25,7 +25,7 @@ use super::control::{ControlServer, MAX_CONNECTIONS};
 use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
-use crate::config::Config;
+use crate::config::{Config, VehicleIdentity};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
 use crate::io::record::Record;
@@ -144,7 +144,8 @@ impl Service {
             left_out_reported: Instant::now(),
             status_publisher,
         };
-        tracing::info!(interfaces = self.config.interfaces.len(), "started");
+        let VehicleIdentity { name: vehicle, id, pack } = &self.config.vehicle;
+        tracing::info!(interfaces = self.config.interfaces.len(), vehicle, id, pack, "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::log_kernel_stack();
         }
@@ -156,7 +157,8 @@ impl Service {
 
     fn identity(&self, clock: MappedClock) -> ServiceIdentity {
         let interfaces = self.config.interface_names();
-        ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
+        let (config, vehicle) = (self.config_file.clone(), self.config.vehicle.clone());
+        ServiceIdentity { started: clock.now(), config, vehicle, interfaces }
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Record>) -> (JoinSet<()>, Vec<LinkOutput>) {

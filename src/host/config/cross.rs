@@ -10,9 +10,12 @@ use crate::cell::{CapacityState, CellModel};
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
+/// Longest name of a vehicle or pack, characters: a line of the status shows all three.
+const MAX_VEHICLE_TEXT: usize = 64;
 
 /// Notes keys that do not fit together.
 pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    vehicle(raw, faults);
     interfaces(raw, faults);
     sources(raw, faults);
     voltages(raw, faults);
@@ -25,6 +28,17 @@ pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Fau
     let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| RatedCell::new(rated_ah, recharge));
     alarm::check(raw, rated.as_ref(), faults);
     output(raw, faults);
+}
+
+/// Texts that fit a label, a title and a line.
+fn vehicle(raw: &RawTables, faults: &mut Faults) {
+    let Some(keys) = &raw.vehicle else { return };
+    for (key, text) in keys.config().labels() {
+        if text.chars().count() > MAX_VEHICLE_TEXT || text.contains(char::is_control) {
+            let what = format!("must be at most {MAX_VEHICLE_TEXT} characters without control characters");
+            keys.place.fault(faults, key, &what);
+        }
+    }
 }
 
 fn interfaces(raw: &RawTables, faults: &mut Faults) {

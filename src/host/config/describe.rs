@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::keys::TemperatureInput;
 use super::resolve::{ResolvedSignal, channel_words};
 use super::tables::RawTables;
-use super::{Config, ConfigFiles, InterfaceConfig, protect};
+use super::{Config, ConfigFiles, InterfaceConfig, VehicleIdentity, protect};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
@@ -20,6 +20,8 @@ pub struct Description {
     pub file: String,
     /// Its drop-ins, in the order in which they are merged.
     pub drop_ins: Vec<String>,
+    /// The vehicle.
+    pub vehicle: VehicleIdentity,
     /// The cell model.
     pub cell: String,
     /// Assumptions about the pack, in sentences.
@@ -138,6 +140,7 @@ pub(super) fn describe(
     Description {
         file: config.path.display().to_string(),
         drop_ins: files.drop_ins.iter().map(|file| file.display().to_string()).collect(),
+        vehicle: config.vehicle.clone(),
         cell,
         pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),

@@ -16,6 +16,7 @@
 //! | `cross`, `alarm`, `output`, `commands`, `j1939`, `protect` | what concerns several keys |
 //! | `convert` | the settings of the core |
 //! | `cell_model` | cell model files, by the same mechanism |
+//! | `vehicle` | which vehicle and pack |
 //! | `describe`, `reference`, `manual` | the configuration in words |
 //! | `partial` | as much of a faulty configuration as can be read |
 //!
@@ -58,6 +59,7 @@ mod setting;
 mod source;
 mod tables;
 mod threshold;
+mod vehicle;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 pub(crate) use diagnostic::answers;
@@ -73,6 +75,7 @@ pub(crate) use resolve::{Databases, NamedSignal, ResolvedSignal, channel_words, 
 pub use source::ConfigFiles;
 use source::Sources;
 pub(crate) use tables::RawTables;
+pub use vehicle::VehicleIdentity;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -87,6 +90,8 @@ pub struct Config {
     pub output_layout: Option<Database>,
     /// How state and history are kept.
     pub store: StoreConfig,
+    /// Which vehicle and pack this is.
+    pub vehicle: VehicleIdentity,
 }
 
 impl Config {
@@ -212,7 +217,8 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
-    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };
+    let vehicle = raw.vehicle.as_ref()?.config();
+    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store, vehicle };
     let description = describe::describe(files, &raw, &config, &found, outputs);
     Some((config, description))
 }

@@ -523,6 +523,18 @@ fn text_that_is_not_utf_8_is_refused_with_its_line() {
 }
 
 #[test]
+fn the_vehicle_is_optional_and_its_texts_fit_a_line() {
+    assert_eq!(good(PACK).vehicle, VehicleIdentity::default());
+    let config = good(&format!("{PACK}[vehicle]\nid = \"WDB1\"\n"));
+    assert_eq!(config.vehicle.to_string(), "WDB1");
+    let all = faults(&format!("{PACK}[vehicle]\nname = \"\"\nid = \"a\\u0007b\"\npack = \"{}\"\n", "x".repeat(65)));
+    assert!(all[0].ends_with("vehicle.name = \"\", must be a text that is not empty"), "{all:?}");
+    let all = faults(&format!("{PACK}[vehicle]\nid = \"a\\u0007b\"\npack = \"{}\"\n", "x".repeat(65)));
+    assert_eq!(all.len(), 2, "{all:?}");
+    assert!(all.iter().all(|fault| fault.ends_with("must be at most 64 characters without control characters")));
+}
+
+#[test]
 fn every_default_is_a_value_its_key_allows() {
     use super::schema::Presence;
     for info in tables::SECTIONS.iter().chain(super::cell_model::SECTIONS) {

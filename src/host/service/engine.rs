@@ -58,7 +58,8 @@ pub(super) struct Engine {
 impl Engine {
     /// Opens store and files, and restores the state.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
-        let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
+        let (store, found) =
+            Store::open(&service.state, &service.config.store, &service.config.vehicle).map_err(ServiceError::Store)?;
         let names = service.config.interface_names();
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
@@ -79,7 +80,10 @@ impl Engine {
         let has_lost_file = downtime
             .is_some_and(|downtime| write_or_stop(&mut record, "record", |journal| journal.restored(now, downtime)));
         let frames = service.frames.as_deref().map(create).transpose()?;
-        let events = service.events.as_deref().map(create).transpose()?;
+        let mut events = service.events.as_deref().map(create).transpose()?;
+        let vehicle = &service.config.vehicle;
+        let has_lost_file =
+            write_or_stop(&mut events, "events", |file| event_log::write_head(file, vehicle)) || has_lost_file;
         let log = EventLog::new(names.clone());
         let restored = downtime.map(|downtime| match downtime {
             Downtime::Seconds(age_s) => describe_restored(Some(age_s)),

@@ -16,7 +16,7 @@ use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
-use crate::config::ConfigFiles;
+use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, Statistics, Validity};
@@ -45,6 +45,9 @@ pub struct StatusDocument {
     pub uptime_s: f64,
     /// The configuration in use.
     pub config: Option<ConfigFile>,
+    /// The vehicle.
+    #[serde(default)]
+    pub vehicle: VehicleIdentity,
     /// Validity of the estimates.
     pub state: Validity,
     /// The interfaces, in the order of the configuration.

@@ -3,6 +3,7 @@
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
@@ -33,6 +34,7 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
             drop_ins: Vec::new(),
             sha256: "0123456789abcdef".repeat(4),
         }),
+        vehicle: VehicleIdentity::default(),
         state: Validity::Valid,
         interfaces: vec![interface("can0", LinkState::Up), interface("can1", LinkState::Missing)],
         pack: pack(cells),
