@@ -29,6 +29,7 @@ use crate::config::{Config, VehicleIdentity};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
 use crate::io::record::Record;
+use crate::io::segments::SegmentLimits;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
 use crate::io::stop::Stop;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
@@ -52,6 +53,8 @@ pub struct Service {
     pub config: Config,
     /// Journal of every input.
     pub record: Option<PathBuf>,
+    /// Sizes of a journal in segments; `None` = it is one file.
+    pub record_limits: Option<SegmentLimits>,
     /// Log of the frames sent, with the time of the input that caused each.
     pub frames: Option<PathBuf>,
     /// Events as JSON, a line each.

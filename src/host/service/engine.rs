@@ -12,7 +12,7 @@ use crate::io::background_file::BackgroundFile;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
-use crate::io::journal::JournalWriter;
+use crate::io::journal::{self, JournalWriter};
 use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
@@ -76,7 +76,7 @@ impl Engine {
         if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
             store.set_state_aside(why, now);
         }
-        let mut record = open_journal(service.record.as_deref(), &names)?;
+        let mut record = open_journal(service, &names)?;
         let has_lost_file = downtime
             .is_some_and(|downtime| write_or_stop(&mut record, "record", |journal| journal.restored(now, downtime)));
         let frames = service.frames.as_deref().map(create).transpose()?;
@@ -300,8 +300,12 @@ fn create(path: &Path) -> Result<BackgroundFile, ServiceError> {
     BackgroundFile::create(path).map_err(|error| ServiceError::File { path: path.to_owned(), error })
 }
 
-fn open_journal(path: Option<&Path>, names: &[String]) -> Result<Option<JournalWriter<BackgroundFile>>, ServiceError> {
-    let Some(path) = path else { return Ok(None) };
-    let journal = JournalWriter::new(create(path)?, names.to_vec());
+fn open_journal(service: &Service, names: &[String]) -> Result<Option<JournalWriter<BackgroundFile>>, ServiceError> {
+    let Some(path) = service.record.as_deref() else { return Ok(None) };
+    let file = match service.record_limits {
+        None => BackgroundFile::create(path),
+        Some(limits) => BackgroundFile::create_segments(path, journal::HEADER, limits),
+    };
+    let journal = file.and_then(|file| JournalWriter::new(file, names.to_vec()));
     journal.map(Some).map_err(|error| ServiceError::File { path: path.to_owned(), error })
 }
