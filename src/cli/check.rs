@@ -18,8 +18,12 @@ pub(crate) struct Args {
     /// Print the meaning as JSON
     #[arg(long)]
     json: bool,
+    /// Print the configuration and its drop-ins FILE.d/*.toml as one TOML text, each part with its file and line; then
+    /// report the faults, if there are any
+    #[arg(long, conflicts_with = "json")]
+    merged: bool,
     /// Print the reference of all keys and do nothing else
-    #[arg(long, conflicts_with_all = ["file", "json"])]
+    #[arg(long, conflicts_with_all = ["file", "json", "merged"])]
     reference: bool,
 }
 
@@ -28,7 +32,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Some(file) = &args.file else {
         return print(&crate::config::reference());
     };
+    if args.merged {
+        print(&crate::config::merged(file)?)?;
+    }
     let description = crate::config::describe(file)?;
+    if args.merged {
+        return Ok(());
+    }
     if args.json {
         unless_closed(print_json(&description))
     } else {
@@ -40,8 +50,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
 fn show(description: &Description, page: &mut String) {
     page.push_str(&format!("{}: {}\n", description.file, verdict(description.warnings.len())));
+    for file in &description.drop_ins {
+        page.push_str(&format!("  with {file}\n"));
+    }
     if !description.warnings.is_empty() {
         list("warnings", &description.warnings, "", page);
+    }
+    if description.vehicle.is_stated() {
+        page.push_str(&format!("\nvehicle\n  {}\n", description.vehicle));
     }
     page.push_str(&format!("\ncell\n  {}\n", description.cell));
     list("pack", &description.pack, "", page);

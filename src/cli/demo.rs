@@ -15,7 +15,7 @@ use super::output::word;
 use crate::alarm::{Change, Rule};
 use crate::can::Frame;
 use crate::can::encode::InputEncoder;
-use crate::config::{self, Config};
+use crate::config::{self, Config, ConfigFiles};
 use crate::io::candump::{self, StampDigits};
 use crate::io::ticks::Ticks;
 use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
@@ -57,7 +57,7 @@ pub(crate) struct Args {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let config = config::load_with(Path::new("demo.toml"), &read_built_in)?;
+    let config = config::load_with(&ConfigFiles::alone(Path::new("demo.toml")), &read_built_in)?;
     let mut demo = Demo::new(config, args.seed)?;
     demo.run().map_err(|error| Failure::new(format!("standard output: {error}")))?;
     demo.conclude()

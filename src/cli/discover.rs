@@ -127,7 +127,8 @@ fn write(
         Some(database) if path == own => Ok(database.clone().into_bytes()),
         _ => std::fs::read(path),
     };
-    config::load_with(file, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
+    let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
+    config::load_with(&files, &read).map_err(|faults| failed(&faults.0.join("\n")))?;
     if let Some(database) = &pack.database {
         check_place(&own, args.dbc.iter().chain([&args.log])).map_err(Failure::new)?;
         write_whole(&own, database)?;

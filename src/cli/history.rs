@@ -117,14 +117,16 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn list(reader: &HistoryReader, args: &Args) -> Result<(), Failure> {
     let entries =
         reader.entries(&args.wanted.filter(Some(args.limit).filter(|&limit| limit > 0))).map_err(Failure::new)?;
+    let vehicle = reader.vehicle().map_err(Failure::new)?;
     if args.json {
         let rows: Vec<Value> = entries.iter().map(document).collect();
-        return print(&format!("{}\n", json!({ "version": VERSION, "rows": rows })));
+        return print(&format!("{}\n", json!({ "version": VERSION, "vehicle": vehicle, "rows": rows })));
     }
+    let of = if vehicle.is_stated() { format!("{vehicle}\n") } else { String::new() };
     if entries.is_empty() {
-        return print("no rows\n");
+        return print(&format!("{of}no rows\n"));
     }
-    let head = format!("{:<26}  {:>4}  {:<14}  {:>4}  {}\n", "time (UTC)", "pack", "kind", "cell", "what");
+    let head = of + &format!("{:<26}  {:>4}  {:<14}  {:>4}  {}\n", "time (UTC)", "pack", "kind", "cell", "what");
     print(&entries.iter().fold(head, |text, entry| text + &line(entry)))
 }
 

@@ -41,6 +41,15 @@ pub(crate) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<u
     number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }
 
+/// A size in bytes: a whole number, with B, KiB, MiB or GiB behind it where it is not bytes.
+pub(crate) fn bytes(text: &str) -> Result<u64, String> {
+    let units = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("B", 0)];
+    let unit = units.into_iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, shift)));
+    let (number, shift) = unit.unwrap_or((text, 0));
+    let size = number.trim_end().parse::<u64>().ok().and_then(|number| number.checked_mul(1 << shift));
+    size.ok_or_else(|| "must be a whole number of bytes, or one with KiB, MiB or GiB, as 64MiB".to_owned())
+}
+
 /// A finite number above 0.
 pub(crate) fn above_0(text: &str) -> Result<f64, String> {
     within(text, |value| value > 0.0, "a finite number above 0")
@@ -60,4 +69,18 @@ pub(crate) fn share(text: &str) -> Result<f64, String> {
 pub(crate) fn percent(text: &str) -> Result<f64, String> {
     let digits = text.trim().trim_end_matches('%');
     within(digits, |value| value > 0.0 && value <= 100.0, "per cent above 0, at most 100")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_binary_units_and_others_are_refused() {
+        let sizes = ["4096", "64MiB", "2 GiB", "1KiB", "7B"].map(|text| bytes(text).expect("a size"));
+        assert_eq!(sizes, [4096, 64 << 20, 2 << 30, 1024, 7]);
+        for text in ["", "MiB", "1.5GiB", "-1", "2GB", "99999999999999GiB"] {
+            assert!(bytes(text).is_err(), "{text}");
+        }
+    }
 }

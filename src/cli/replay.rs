@@ -12,6 +12,7 @@ use super::output::print_json;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;
+use crate::io::event_log;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
 use crate::io::snapshot_file;
@@ -52,7 +53,7 @@ fn replay_all(
 ) -> Result<(), ReplayError> {
     let sinks = Sinks {
         estimates: create(args.estimates.as_deref())?,
-        events: create(args.events.as_deref())?,
+        events: events_file(args.events.as_deref(), &config)?,
         frames: create(args.frames.as_deref())?,
         watch: None,
     };
@@ -113,7 +114,7 @@ fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
         store: args
             .state
             .as_deref()
-            .map(|path| Recorder::create(path, &config.store))
+            .map(|path| Recorder::create(path, &config.store, &config.vehicle))
             .transpose()
             .map_err(Failure::new)?,
         ..plain_settings(args, config)
@@ -128,6 +129,15 @@ fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
 
 fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
     path.map(ResultFile::create).transpose()
+}
+
+/// A file of events, which begins with the vehicle as that of `run` does.
+fn events_file(path: Option<&Path>, config: &Config) -> io::Result<Option<ResultFile>> {
+    let mut file = create(path)?;
+    if let Some(file) = &mut file {
+        event_log::write_head(file, &config.vehicle)?;
+    }
+    Ok(file)
 }
 
 fn print_summary(args: &Args, summary: &ReplaySummary) -> io::Result<()> {

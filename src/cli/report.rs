@@ -9,7 +9,7 @@ use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
 
-use crate::config::{self, Config};
+use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
@@ -41,7 +41,7 @@ pub(crate) struct Args {
     /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
     #[arg(long, value_name = "TABLE.csv")]
     reference: Option<PathBuf>,
-    /// Title of the page [default: the name of the log or folder]
+    /// Title of the page [default: the vehicle, else the name of the log or folder]
     #[arg(long)]
     title: Option<String>,
     #[command(flatten)]
@@ -52,21 +52,22 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
-    let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
+    let config_text = args.config.as_deref().map(config_text).transpose();
     let reference = args.reference.as_deref().map(report::read_reference).transpose();
     let reference = reference.map_err(failure)?;
-    let (data, provenance) = match (&args.state, &config) {
+    let (data, provenance, vehicle) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
         (None, None) => return Err(Failure::new("neither --state nor -c with logs, one must be given")),
     };
     let mut provenance = provenance;
+    provenance.extend(vehicle.is_stated().then(|| ("Vehicle".to_owned(), vehicle.to_string())));
     provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
     provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
     let context = PageContext {
-        title: args.title(),
+        title: args.title(&vehicle),
         config: config.as_ref(),
-        config_text: config_text.map_err(failure)?,
+        config_text: config_text?,
         reference: reference.unwrap_or_default(),
         provenance,
     };
@@ -76,6 +77,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     report::write_plots(folder, &data, &context).map(drop).map_err(failure)
 }
 
+/// The configuration as it is written; with drop-ins, merged.
+fn config_text(path: &Path) -> Result<String, Failure> {
+    match ConfigFiles::find(path)?.drop_ins.is_empty() {
+        true => fs::read_to_string(path).map_err(failure),
+        false => Ok(config::merged(path)?),
+    }
+}
+
 impl Args {
     /// Checks the arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
@@ -83,7 +92,10 @@ impl Args {
         check_place(&self.out, inputs).map_err(Failure::new)
     }
 
-    fn title(&self) -> String {
+    fn title(&self, vehicle: &VehicleIdentity) -> String {
+        if let (None, true) = (&self.title, vehicle.is_stated()) {
+            return vehicle.to_string();
+        }
         let of = self.state.as_ref().or(self.logs.first());
         let name = of.and_then(|path| path.file_name()).map(|name| name.to_string_lossy().into_owned());
         let more = if self.logs.len() > 1 { format!(" and {} more", self.logs.len() - 1) } else { String::new() };
@@ -94,8 +106,9 @@ impl Args {
 /// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
-fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
+fn of_store(folder: &Path) -> Result<(Data, Provenance, VehicleIdentity), Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
+    let vehicle = reader.vehicle().map_err(Failure::new)?;
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
     if let Some(broken) = &verdict.broken {
@@ -109,10 +122,10 @@ fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
         ),
     };
     let provenance = vec![("History".to_owned(), folder.display().to_string()), ("Hash chain".to_owned(), chain)];
-    Ok((data, provenance))
+    Ok((data, provenance, vehicle))
 }
 
-fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure> {
+fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance, VehicleIdentity), Failure> {
     let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
     let watched = Rc::clone(&data);
@@ -131,7 +144,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
     // The replay has ended and with it the closure that shared the data.
     let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));
-    Ok((data, provenance(args, &summary)))
+    Ok((data, provenance(args, &summary), config.vehicle.clone()))
 }
 
 fn provenance(args: &Args, summary: &ReplaySummary) -> Provenance {

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
-use super::numbers::{between, whole};
+use super::numbers::{between, bytes, whole};
 use crate::config;
 use crate::io::place::PlaceSetting;
+use crate::io::segments::{DEFAULT_SEGMENT_BYTES, SegmentLimits};
 use crate::io::snapshot_file;
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
 use crate::monitor::Downtime;
@@ -23,6 +24,13 @@ pub(crate) struct Args {
     /// Journal every input, for `packwatch replay`; an existing file of that name becomes FILE.1
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Journal in compressed segments FILE.000001.zst, FILE.000002.zst and so on, and delete the oldest when they and those
+    /// of the run before exceed this size, as 2GiB
+    #[arg(long, value_name = "SIZE", requires = "record", value_parser = bytes)]
+    record_limit: Option<u64>,
+    /// Size of a segment (default: 64MiB)
+    #[arg(long, value_name = "SIZE", requires = "record_limit", value_parser = bytes, default_value_t = DEFAULT_SEGMENT_BYTES, hide_default_value = true)]
+    record_segment: u64,
     /// Log the frames sent to the interfaces, in candump's form, with the time of the input that caused each
     #[arg(long, value_name = "FILE")]
     frames: Option<PathBuf>,
@@ -82,9 +90,11 @@ pub(crate) fn away(text: &str) -> Result<Downtime, String> {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
+    let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();
     let service = Service {
         config: config::load(&args.config)?,
         record: args.record.clone(),
+        record_limits: record_limits.map_err(|why| Failure::new(format!("--record-limit: {why}")))?,
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,

@@ -9,7 +9,7 @@ pub(crate) use args::Args;
 
 use super::Failure;
 use super::output::{create_folder, failure, short_names, unless_closed};
-use crate::config::{self, Config, ConfigFaults};
+use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 use crate::health::UsableConfig;
 use crate::lab::score::{self, Case, CycleTable, ScoreJob, ScoreSettings};
 
@@ -46,18 +46,18 @@ fn configuration(args: &Args) -> Result<Config, Failure> {
         let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
         known.map_or_else(|| std::fs::read(file), |(_, bytes)| Ok(bytes.to_vec()))
     };
-    let named = named_cell(&path, &read)?;
+    let files = if built_in { ConfigFiles::alone(&path) } else { ConfigFiles::find(&path)? };
+    let named = named_cell(&files, &read)?;
     let read = |file: &Path| if file == named { std::fs::read(cell) } else { read(file) };
-    Ok(config::load_with(&path, &read)?)
+    Ok(config::load_with(&files, &read)?)
 }
 
 /// The path of the cell model that a configuration names.
-fn named_cell(path: &Path, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
-    let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", path.display())]);
-    let bytes = read(path).map_err(|e| fault(format!("cannot be read: {e}")))?;
-    let named = String::from_utf8(bytes).ok().and_then(|text| text.parse::<toml::Table>().ok()).and_then(|table| {
+fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
+    let text = config::merged_with(files, read)?;
+    let named = text.parse::<toml::Table>().ok().and_then(|table| {
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
-        Some(path.parent().unwrap_or(Path::new("")).join(model))
+        Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
     // Without one, reading the configuration reports the fault.
     Ok(named.unwrap_or_default())

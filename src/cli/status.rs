@@ -126,7 +126,12 @@ fn store(document: &StatusDocument) -> String {
 /// The configuration: its name and the start of its fingerprint.
 fn config(document: &StatusDocument) -> String {
     let file = |config: &crate::status::document::ConfigFile| {
-        format!("{} ({})", config.path, config.sha256.get(..8).unwrap_or_default())
+        let drop_ins = match config.drop_ins.len() {
+            0 => String::new(),
+            1 => " with 1 drop-in".to_owned(),
+            number => format!(" with {number} drop-ins"),
+        };
+        format!("{}{drop_ins} ({})", config.path, config.sha256.get(..8).unwrap_or_default())
     };
     document.config.as_ref().map_or_else(|| "-".to_owned(), file)
 }

@@ -431,6 +431,12 @@ impl Replay {
         summary.cell_steps_per_s = steps as f64 / summary.wall_s.max(1e-9);
         summary.times_real_time = span.times_real_time();
         summary.peak_memory_kib = peak_memory_kib();
+        if counts.deleted_segments > 0 {
+            summary.notes.push(format!(
+                "the beginning of the journal is missing, {} segments: its results differ from those of the recorded run",
+                counts.deleted_segments
+            ));
+        }
         if counts.frames == 0 && !counts.foreign.is_empty() {
             let names: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
             let configured = self.settings.interfaces.join(", ");

@@ -25,10 +25,11 @@ use super::control::{ControlServer, MAX_CONNECTIONS};
 use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
-use crate::config::Config;
+use crate::config::{Config, VehicleIdentity};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
 use crate::io::record::Record;
+use crate::io::segments::SegmentLimits;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
 use crate::io::stop::Stop;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
@@ -52,6 +53,8 @@ pub struct Service {
     pub config: Config,
     /// Journal of every input.
     pub record: Option<PathBuf>,
+    /// Sizes of a journal in segments; `None` = it is one file.
+    pub record_limits: Option<SegmentLimits>,
     /// Log of the frames sent, with the time of the input that caused each.
     pub frames: Option<PathBuf>,
     /// Events as JSON, a line each.
@@ -145,7 +148,8 @@ impl Service {
             status_publisher,
         };
         self.config.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
-        tracing::info!(interfaces = self.config.interfaces.len(), "started");
+        let VehicleIdentity { name: vehicle, id, pack } = &self.config.vehicle;
+        tracing::info!(interfaces = self.config.interfaces.len(), vehicle, id, pack, "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::log_kernel_stack();
         }
@@ -157,7 +161,8 @@ impl Service {
 
     fn identity(&self, clock: MappedClock) -> ServiceIdentity {
         let interfaces = self.config.interface_names();
-        ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
+        let (config, vehicle) = (self.config_file.clone(), self.config.vehicle.clone());
+        ServiceIdentity { started: clock.now(), config, vehicle, interfaces }
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Record>) -> (JoinSet<()>, Vec<LinkOutput>) {

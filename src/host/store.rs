@@ -40,7 +40,7 @@ use std::thread::JoinHandle;
 
 use tokio::sync::watch;
 
-use crate::config::StoreConfig;
+use crate::config::{StoreConfig, VehicleIdentity};
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
 use crate::monitor::{Downtime, Event, Monitor, Snapshot};
@@ -117,7 +117,11 @@ impl Store {
     ///
     /// # Errors
     /// When another daemon uses the folder.
-    pub fn open(setting: &PlaceSetting, config: &StoreConfig) -> Result<(Option<Self>, StoredStates), String> {
+    pub fn open(
+        setting: &PlaceSetting,
+        config: &StoreConfig,
+        vehicle: &VehicleIdentity,
+    ) -> Result<(Option<Self>, StoredStates), String> {
         let none = |works| (None, StoredStates { states: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
@@ -147,13 +151,13 @@ impl Store {
                 None
             }
         };
-        Self::start(folder, opening, config, &now).map_err(|error| format!("{shown}: {error}"))
+        Self::start(folder, opening, (config, vehicle), &now).map_err(|error| format!("{shown}: {error}"))
     }
 
     fn start(
         folder: Folder,
         opening: Option<OpenedDatabase>,
-        config: &StoreConfig,
+        (config, vehicle): (&StoreConfig, &VehicleIdentity),
         now: &Stamp,
     ) -> std::io::Result<(Option<Self>, StoredStates)> {
         let path = folder.path().to_owned();
@@ -197,6 +201,8 @@ impl Store {
         let knows_state = database.is_some() || !found.states.is_empty();
         let writer = Writer {
             write_queue: Arc::clone(&write_queue),
+            vehicle: vehicle.clone(),
+            is_vehicle_noted: false,
             folder,
             database,
             progress: sender,

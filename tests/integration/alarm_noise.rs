@@ -9,7 +9,7 @@ use packwatch::can::CanId;
 use packwatch::can::encode::{InputEncoder, default_database};
 use packwatch::can::signal::SignalPlan;
 use packwatch::cell::circuit::{soc_after, terminal_v};
-use packwatch::config;
+use packwatch::config::{self, ConfigFiles};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
@@ -33,7 +33,7 @@ fn configuration(alarm: &str) -> MonitorConfig {
         Some("noise.toml") => Ok(text.clone().into_bytes()),
         _ => std::fs::read(path),
     };
-    config::load_with(&folder.join("noise.toml"), &read)
+    config::load_with(&ConfigFiles::alone(&folder.join("noise.toml")), &read)
         .unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
         .monitor
 }

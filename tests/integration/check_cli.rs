@@ -102,6 +102,67 @@ fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
     }
 }
 
+/// A copy of `config/paper.toml` with the files it names, and these drop-ins.
+fn with_drop_ins(drop_ins: &[(&str, &str)]) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    std::fs::create_dir_all(folder.path().join("cells")).unwrap();
+    std::fs::create_dir_all(folder.path().join("paper.toml.d")).unwrap();
+    for entry in std::fs::read_dir(shipped.join("cells")).unwrap() {
+        let path = entry.unwrap().path();
+        std::fs::copy(&path, folder.path().join("cells").join(path.file_name().unwrap())).unwrap();
+    }
+    for name in ["paper.toml", "packwatch.dbc", "pack96.dbc", "measured.dbc"] {
+        std::fs::copy(shipped.join(name), folder.path().join(name)).unwrap();
+    }
+    for (name, text) in drop_ins {
+        std::fs::write(folder.path().join("paper.toml.d").join(name), text).unwrap();
+    }
+    let path = folder.path().join("paper.toml");
+    (folder, path)
+}
+
+#[test]
+fn drop_ins_are_merged_and_shown_with_the_place_of_each_part() {
+    let drop_ins = [("20-late.toml", "[pack]\nambient_c = 12.5\n"), ("10-early.toml", "[pack]\nambient_c = 3\n")];
+    let (_folder, file) = with_drop_ins(&drop_ins);
+    let name = file.to_str().unwrap();
+    let page = good(&["check", "--merged", name]);
+    assert!(page.contains(&format!("\nambient_c = 12.5 # {name}.d/20-late.toml:2\n")), "{page}");
+    assert!(!page.contains("ambient_c = 3"), "{page}");
+    let table: toml::Table = page.parse().unwrap();
+    assert_eq!(table["pack"]["cells"].as_integer(), Some(1));
+    let said = good(&["check", name]);
+    let head = format!("{name}: good\n  with {name}.d/10-early.toml\n  with {name}.d/20-late.toml\n");
+    assert!(said.starts_with(&head), "{said}");
+}
+
+#[test]
+fn a_faulty_drop_in_is_refused_and_merged_shows_it_all_the_same() {
+    let (_folder, file) = with_drop_ins(&[("a.toml", "[pack]\ncells = 0\n")]);
+    let fault = format!("{}.d/a.toml:2: pack.cells = 0, must be 1 to 1024", file.display());
+    assert_eq!(bad(&file), (78, vec![fault.clone()]));
+    let output = packwatch().args(["check", "--merged"]).arg(&file).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    assert_eq!((output.status.code(), text(output.stderr)), (Some(78), fault + "\n"));
+    assert!(text(output.stdout).contains("cells = 0 # "));
+}
+
+#[test]
+fn the_fingerprint_is_that_of_the_files_one_after_the_other() {
+    use packwatch::status::document::ConfigFile;
+    let (folder, file) = with_drop_ins(&[]);
+    let plain = ConfigFile::of(&file).unwrap();
+    std::fs::write(folder.path().join("paper.toml.d/a.toml"), "[pack]\nambient_c = 1\n").unwrap();
+    let merged = ConfigFile::of(&file).unwrap();
+    assert_ne!(plain.sha256, merged.sha256);
+    assert_eq!(merged.drop_ins, [format!("{}.d/a.toml", file.display())]);
+    let whole = folder.path().join("whole.toml");
+    let text = std::fs::read_to_string(&file).unwrap() + "[pack]\nambient_c = 1\n";
+    std::fs::write(&whole, text).unwrap();
+    assert_eq!(merged.sha256, ConfigFile::of(&whole).unwrap().sha256);
+}
+
 #[test]
 fn a_file_that_is_not_there_is_a_bad_configuration() {
     let (code, lines) = bad(Path::new("no/such/file.toml"));

@@ -4,6 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use packwatch::io::background_file::BackgroundFile;
+use packwatch::io::journal;
+use packwatch::io::segments::SegmentLimits;
 
 fn config() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml")
@@ -43,6 +46,39 @@ fn replaying_twice_gives_the_same_bytes() {
     let rows = String::from_utf8_lossy(&results[0][0]).lines().count();
     assert!((1700..=1801).contains(&rows), "{rows} estimates");
     assert!(!results[0][2].is_empty(), "frames are sent");
+}
+
+#[test]
+fn a_journal_in_segments_gives_the_same_bytes_as_one_file() {
+    use std::io::Write as _;
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let (drive, plain, split) = (path("drive.log"), path("plain.journal"), path("split.journal"));
+    let mut simulate = Command::cargo_bin("packwatch").expect("the binary is built");
+    let paper = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
+    simulate.args(["simulate", "paper", "-o", &drive, "--cycles", "2", "-c"]).arg(&paper).assert().success();
+    let journal = format!("PACKWATCH-JOURNAL 1\n{}", fs::read_to_string(&drive).expect("a log"));
+    fs::write(&plain, &journal).expect("written");
+    let limits = SegmentLimits::new(1 << 20, 64 << 10).expect("allowed");
+    let mut file = BackgroundFile::create_segments(Path::new(&split), journal::HEADER, limits).expect("created");
+    journal.as_bytes().chunks(9_000).for_each(|part| file.write_all(part).expect("queued"));
+    file.finish().expect("written");
+    let segments: Vec<String> =
+        (1..).map(|n| format!("{split}.{n:06}.zst")).take_while(|p| Path::new(p).exists()).collect();
+    assert!(segments.len() >= 2, "{segments:?}");
+    let results = |logs: &[&str], name: &str| {
+        let files = ["estimates", "events", "frames"].map(|kind| path(&format!("{kind}-{name}")));
+        let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+        command.args(["replay", "-c"]).arg(&paper).args(logs).args(["--estimates", &files[0], "--events", &files[1]]);
+        let said = stdout_of(&command.args(["--frames", &files[2]]).assert().success());
+        (files.map(|file| fs::read(file).expect("written")), said)
+    };
+    let (whole, _) = results(&[&plain], "plain");
+    let each: Vec<&str> = segments.iter().map(String::as_str).collect();
+    assert_eq!(results(&[&split], "split").0, whole);
+    assert_eq!(results(&each, "each").0, whole);
+    let (late, said) = results(&each[1..], "late");
+    assert!(late != whole && said.contains("the beginning of the journal is missing, 1 segments"), "{said}");
 }
 
 #[test]

@@ -96,6 +96,48 @@ fn learned_values_of_a_replay_are_in_the_history() {
 }
 
 #[test]
+fn the_vehicle_is_in_events_history_report_and_export() {
+    let place = Place { folder: tempfile::tempdir().expect("a folder") };
+    let log = log(place.folder.path());
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    let names =
+        ["measured.toml", "measured.dbc", "cells/nasa_b0005.toml", "cells/example_nmc_2600.toml", "packwatch.dbc"];
+    fs::create_dir_all(place.folder.path().join("cells")).expect("created");
+    for name in names {
+        fs::copy(shipped.join(name), place.folder.path().join(name)).expect("copied");
+    }
+    let config = place.path("measured.toml");
+    fs::create_dir(format!("{config}.d")).expect("created");
+    let vehicle = "[vehicle]\nname = \"Bus 12\"\nid = \"WDB1\"\npack = \"front\"\n";
+    fs::write(format!("{config}.d/vehicle.toml"), vehicle).expect("written");
+    let (events, state) = (place.path("events.jsonl"), place.state());
+    good(&["replay", "-c", &config, &log, "--state", &state, "--events", &events]);
+    let head = r#"{"vehicle":{"id":"WDB1","name":"Bus 12","pack":"front"}}"#;
+    assert_eq!(fs::read_to_string(&events).expect("events").lines().next(), Some(head));
+    let table = good(&["history", "--state", &state]);
+    assert_eq!(table.lines().next(), Some("Bus 12 (WDB1), pack front"));
+    let document: Value = serde_json::from_str(&good(&["history", "--state", &state, "--json"])).expect("JSON");
+    assert_eq!(document["vehicle"]["pack"], "front");
+    assert!(good(&["check", &config]).contains("\nvehicle\n  Bus 12 (WDB1), pack front\n"));
+    in_report_and_export(&place, &config, &log);
+}
+
+#[cfg(feature = "lab")]
+fn in_report_and_export(place: &Place, config: &str, log: &str) {
+    let (page, out) = (place.path("page.html"), place.path("tables"));
+    good(&["report", "--state", &place.state(), "-o", &page]);
+    let title = "<title>Bus 12 (WDB1), pack front</title>";
+    assert!(fs::read_to_string(&page).expect("a page").contains(title), "no {title}");
+    good(&["export", "-c", config, log, "-o", &out]);
+    let about = fs::read_to_string(format!("{out}/cell/about.json")).expect("about.json");
+    let about: Value = serde_json::from_str(&about).expect("JSON");
+    assert_eq!(about["metadata"]["packwatch.vehicle_id"], "WDB1");
+}
+
+#[cfg(not(feature = "lab"))]
+fn in_report_and_export(_: &Place, _: &str, _: &str) {}
+
+#[test]
 fn verify_names_the_first_row_that_was_changed() {
     let place = Place::filled();
     let before = fs::read(place.database()).expect("read");
@@ -150,5 +192,5 @@ fn a_history_of_a_newer_program_or_none_at_all_is_said_to_be_so() {
     bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
     fs::write(place.database(), bytes).expect("written");
     let printed = bad(&["history", "--state", &place.state()]);
-    assert!(printed.contains("layout version 99, this program reads 1 to 3"), "{printed}");
+    assert!(printed.contains("layout version 99, this program reads 1 to 4"), "{printed}");
 }

@@ -15,7 +15,7 @@ use super::{Args, Failure, report};
 use crate::cli::output::{check_distinct, create_folder};
 use crate::config::Config;
 use crate::io::log::LogSource;
-use crate::io::result_file::{ResultFile, check_place};
+use crate::io::result_file::check_place;
 use crate::monitor::Monitor;
 use crate::replay::{self, ReplayError, ReplayProgress, ReplaySummary, Sinks, in_order};
 
@@ -94,10 +94,14 @@ fn name(log: &Path) -> String {
 }
 
 fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result<ReplaySummary, ReplayError> {
-    let create = |path: &Option<PathBuf>| path.as_deref().map(ResultFile::create).transpose();
+    let create = |path: &Option<PathBuf>| super::create(path.as_deref());
     let [estimates, events, frames] = results(args, log);
-    let sinks =
-        Sinks { estimates: create(&estimates)?, events: create(&events)?, frames: create(&frames)?, watch: None };
+    let sinks = Sinks {
+        estimates: create(&estimates)?,
+        events: super::events_file(events.as_deref(), config)?,
+        frames: create(&frames)?,
+        watch: None,
+    };
     let mut source = LogSource::new([log.to_owned()], super::log_options(&args.input, config));
     let settings = super::plain_settings(args, config);
     let mut progress_of_log = LogProgress { bar, began: Instant::now(), bytes: 0, frames: 0, awake_s: 0.0 };

@@ -102,6 +102,7 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
         ("stamps backwards", log.time_backwards),
         ("unknown gaps", log.unknown_gaps),
         ("values no frame carries", log.uncarried_values),
+        ("segments missing at the beginning", log.deleted_segments),
     ];
     rows.extend(counted.into_iter().filter(|&(_, count)| count > 0).map(|(name, count)| (name, count.to_string())));
     if !log.foreign.is_empty() {

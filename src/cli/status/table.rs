@@ -36,6 +36,9 @@ fn head(text: &mut String, document: &StatusDocument) {
         stamp::format_utc(document.wall_time),
         config(document),
     );
+    if document.vehicle.is_stated() {
+        let _ = writeln!(text, "vehicle    {}", document.vehicle);
+    }
 }
 
 fn pack(text: &mut String, document: &StatusDocument) {

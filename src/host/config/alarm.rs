@@ -109,14 +109,15 @@ pub(super) fn check(raw: &RawTables, rated: Option<&RatedCell>, faults: &mut Fau
         for (key, severity, _) in alarm.thresholds() {
             let same = |other: &&Alarm| other.rule == alarm.rule && other.thresholds().any(|(_, s, _)| s == severity);
             if let Some(twin) = raw.alarms[..index].iter().find(same) {
-                let what = format!("must be one per rule, {} in line {} has one", twin.place.path, twin.place.line);
+                let line = twin.place.at.beside(place.line_of(key));
+                let what = format!("must be one per rule, {} in {line} has one", twin.place.path);
                 place.fault(faults, key, &what);
             }
         }
         check_needs(alarm, raw, faults);
         if alarm.thresholds().next().is_none() {
             let text = format!("{} has no threshold, must have info, warning or severe", place.path);
-            faults.add(&place.file, place.line, text);
+            faults.add_at(&place.at, text);
         }
         if let Some(rated) = rated {
             check_thresholds(alarm, rated, faults);

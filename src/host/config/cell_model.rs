@@ -14,7 +14,7 @@ use super::schema::Presence::{Optional, Required};
 use super::schema::{SchemaReader, Section as _, SectionInfo, section};
 use super::setting::ValueRange::{Above, Any, Between, NotEmpty};
 use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
-use super::{ConfigFaults, ReadFile, read_text};
+use super::{ConfigFaults, ConfigFiles, ReadFile, Sources};
 use crate::cell::{
     AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, NegativeMaterial, PositiveMaterial, Table, Thermal,
 };
@@ -163,8 +163,8 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
 
 /// As [`load`], through `read`; faults are noted with those of other files.
 pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
-    let text = read_text(path, read, faults)?;
-    let document = Document::parse(&path.display().to_string(), &text, faults);
+    let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
+    let document = Document::parse(&sources, faults);
     let mut reader = SchemaReader::new(&document, SECTIONS, faults);
     let head = reader.one::<Head>();
     let measured = reader.optional::<Measured>();

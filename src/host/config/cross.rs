@@ -10,9 +10,12 @@ use crate::cell::{CapacityState, CellModel};
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
+/// Longest name of a vehicle or pack, characters: a line of the status shows all three.
+const MAX_VEHICLE_TEXT: usize = 64;
 
 /// Notes keys that do not fit together.
 pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    vehicle(raw, faults);
     interfaces(raw, faults);
     sources(raw, faults);
     voltages(raw, faults);
@@ -25,6 +28,17 @@ pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Fau
     let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| RatedCell::new(rated_ah, recharge));
     alarm::check(raw, rated.as_ref(), faults);
     output(raw, faults);
+}
+
+/// Texts that fit a label, a title and a line.
+fn vehicle(raw: &RawTables, faults: &mut Faults) {
+    let Some(keys) = &raw.vehicle else { return };
+    for (key, text) in keys.config().labels() {
+        if text.chars().count() > MAX_VEHICLE_TEXT || text.contains(char::is_control) {
+            let what = format!("must be at most {MAX_VEHICLE_TEXT} characters without control characters");
+            keys.place.fault(faults, key, &what);
+        }
+    }
 }
 
 fn interfaces(raw: &RawTables, faults: &mut Faults) {
@@ -41,7 +55,8 @@ fn interfaces(raw: &RawTables, faults: &mut Faults) {
             interface.place.fault(faults, "name", &what);
         }
         if let Some(first) = raw.interfaces[..index].iter().find(|other| other.name == *name) {
-            let what = format!("must be unique, is also the name in line {}", first.place.line_of("name"));
+            let first = first.place.line_of("name").beside(interface.place.line_of("name"));
+            let what = format!("must be unique, is also the name in {first}");
             interface.place.fault(faults, "name", &what);
         }
     }
@@ -57,15 +72,22 @@ fn voltages(raw: &RawTables, faults: &mut Faults) {
     match (raw.is_written::<CellVoltageInput>(), raw.is_written::<PackVoltageInput>()) {
         (false, false) if raw.broken => {}
         (false, false) => {
-            let line = raw.input.as_ref().map_or(1, |input| input.place.line);
-            faults.add(&raw.file, line, "input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]");
+            let text = "input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]";
+            note_at(raw.input.as_ref().map(|input| &input.place), text, raw, faults);
         }
         (true, true) => {
-            let line = raw.pack_voltage.as_ref().map_or(1, |input| input.place.line);
             let text = "input.pack_voltage stands beside [input.cell_voltage], must be one of them";
-            faults.add(&raw.file, line, text);
+            note_at(raw.pack_voltage.as_ref().map(|input| &input.place), text, raw, faults);
         }
         (true, false) | (false, true) => {}
+    }
+}
+
+/// Notes `text` about a table; about the file, where it could not be read.
+fn note_at(place: Option<&TablePlace>, text: &str, raw: &RawTables, faults: &mut Faults) {
+    match place {
+        Some(place) => faults.add_at(&place.at, text),
+        None => faults.add(&raw.file, 1, text),
     }
 }
 
@@ -82,7 +104,7 @@ fn temperatures(pack: &Pack, raw: &RawTables, faults: &mut Faults) {
     if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {
             let text = format!("{} is one too many, must be one: the pack is estimated as one cell", sensor.place.path);
-            faults.add(&sensor.place.file, sensor.place.line, text);
+            faults.add_at(&sensor.place.at, text);
         }
         for sensor in raw.temperatures.iter().filter(|sensor| sensor.cells.is_some()) {
             sensor.place.fault(faults, "cells", "must not be given: the pack is estimated as one cell");
@@ -99,7 +121,8 @@ fn temperatures(pack: &Pack, raw: &RawTables, faults: &mut Faults) {
             cells.iter().any(|cell| others.contains(cell))
         };
         if let Some(other) = raw.temperatures[..index].iter().find(shared) {
-            let what = format!("must not name cells of {} (line {})", other.place.path, other.place.line);
+            let line = other.place.at.beside(sensor.place.line_of("cells"));
+            let what = format!("must not name cells of {} ({line})", other.place.path);
             sensor.place.fault(faults, "cells", &what);
         }
     }

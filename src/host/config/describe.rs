@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::keys::TemperatureInput;
 use super::resolve::{ResolvedSignal, channel_words};
 use super::tables::RawTables;
-use super::{Config, InterfaceConfig, protect};
+use super::{Config, ConfigFiles, InterfaceConfig, VehicleIdentity, protect};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
@@ -20,6 +20,10 @@ pub struct Description {
     pub file: String,
     /// What is allowed and unlikely, one line each.
     pub warnings: Vec<String>,
+    /// Its drop-ins, in the order in which they are merged.
+    pub drop_ins: Vec<String>,
+    /// The vehicle.
+    pub vehicle: VehicleIdentity,
     /// The cell model.
     pub cell: String,
     /// Assumptions about the pack, in sentences.
@@ -115,6 +119,7 @@ pub struct OutputUse {
 
 /// Describes a checked configuration and the signals found for it.
 pub(super) fn describe(
+    files: &ConfigFiles,
     raw: &RawTables,
     config: &Config,
     found: &[ResolvedSignal<'_>],
@@ -137,6 +142,8 @@ pub(super) fn describe(
     Description {
         file: config.path.display().to_string(),
         warnings: config.warnings.clone(),
+        drop_ins: files.drop_ins.iter().map(|file| file.display().to_string()).collect(),
+        vehicle: config.vehicle.clone(),
         cell,
         pack: pack(config, voltage_step_v, rounding_v),
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),

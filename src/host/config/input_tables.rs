@@ -22,8 +22,11 @@ pub(super) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut 
         false => format!("must be the name of one of {count} interfaces"),
     };
     if count > 1 && !raw.is_written::<CurrentInput>() {
-        let line = raw.input.as_ref().map_or(1, |input| input.place.line);
-        faults.add(&document.file, line, format!("{}.interface is missing, {allowed}", CurrentInput::PATH));
+        let text = format!("{}.interface is missing, {allowed}", CurrentInput::PATH);
+        match raw.input.as_ref() {
+            Some(input) => faults.add_at(&input.place.at, text),
+            None => faults.add(&document.file, 1, text),
+        }
     }
     for (place, table) in with_key("interface").flat_map(|info| tables(document, info)) {
         let is_fault = match table.get("interface").map(|value| value.get_ref().as_str()) {

@@ -85,9 +85,9 @@ fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
             };
             let same = |(other, of): &&(&Alarm, AlarmCode)| other.rule != alarm.rule && of.code == own.code;
             if let Some((twin, _)) = codes.iter().find(same) {
-                let (line, path, fmi) = (twin.place.line, &twin.place.path, own.code.fmi());
-                let what =
-                    format!("must not give two rules one code, {path} in line {line} has it with FMI {fmi} ({key})");
+                let line = twin.place.at.beside(alarm.place.line_of("spn"));
+                let (path, fmi) = (&twin.place.path, own.code.fmi());
+                let what = format!("must not give two rules one code, {path} in {line} has it with FMI {fmi} ({key})");
                 alarm.place.fault(faults, "spn", &what);
                 is_good = false;
             }

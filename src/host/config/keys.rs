@@ -8,13 +8,13 @@ mod input;
 mod limits;
 mod traffic;
 
-use super::StoreConfig;
 use super::schema::Presence::{Default, Optional, Required};
 use super::schema::SubTables;
 use super::schema::section;
 use super::setting::ValueRange::{self, Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, NumberRange, choice};
 use super::threshold::Threshold;
+use super::{StoreConfig, VehicleIdentity};
 
 use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
@@ -96,6 +96,18 @@ choice!(Rule {
     "store_failed" => Self::StoreFailed,
     "bus_fault" => Self::BusFault,
 });
+
+section! {
+    /// Which vehicle and pack this is, for status, metrics, events, reports and history. Each key is at most 64 characters long. A change needs a restart.
+    Vehicle at "vehicle" gives VehicleIdentity, |keys| {
+        /// Name of the vehicle. Without it: not stated.
+        name: Option<String>, "", NotEmpty, Optional => name: keys.name.clone();
+        /// Vehicle identification number or fleet number. Without it: not stated.
+        id: Option<String>, "", NotEmpty, Optional => id: keys.id.clone();
+        /// Name of the pack, in a vehicle with several packs. Without it: not stated.
+        pack: Option<String>, "", NotEmpty, Optional => pack: keys.pack.clone();
+    }
+}
 
 section! {
     /// The pack: how many cells, how they are connected, and which cell they are.

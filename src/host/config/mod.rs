@@ -1,11 +1,13 @@
 //! The TOML configuration: as written, then checked; every fault at once, with file, line, key, found and allowed.
 //!
-//! In: the configuration file and the files it names (DBC files, cell model). Out: [`Config`], the settings of the other
+//! In: the configuration file, its drop-ins and the files they name (DBC files, cell model). Out: [`Config`], the settings of the other
 //! modules, which cannot be wrong; or [`ConfigFaults`], a line per fault.
 //!
 //! | file | content |
 //! | --- | --- |
-//! | `document` | TOML text, places of keys, list of faults |
+//! | `source` | the file and its drop-ins, their texts |
+//! | `document` | the texts parsed and merged, places of keys, list of faults |
+//! | `merged` | the merged tables as one TOML text |
 //! | `setting`, `threshold` | types a key may have |
 //! | `schema` | the mechanism: what a declared key gives |
 //! | `keys` | every key, declared once |
@@ -15,6 +17,7 @@
 //! | `input_tables`, `plausible` | faulty tables checked as far as they go; what cannot be meant |
 //! | `convert` | the settings of the core |
 //! | `cell_model` | cell model files, by the same mechanism |
+//! | `vehicle` | which vehicle and pack |
 //! | `describe`, `reference`, `manual` | the configuration in words |
 //! | `partial` | as much of a faulty configuration as can be read |
 //!
@@ -46,6 +49,7 @@ mod input_tables;
 mod j1939;
 mod keys;
 mod manual;
+mod merged;
 mod output;
 mod partial;
 mod pattern;
@@ -55,8 +59,10 @@ mod reference;
 mod resolve;
 mod schema;
 mod setting;
+mod source;
 mod tables;
 mod threshold;
+mod vehicle;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 pub(crate) use diagnostic::answers;
@@ -69,7 +75,10 @@ pub(crate) use pattern::Pattern;
 pub use reference::reference;
 use resolve::Checks;
 pub(crate) use resolve::{Databases, NamedSignal, ResolvedSignal, channel_words, input_map};
+pub use source::ConfigFiles;
+use source::Sources;
 pub(crate) use tables::RawTables;
+pub use vehicle::VehicleIdentity;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -86,6 +95,8 @@ pub struct Config {
     pub store: StoreConfig,
     /// What is allowed and unlikely, one line each, in the form of the faults.
     pub warnings: Vec<String>,
+    /// Which vehicle and pack this is.
+    pub vehicle: VehicleIdentity,
 }
 
 impl Config {
@@ -123,20 +134,21 @@ pub struct ConfigFaults(pub Vec<String>);
 /// Reads the bytes of a file: from the disk, or (demo, tests) from memory.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 
-/// Reads and checks a configuration with everything it names (DBC files, cell model; paths are relative to it).
+/// Reads and checks a configuration, its drop-ins and everything they name (DBC files, cell model; paths are relative to
+/// the configuration file).
 ///
 /// # Errors
 /// Every fault found, not only the first.
 pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
-    load_with(path, &read_file)
+    load_with(&ConfigFiles::find(path)?, &read_file)
 }
 
 /// As [`load`], with files read by `read`.
 ///
 /// # Errors
 /// Every fault found, not only the first.
-pub fn load_with(path: &Path, read: ReadFile<'_>) -> Result<Config, ConfigFaults> {
-    read_all(path, read).map(|(config, _)| config)
+pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, ConfigFaults> {
+    read_all(files, read).map(|(config, _)| config)
 }
 
 /// Reads and checks a configuration and describes it.
@@ -144,22 +156,43 @@ pub fn load_with(path: &Path, read: ReadFile<'_>) -> Result<Config, ConfigFaults
 /// # Errors
 /// Every fault found, not only the first.
 pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
-    read_all(path, &read_file).map(|(_, description)| description)
+    read_all(&ConfigFiles::find(path)?, &read_file).map(|(_, description)| description)
 }
 
-fn read_all(path: &Path, read: ReadFile<'_>) -> Result<(Config, Description), ConfigFaults> {
+/// The configuration file and its drop-ins as one TOML text, each part with the file and line it comes from. Keys and
+/// values are not checked.
+///
+/// # Errors
+/// When a file cannot be read or is no TOML: every such fault.
+pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
+    merged_with(&ConfigFiles::find(path)?, &read_file)
+}
+
+/// As [`merged`], with files read by `read`.
+///
+/// # Errors
+/// When a file cannot be read or is no TOML: every such fault.
+pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, ConfigFaults> {
     let mut faults = Faults::default();
-    match read_config(path, read, &mut faults) {
+    let sources = Sources::read(files, read, &mut faults);
+    let text = sources.as_ref().map(|sources| merged::text(&Document::parse(sources, &mut faults)));
+    text.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+}
+
+fn read_all(files: &ConfigFiles, read: ReadFile<'_>) -> Result<(Config, Description), ConfigFaults> {
+    let mut faults = Faults::default();
+    match read_config(files, read, &mut faults) {
         Some(good) if faults.is_empty() => Ok(good),
         // A part that cannot be made and has no fault is an error of this program, which is reported too.
-        None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", path.display())])),
+        None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", files.main.display())])),
         _ => Err(ConfigFaults(faults.into_lines())),
     }
 }
 
-fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
-    let text = read_text(path, read, faults)?;
-    let document = Document::parse(&path.display().to_string(), &text, faults);
+fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
+    let path = files.main.as_path();
+    let sources = Sources::read(files, read, faults)?;
+    let document = Document::parse(&sources, faults);
     let raw = RawTables::read(&document, faults);
     let model = read_model(path, &document, read, faults);
     cross::check(&raw, model.as_ref(), faults);
@@ -197,8 +230,9 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();
-    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store, warnings };
-    let description = describe::describe(&raw, &config, &found, outputs);
+    let vehicle = raw.vehicle.as_ref()?.config();
+    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store, warnings, vehicle };
+    let description = describe::describe(files, &raw, &config, &found, outputs);
     Some((config, description))
 }
 

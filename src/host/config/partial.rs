@@ -5,7 +5,7 @@ use std::path::Path;
 use super::document::{Document, Faults};
 use super::resolve::{self, Checks, Databases, ResolvedSignal};
 use super::tables::RawTables;
-use super::{Config, ConfigFaults, load, protect, read_file, read_model, read_text};
+use super::{Config, ConfigFaults, ConfigFiles, Sources, load, protect, read_file, read_model};
 use crate::can::guard::GuardConfig;
 use crate::cell::CellModel;
 
@@ -16,7 +16,7 @@ pub(crate) struct PartialConfig {
     pub config: Option<Config>,
     /// Every fault; empty when it is good.
     pub faults: Vec<String>,
-    /// The tables of the file.
+    /// The tables of the file and its drop-ins.
     pub raw: RawTables,
     /// The DBC files.
     pub databases: Databases,
@@ -36,8 +36,9 @@ impl PartialConfig {
         };
         // The second reading finds the same faults again.
         let again = &mut Faults::default();
-        let Some(text) = read_text(path, &read_file, again) else { return Err(ConfigFaults(faults)) };
-        let document = Document::parse(&path.display().to_string(), &text, again);
+        let sources = Sources::read(&ConfigFiles::find(path)?, &read_file, again);
+        let Some(sources) = sources else { return Err(ConfigFaults(faults)) };
+        let document = Document::parse(&sources, again);
         let raw = RawTables::read(&document, again);
         let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
         let model = read_model(path, &document, &read_file, again);

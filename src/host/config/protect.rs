@@ -37,7 +37,8 @@ pub(super) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardCo
         check_layout(keys, &inputs, checks.faults);
         let guard = guard(keys, first, bus);
         if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
-            let what = format!("must be protected once, is also in line {}", twin.place.line_of("message"));
+            let line = twin.place.line_of("message").beside(keys.place.line_of("message"));
+            let what = format!("must be protected once, is also in {line}");
             keys.place.fault(checks.faults, "message", &what);
         }
         guards.push((guard, keys));

@@ -11,6 +11,7 @@ use toml::de::{DeTable, DeValue};
 
 use super::document::{Document, Faults, TablePlace};
 use super::setting::{Setting, ValueFault, ValueRange};
+use super::source::SourceLine;
 
 /// Effect of a key that is not written.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -304,7 +305,7 @@ impl TableReader<'_> {
                 let (ValueFault::Type(span) | ValueFault::Range(span)) = wrong;
                 let found = self.document.found(value, &span);
                 let text = format!("{} = {found}, {what}", self.place.key(key.name));
-                self.faults.add(&self.document.file, self.document.line(&span), text);
+                self.faults.add_at(&self.document.line(&span), text);
                 None
             }
         }
@@ -339,7 +340,7 @@ impl TableReader<'_> {
             Presence::Required if self.broken => None,
             Presence::Required => {
                 let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
-                self.faults.add(&self.document.file, self.place.line, text);
+                self.faults.add_at(&self.place.at, text);
                 None
             }
         }
@@ -383,7 +384,7 @@ impl<'a> SchemaReader<'a> {
     pub(super) fn one<S: Section>(&mut self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
-            return self.read(S::PATH, 1, Some(root));
+            return self.read(S::PATH, self.document.first_line(), Some(root));
         }
         match self.document.find(S::PATH) {
             None => self.read(S::PATH, self.line_above(S::PATH), None),
@@ -424,14 +425,14 @@ impl<'a> SchemaReader<'a> {
     }
 
     /// Line of the table that the table at `path`, which is not written, would be in.
-    fn line_above(&self, path: &str) -> usize {
+    fn line_above(&self, path: &str) -> SourceLine {
         let above = path.rsplit_once('.').and_then(|(above, _)| self.document.find(above));
-        above.map_or(1, |value| self.document.line(&value.span()))
+        above.map_or_else(|| self.document.first_line(), |value| self.document.line(&value.span()))
     }
 
-    fn read<S: Section>(&mut self, path: &str, line: usize, table: Option<&'a DeTable<'a>>) -> Option<S> {
+    fn read<S: Section>(&mut self, path: &str, at: SourceLine, table: Option<&'a DeTable<'a>>) -> Option<S> {
         let nothing = DeTable::new();
-        let place = self.document.place(path, line, table.unwrap_or(&nothing));
+        let place = self.document.place(path, at, table.unwrap_or(&nothing));
         S::read(&mut TableReader { document: self.document, broken: self.broken, table, place, faults: self.faults })
     }
 
@@ -451,7 +452,7 @@ impl<'a> SchemaReader<'a> {
                 self.table_below(&join(schema, key), &shown_key, value, known);
             } else if !keys.iter().any(|k| k.name == key) {
                 let hint = did_you_mean(key, keys.iter().map(|k| k.name).chain(tables.iter().copied()));
-                self.faults.add(&self.document.file, line, format!("{shown_key} is not a known key{hint}"));
+                self.faults.add_at(&line, format!("{shown_key} is not a known key{hint}"));
             }
         }
     }
@@ -479,7 +480,7 @@ impl<'a> SchemaReader<'a> {
                     _ => self.document.quote(&value.span()),
                 };
                 let must_be = if many { format!("tables [[{schema}]]") } else { format!("one table [{schema}]") };
-                self.faults.add(&self.document.file, line, format!("{shown} = {found}, must be {must_be}"));
+                self.faults.add_at(&line, format!("{shown} = {found}, must be {must_be}"));
             }
         }
     }

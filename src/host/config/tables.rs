@@ -5,7 +5,8 @@ use super::keys::{
     Alarm, AnswerSignalKeys, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
     DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack,
     PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput,
-    SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle,
+    VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -13,6 +14,7 @@ use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 tables! {
     /// The tables of a file; `None` = not written, or faulty (and noted).
     RawTables, SECTIONS {
+        vehicle: one Vehicle,
         pack: one Pack,
         interfaces: many Interface,
         input: one Input,

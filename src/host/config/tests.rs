@@ -10,6 +10,7 @@ use proptest::prelude::*;
 mod alarms;
 mod cell_model;
 mod diagnostic;
+mod drop_ins;
 mod j1939;
 mod plausible;
 mod protect;
@@ -78,14 +79,22 @@ signal = "Status.Temperature"
 "#;
 
 fn read_texts(pack: &str, cell: &str, dbc: &str) -> Result<(Config, Description), Vec<String>> {
+    read_merged(pack, cell, dbc, &[])
+}
+
+/// The drop-ins are 1.toml, 2.toml and so on.
+fn read_merged(pack: &str, cell: &str, dbc: &str, drop_ins: &[&str]) -> Result<(Config, Description), Vec<String>> {
+    let names: Vec<String> = (1..=drop_ins.len()).map(|number| format!("{number}.toml")).collect();
     let own = include_str!("../../../config/packwatch.dbc");
     let files = [("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC), ("own.dbc", own)];
-    let files = HashMap::from(files);
+    let mut files = HashMap::from(files);
+    files.extend(names.iter().map(String::as_str).zip(drop_ins.iter().copied()));
     let read = |path: &Path| match path.to_str().and_then(|name| files.get(name)) {
         Some(text) => Ok(text.as_bytes().to_vec()),
         None => Err(std::io::ErrorKind::NotFound.into()),
     };
-    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
+    let files = ConfigFiles { main: "pack.toml".into(), drop_ins: names.iter().map(PathBuf::from).collect() };
+    read_all(&files, &read).map_err(|faults| faults.0)
 }
 
 fn good(pack: &str) -> Config {
@@ -509,7 +518,22 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
 #[test]
 fn text_that_is_not_utf_8_is_refused_with_its_line() {
     let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
-    assert_eq!(load_with(Path::new("pack.toml"), &read).unwrap_err().0, ["pack.toml:2: is not UTF-8 text"]);
+    assert_eq!(
+        load_with(&ConfigFiles::alone(Path::new("pack.toml")), &read).unwrap_err().0,
+        ["pack.toml:2: is not UTF-8 text"]
+    );
+}
+
+#[test]
+fn the_vehicle_is_optional_and_its_texts_fit_a_line() {
+    assert_eq!(good(PACK).vehicle, VehicleIdentity::default());
+    let config = good(&format!("{PACK}[vehicle]\nid = \"WDB1\"\n"));
+    assert_eq!(config.vehicle.to_string(), "WDB1");
+    let all = faults(&format!("{PACK}[vehicle]\nname = \"\"\nid = \"a\\u0007b\"\npack = \"{}\"\n", "x".repeat(65)));
+    assert!(all[0].ends_with("vehicle.name = \"\", must be a text that is not empty"), "{all:?}");
+    let all = faults(&format!("{PACK}[vehicle]\nid = \"a\\u0007b\"\npack = \"{}\"\n", "x".repeat(65)));
+    assert_eq!(all.len(), 2, "{all:?}");
+    assert!(all.iter().all(|fault| fault.ends_with("must be at most 64 characters without control characters")));
 }
 
 #[test]

@@ -43,7 +43,7 @@ impl Survey {
     pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
         let place = self.places.get(table)?;
         let found = place.found(key).map(str::to_owned);
-        Some((format!("{}:{}", place.file, place.line_of(key)), found))
+        Some((place.line_of(key).to_string(), found))
     }
 }
 

@@ -11,6 +11,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::place::with_suffix;
+use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Bytes collected before they are sent to the thread, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
@@ -39,8 +40,26 @@ impl BackgroundFile {
     pub fn create(path: &Path) -> io::Result<Self> {
         keep_earlier(path)?;
         let file = File::create(path)?;
+        Self::start(move |queue| write_all(file, queue))
+    }
+
+    /// As [`create`](Self::create), in segments that begin with `header`; the text itself brings the first header.
+    ///
+    /// # Errors
+    /// When the first segment cannot be created.
+    pub fn create_segments(path: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
+        let mut segments = SegmentWriter::create(path, header, limits)?;
+        Self::start(move |queue| {
+            for piece in queue {
+                segments.write(&piece)?;
+            }
+            segments.finish()
+        })
+    }
+
+    fn start(write: impl FnOnce(&Receiver<Vec<u8>>) -> io::Result<()> + Send + 'static) -> io::Result<Self> {
         let (pieces, queue) = sync_channel(MAX_PIECES);
-        let writer = std::thread::Builder::new().name("record".to_owned()).spawn(move || write_all(file, &queue))?;
+        let writer = std::thread::Builder::new().name("record".to_owned()).spawn(move || write(&queue))?;
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 

@@ -8,6 +8,7 @@ use crate::can::diagnostic::MessageLoss;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::poll::PollChange;
+use crate::config::VehicleIdentity;
 use crate::monitor::{BusEvent, Event, EventKind};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -19,6 +20,15 @@ const LONGEST_SUMMARY_S: f64 = 3600.0;
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
 pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     serde_json::to_writer(&mut *out, event)?;
+    out.write_all(b"\n")
+}
+
+/// Writes the first line of a file of events, which names the vehicle; nothing where none is stated.
+pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result<()> {
+    if !vehicle.is_stated() {
+        return Ok(());
+    }
+    serde_json::to_writer(&mut *out, &serde_json::json!({ "vehicle": vehicle }))?;
     out.write_all(b"\n")
 }
 

@@ -6,12 +6,12 @@
 
 mod ahead;
 
-use std::fs::File;
 use std::io::{self, Cursor, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::segments::JoinedFiles;
 use ahead::ReadAhead;
 
 /// Bytes read from the file or decompressor at once; also the longest line accepted. A CAN XL line has 4,200.
@@ -33,8 +33,17 @@ pub enum RawLine<'a> {
 /// # Errors
 /// When the file cannot be opened or its first bytes cannot be read.
 pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
+    open_parts(&[path.to_owned()], read_bytes)
+}
+
+/// As [`open`], of files that are one log in parts.
+///
+/// # Errors
+/// When the first file cannot be opened or its first bytes cannot be read.
+pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
+    let is_standard_input = paths.iter().any(|path| path == Path::new("-"));
     let raw: Box<dyn Read + Send> =
-        if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
+        if is_standard_input { Box::new(io::stdin()) } else { Box::new(JoinedFiles::open(paths)?) };
     let mut counted = CountingReader { inner: raw, bytes: Arc::clone(read_bytes) };
     let mut magic = Vec::with_capacity(4);
     (&mut counted).take(4).read_to_end(&mut magic)?;

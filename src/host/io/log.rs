@@ -15,6 +15,7 @@ use super::candump::{self, Line, fast_line};
 use super::csv_log::{CsvLog, CsvOptions, RowTime};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
+use super::segments;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
@@ -73,6 +74,8 @@ pub struct LogCounts {
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
+    /// Segments of a journal before the first one read: deleted, or not named.
+    pub deleted_segments: u64,
 }
 
 /// Reads logs one after another.
@@ -180,8 +183,12 @@ impl LogSource {
                 return Ok(Some(slot[0]));
             }
             let Some(open) = &mut self.current else {
-                let Some(path) = self.files.pop_front() else { return Ok(None) };
-                self.current = Some(self.open(&path)?);
+                let first = self.files.front().map(|path| path.display().to_string()).unwrap_or_default();
+                let next = segments::next_log(&mut self.files);
+                let next = next.map_err(|error| LogError(format!("{first}: cannot be read: {error}")))?;
+                let Some(parts) = next else { return Ok(None) };
+                self.state.counts.deleted_segments += parts.deleted;
+                self.current = Some(self.open(&parts.paths)?);
                 continue;
             };
             let more = match &mut open.form {
@@ -233,10 +240,11 @@ impl LogSource {
         Ok(true)
     }
 
-    fn open(&mut self, path: &Path) -> Result<OpenLog, LogError> {
+    fn open(&mut self, paths: &[PathBuf]) -> Result<OpenLog, LogError> {
+        let path = paths.first().map_or(Path::new(""), PathBuf::as_path);
         let name = path.display().to_string();
         let failed = |e: std::io::Error| LogError(format!("{name}: cannot be read: {e}"));
-        let mut lines = Lines::new(lines::open(path, &self.read_bytes).map_err(failed)?);
+        let mut lines = Lines::new(lines::open_parts(paths, &self.read_bytes).map_err(failed)?);
         let first = lines.peek().map_err(failed)?.trim_ascii_end();
         let journal = first == journal::HEADER.as_bytes();
         if first.starts_with(b"PACKWATCH-JOURNAL") && !journal {
@@ -321,6 +329,10 @@ impl ReadState {
                     return Ok(None);
                 }
             };
+            // The next segment begins.
+            if journal && number > 1 && bytes == journal::HEADER.as_bytes() {
+                continue;
+            }
             self.counts.lines += 1;
             let record = match candump::parse_line(bytes) {
                 Ok(Line::Other) if journal && journal::is_mark(bytes) => {

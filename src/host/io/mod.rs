@@ -11,6 +11,7 @@ pub mod log;
 pub mod place;
 pub mod record;
 pub mod result_file;
+pub mod segments;
 pub mod snapshot_file;
 pub mod socket;
 pub mod stamp;

@@ -12,7 +12,7 @@ use crate::io::background_file::BackgroundFile;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
-use crate::io::journal::JournalWriter;
+use crate::io::journal::{self, JournalWriter};
 use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
@@ -58,7 +58,8 @@ pub(super) struct Engine {
 impl Engine {
     /// Opens store and files, and restores the state.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
-        let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
+        let (store, found) =
+            Store::open(&service.state, &service.config.store, &service.config.vehicle).map_err(ServiceError::Store)?;
         let names = service.config.interface_names();
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
@@ -75,11 +76,14 @@ impl Engine {
         if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
             store.set_state_aside(why, now);
         }
-        let mut record = open_journal(service.record.as_deref(), &names)?;
+        let mut record = open_journal(service, &names)?;
         let has_lost_file = downtime
             .is_some_and(|downtime| write_or_stop(&mut record, "record", |journal| journal.restored(now, downtime)));
         let frames = service.frames.as_deref().map(create).transpose()?;
-        let events = service.events.as_deref().map(create).transpose()?;
+        let mut events = service.events.as_deref().map(create).transpose()?;
+        let vehicle = &service.config.vehicle;
+        let has_lost_file =
+            write_or_stop(&mut events, "events", |file| event_log::write_head(file, vehicle)) || has_lost_file;
         let log = EventLog::new(names.clone());
         let restored = downtime.map(|downtime| match downtime {
             Downtime::Seconds(age_s) => describe_restored(Some(age_s)),
@@ -296,8 +300,12 @@ fn create(path: &Path) -> Result<BackgroundFile, ServiceError> {
     BackgroundFile::create(path).map_err(|error| ServiceError::File { path: path.to_owned(), error })
 }
 
-fn open_journal(path: Option<&Path>, names: &[String]) -> Result<Option<JournalWriter<BackgroundFile>>, ServiceError> {
-    let Some(path) = path else { return Ok(None) };
-    let journal = JournalWriter::new(create(path)?, names.to_vec());
+fn open_journal(service: &Service, names: &[String]) -> Result<Option<JournalWriter<BackgroundFile>>, ServiceError> {
+    let Some(path) = service.record.as_deref() else { return Ok(None) };
+    let file = match service.record_limits {
+        None => BackgroundFile::create(path),
+        Some(limits) => BackgroundFile::create_segments(path, journal::HEADER, limits),
+    };
+    let journal = file.and_then(|file| JournalWriter::new(file, names.to_vec()));
     journal.map(Some).map_err(|error| ServiceError::File { path: path.to_owned(), error })
 }

@@ -15,7 +15,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
-use crate::config::{self, Config, InterfaceConfig, StoreConfig};
+use crate::config::{self, Config, InterfaceConfig, StoreConfig, VehicleIdentity};
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
@@ -121,11 +121,12 @@ async fn finished(reading: &mut Option<LoadTask>) -> Result<Box<LoadedConfig>, V
 struct FixedSettings {
     interfaces: Vec<InterfaceConfig>,
     store: StoreConfig,
+    vehicle: VehicleIdentity,
 }
 
 impl FixedSettings {
     fn of(config: &Config) -> Self {
-        Self { interfaces: config.interfaces.clone(), store: config.store }
+        Self { interfaces: config.interfaces.clone(), store: config.store, vehicle: config.vehicle.clone() }
     }
 
     /// Checks whether `new` can be applied.
@@ -136,6 +137,10 @@ impl FixedSettings {
         let new = Self::of(new);
         if self.interfaces != new.interfaces {
             return Err(format!("interfaces = {new}, running with {self}: needs a restart"));
+        }
+        if self.vehicle != new.vehicle {
+            let (found, running) = (new.vehicle.to_string(), self.vehicle.to_string());
+            return Err(format!("[vehicle] = {found:?}, running with {running:?}: needs a restart"));
         }
         if self.store != new.store {
             return Err("[store]: other settings than it was started with: needs a restart".to_owned());
@@ -198,6 +203,14 @@ mod tests {
                 .check(&new)
                 .is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
         );
+    }
+
+    #[test]
+    fn another_vehicle_needs_a_restart_and_is_named() {
+        let (old, mut new) = (example(), example());
+        new.vehicle.id = Some("WDB1".to_owned());
+        let why = FixedSettings::of(&old).check(&new).expect_err("another vehicle");
+        assert_eq!(why, "[vehicle] = \"WDB1\", running with \"\": needs a restart");
     }
 
     #[test]

@@ -12,6 +12,7 @@ use super::server::Draft;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::cell::LossModes;
+use crate::config::VehicleIdentity;
 use crate::control::answer;
 use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
@@ -50,6 +51,7 @@ impl RecentEvents {
 pub struct ServiceIdentity {
     pub started: Timestamp,
     pub config: Option<ConfigFile>,
+    pub vehicle: VehicleIdentity,
     pub interfaces: Vec<String>,
 }
 
@@ -118,6 +120,7 @@ impl Sources<'_> {
             started: identity.started,
             uptime_s: now.since(identity.started),
             config: identity.config.clone(),
+            vehicle: identity.vehicle.clone(),
             state: pack.validity,
             interfaces: self.interfaces(&core),
             pack,

@@ -16,6 +16,7 @@ use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, Statistics, Validity};
@@ -44,6 +45,9 @@ pub struct StatusDocument {
     pub uptime_s: f64,
     /// The configuration in use.
     pub config: Option<ConfigFile>,
+    /// The vehicle.
+    #[serde(default)]
+    pub vehicle: VehicleIdentity,
     /// Validity of the estimates.
     pub state: Validity,
     /// The interfaces, in the order of the configuration.
@@ -82,7 +86,11 @@ pub struct StatusDocument {
 pub struct ConfigFile {
     /// The file.
     pub path: String,
-    /// SHA-256 of its contents, in hexadecimal digits (its own text, without the files it names).
+    /// Its drop-ins, in the order in which they are merged.
+    #[serde(default)]
+    pub drop_ins: Vec<String>,
+    /// SHA-256 of the text of the file and then of its drop-ins, in hexadecimal digits, as `cat FILE FILE.d/*.toml |
+    /// sha256sum` prints it (without the other files they name).
     pub sha256: String,
 }
 
@@ -373,10 +381,15 @@ pub struct StoreStatus {
 }
 
 impl ConfigFile {
-    /// Reads the file's name and fingerprint; `None` = it cannot be read any more.
+    /// Reads the files' names and fingerprint; `None` = they cannot be read any more.
     pub fn of(path: &Path) -> Option<Self> {
-        let text = std::fs::read(path).ok()?;
-        let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
-        Some(Self { path: path.display().to_string(), sha256 })
+        let files = ConfigFiles::find(path).ok()?;
+        let mut digest = Sha256::new();
+        for file in files.all() {
+            digest.update(std::fs::read(file).ok()?);
+        }
+        let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+        let drop_ins = files.drop_ins.iter().map(|file| file.display().to_string()).collect();
+        Some(Self { path: path.display().to_string(), drop_ins, sha256 })
     }
 }

@@ -159,6 +159,9 @@ fn program(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Resul
     if let Some(config) = &document.config {
         families.info("config", "The configuration it runs with", &label("sha256", config.sha256.clone()))?;
     }
+    if document.vehicle.is_stated() {
+        families.info("vehicle", "The vehicle and its pack, as configured", &document.vehicle.labels())?;
+    }
     families.gauge("uptime", "seconds", "Time since the daemon's start", one(Some(document.uptime_s)))?;
     let seconds = |time: crate::quantity::Timestamp| time.nanos() as f64 / 1e9;
     let written = one(Some(seconds(document.wall_time)));

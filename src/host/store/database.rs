@@ -11,7 +11,7 @@ use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, TransactionB
 
 use super::delta_encoder::DeltaEncoder;
 use super::document::StateDocument;
-use super::meta::Meta;
+use super::meta::{self, Meta};
 use super::retention;
 use super::row_sql::write_batch;
 use super::rows::{HistoryRow, RowBatch};
@@ -20,6 +20,7 @@ use super::stamp::{BootId, Stamp};
 use super::state_slots::{
     ASIDE, STATE, StateRecord, StoredState, read_base, read_document, read_state, set_aside, write_state,
 };
+use crate::config::VehicleIdentity;
 use crate::monitor::EventKind;
 
 /// Bytes of a page: a checkpoint changes few bytes, and whole pages are written.
@@ -142,6 +143,14 @@ impl Database {
     pub(super) fn counts(&self) -> Counts {
         let Meta { head, half_cycles, pack, .. } = self.meta;
         Counts { chained: head.count, half_cycles, packs: pack }
+    }
+
+    /// Notes which vehicle the history is of, if it is not noted yet.
+    pub(super) fn set_vehicle(&self, vehicle: &VehicleIdentity) -> rusqlite::Result<()> {
+        if meta::vehicle(&self.connection)? == *vehicle {
+            return Ok(());
+        }
+        meta::set_vehicle(&self.connection, vehicle)
     }
 
     /// Writes rows and state, all or nothing; durable when it returns.

@@ -1,8 +1,21 @@
-//! The row of `meta`: the end of the chain, the counts of half-cycles, and which pack is connected.
+//! The row of `meta`: the end of the chain, the counts of half-cycles, which pack is connected, and the vehicle.
 
 use rusqlite::{Connection, params};
 
 use super::chain::ChainHead;
+use crate::config::VehicleIdentity;
+
+/// The vehicle that the history is of. A text that cannot be read states none.
+pub(super) fn vehicle(connection: &Connection) -> rusqlite::Result<VehicleIdentity> {
+    let text: Option<String> = connection.query_row("SELECT vehicle FROM meta WHERE id = 1", [], |row| row.get(0))?;
+    Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
+}
+
+/// Writes the vehicle.
+pub(super) fn set_vehicle(connection: &Connection, vehicle: &VehicleIdentity) -> rusqlite::Result<()> {
+    let text = serde_json::to_string(vehicle).ok().filter(|_| vehicle.is_stated());
+    connection.execute("UPDATE meta SET vehicle = ?1 WHERE id = 1", [text]).map(drop)
+}
 
 /// The contents of `meta`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

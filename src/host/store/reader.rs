@@ -9,10 +9,12 @@ use rusqlite::{Connection, OpenFlags};
 use super::chain::hex;
 use super::document::StateDocument;
 use super::folder::DATABASE;
+use super::meta;
 use super::rows::HistoryTable;
 use super::schema;
 use super::state_slots::{STATE, read_document};
 use super::verify::{self, ChainReport};
+use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
@@ -100,6 +102,18 @@ impl HistoryReader {
 
     fn named(&self, error: &rusqlite::Error) -> String {
         format!("{}: {error}", self.path.display())
+    }
+
+    /// The vehicle that the history is of, as the daemon was configured last.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn vehicle(&self) -> Result<VehicleIdentity, String> {
+        let version = schema::version(&self.connection).map_err(|error| self.named(&error))?;
+        if version < schema::VERSION_WITH_VEHICLE {
+            return Ok(VehicleIdentity::default());
+        }
+        meta::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
 
     /// Checks the hash chain.

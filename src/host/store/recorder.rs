@@ -9,7 +9,7 @@ use super::history_filter::HistoryFilter;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 use super::state_slots::StateRecord;
-use crate::config::StoreConfig;
+use crate::config::{StoreConfig, VehicleIdentity};
 use crate::monitor::{Event, Monitor};
 use crate::quantity::Timestamp;
 
@@ -29,7 +29,7 @@ impl Recorder {
     ///
     /// # Errors
     /// When there is one, or it cannot be created: a replay must never get into the history of a real pack.
-    pub fn create(path: &Path, config: &StoreConfig) -> Result<Self, String> {
+    pub fn create(path: &Path, config: &StoreConfig, vehicle: &VehicleIdentity) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
         if folder::has_history(path) {
             return Err(format!("{shown}: exists; a replay needs a state folder of its own, name a new one"));
@@ -39,6 +39,7 @@ impl Recorder {
         let now = Stamp::replayed(Timestamp::ZERO);
         let database = Database::open(&path.join(DATABASE), &now, config.max_half_cycles)
             .map_err(|error| format!("{shown}: {error}"))?;
+        database.set_vehicle(vehicle).map_err(|error| format!("{shown}: {error}"))?;
         let (history_filter, checkpoint_s) = (HistoryFilter::default(), config.checkpoint_s);
         Ok(Self { database, folder, history_filter, checkpoint_s, checkpointed: None })
     }

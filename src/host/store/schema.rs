@@ -7,7 +7,7 @@
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
 //! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
 //! | `state` | the core's state: slot 0 in full, slot 1 the changes since | the latest |
-//! | `meta` | one row: the chain's end, counts | |
+//! | `meta` | one row: the chain's end, counts, the vehicle | |
 //!
 //! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the layout's version.
 
@@ -17,7 +17,10 @@ use rusqlite::{Connection, TransactionBehavior};
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// The statements that lead to each version from the one before; the first starts from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4];
+
+/// The first version that names the vehicle.
+pub(super) const VERSION_WITH_VEHICLE: i32 = 4;
 
 const VERSION_1: &str = "
 CREATE TABLE meta (
@@ -132,6 +135,11 @@ CREATE TABLE loss_modes (
     lam_pe_std REAL,
     hash BLOB NOT NULL
 ) STRICT;
+";
+
+/// The vehicle, as JSON.
+const VERSION_4: &str = "
+ALTER TABLE meta ADD COLUMN vehicle TEXT;
 ";
 
 /// The version of an open database; 0 = an empty file.

@@ -93,7 +93,7 @@ fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
 fn the_database_holds_the_state_in_which_the_replay_ended() {
     let folder = tempfile::tempdir().unwrap();
     let state = folder.path().join("state");
-    let end = snapshot(None, Some(Recorder::create(&state, &config().store).unwrap()));
+    let end = snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
     let now = Stamp::replayed(end.time.plus_secs(60.0));
     let database = Database::open(&state.join(DATABASE), &now, 1000).unwrap();
     let counts = database.counts();
@@ -149,7 +149,8 @@ fn a_failing_disk_is_reported_at_once_and_gets_everything_when_it_works() {
     let state = place.path().join("folder");
     // A file in place of the folder: nothing can be created there.
     std::fs::write(&state, "").unwrap();
-    let (store, found) = Store::open(&PlaceSetting::At(state.clone()), &config().store).unwrap();
+    let (store, found) =
+        Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
     assert!(!found.works && found.states.is_empty());
     let monitor = Monitor::new(config().monitor);
@@ -178,7 +179,8 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
     std::fs::write(&state, "").unwrap();
-    let (store, _) = Store::open(&PlaceSetting::At(state.clone()), &config().store).unwrap();
+    let (store, _) =
+        Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default()).unwrap();
     let store = store.unwrap();
     let mut progress = store.progress();
     let (begun, mut changes) = (Instant::now(), 0);
@@ -204,7 +206,8 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
 #[test]
 fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the_next_start() {
     let place = tempfile::tempdir().unwrap();
-    let (store, _) = Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store).unwrap();
+    let (store, _) =
+        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
     let monitor = Monitor::new(config().monitor);
     let learn = |store: &mut Store, seconds: f64| {
@@ -226,7 +229,8 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
         std::thread::sleep(Duration::from_millis(700));
     }
     store.finish(&monitor, Timestamp::from_secs(9.0));
-    let (store, found) = Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store).unwrap();
+    let (store, found) =
+        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     let mut store = store.unwrap();
     // Cached pages may not have been read again: then the start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
@@ -255,7 +259,8 @@ fn on_a_disk_that_fails_the_last_state_is_in_the_runtime_folder() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
     std::fs::write(&state, "").unwrap();
-    let (store, _) = Store::open(&PlaceSetting::At(state.clone()), &config().store).unwrap();
+    let (store, _) =
+        Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default()).unwrap();
     let file = place.path().join(runtime::FILE_NAME);
     let mut store = store.unwrap();
     store.runtime = Some(RuntimeState::start(file.clone()).unwrap());
@@ -275,7 +280,9 @@ fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
     const ASIDE: &str = "database, set aside earlier";
     let place = tempfile::tempdir().unwrap();
     let open = || {
-        let (store, found) = Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store).unwrap();
+        let (store, found) =
+            Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default())
+                .unwrap();
         (store.unwrap(), found)
     };
     let finish = |store: Store, seconds: f64| store.finish(&at(seconds), Timestamp::from_secs(seconds));
@@ -312,7 +319,8 @@ fn a_state_of_another_version_is_reported_and_not_overwritten() {
     let parts = JsonParts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
     database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
     drop(database);
-    let (store, found) = Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store).unwrap();
+    let (store, found) =
+        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
     assert!(!found.works && found.states.is_empty());
     store.unwrap().finish(&at(1.0), Timestamp::from_secs(1.0));
     assert_eq!(reasons(place.path()), ["state_unfit"]);

@@ -16,6 +16,7 @@ use super::folder::{Folder, OpenedDatabase};
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::{BootId, Stamp};
 use super::state_slots::StateRecord;
+use crate::config::VehicleIdentity;
 use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
@@ -137,6 +138,10 @@ impl WriteQueue {
 #[derive(Debug)]
 pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
+    /// Which vehicle the history is of.
+    pub(super) vehicle: VehicleIdentity,
+    /// The open database has the vehicle.
+    pub(super) is_vehicle_noted: bool,
     pub(super) folder: Folder,
     /// `None` = not open.
     pub(super) database: Option<Database>,
@@ -235,6 +240,10 @@ impl Writer {
             Some(database) => database,
             None => self.reopen(&document.stamp)?,
         };
+        if !self.is_vehicle_noted {
+            database.set_vehicle(&self.vehicle).map_err(|error| error.to_string())?;
+            self.is_vehicle_noted = true;
+        }
         // Opening it may have found a state to set aside.
         let record = StateRecord { sets_aside: self.sets_aside, ..record };
         match database.commit(batches, Some(record)) {
@@ -255,6 +264,7 @@ impl Writer {
     }
 
     fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
+        self.is_vehicle_noted = false;
         let opening = self.folder.open(now).map_err(|error| error.to_string())?;
         let OpenedDatabase { mut database, mut rows, state, is_unreadable, .. } = opening;
         self.sets_aside |= is_unreadable;

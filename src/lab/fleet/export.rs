@@ -144,7 +144,15 @@ fn metadata(
     settings: &ExportSettings<'_>,
 ) -> Vec<(&'static str, String)> {
     let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
-    vec![
+    let vehicle = config.vehicle.labels().into_iter().map(|(label, text)| {
+        let key = match label {
+            "name" => "packwatch.vehicle_name",
+            "id" => "packwatch.vehicle_id",
+            _ => "packwatch.vehicle_pack",
+        };
+        (key, text)
+    });
+    let run = [
         ("packwatch.version", env!("CARGO_PKG_VERSION").to_owned()),
         ("packwatch.config", config.path.display().to_string()),
         ("packwatch.config_sha256", hash),
@@ -152,7 +160,8 @@ fn metadata(
         ("packwatch.start_utc", stamp::format_utc_micros(first)),
         ("packwatch.end_utc", stamp::format_utc_micros(last)),
         ("packwatch.estimates_period_s", settings.period_s.to_string()),
-    ]
+    ];
+    run.into_iter().chain(vehicle).collect()
 }
 
 fn write_about(

@@ -17,7 +17,7 @@ use toml::{Table, Value};
 
 use self::target::{Target, name_rules, rule_of, targets};
 use crate::alarm::Rule;
-use crate::config::{self, Config};
+use crate::config::{self, Config, ConfigFiles};
 
 /// Most combinations: a longer table is not readable.
 pub const MAX_COMBINATIONS: usize = 1000;
@@ -110,7 +110,7 @@ pub struct VariantGrid {
 /// When the configuration is faulty, a key names nothing, there are too many combinations, or none of them is valid.
 pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>> {
     let plain = config::load(path).map_err(|faults| faults.0)?;
-    let root = read(path).map_err(|fault| vec![fault])?;
+    let root = read(path)?;
     let mut grid = VariantGrid {
         keys: choices.iter().map(|choice| choice.key.clone()).collect(),
         variants: Vec::new(),
@@ -166,7 +166,7 @@ fn variant(
     }
     let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
-    let config = config::load_with(path, &read).map_err(|faults| {
+    let config = config::load_with(&ConfigFiles::alone(path), &read).map_err(|faults| {
         // The line numbers refer to a generated text.
         let file = format!("{}:", path.display());
         let without_line = |fault: &String| {
@@ -178,9 +178,10 @@ fn variant(
     Ok((config, replay_key(&root)))
 }
 
-fn read(path: &Path) -> Result<Table, String> {
-    let text = std::fs::read_to_string(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
-    text.parse::<Table>().map_err(|error| format!("{}: {}", path.display(), error.message()))
+/// The tables of the configuration and its drop-ins.
+fn read(path: &Path) -> Result<Table, Vec<String>> {
+    let text = config::merged(path).map_err(|faults| faults.0)?;
+    text.parse::<Table>().map_err(|error| vec![format!("{}: {}", path.display(), error.message())])
 }
 
 /// Returns everything in a configuration that estimates and the values of rules can depend on.

@@ -9,7 +9,7 @@ use std::path::Path;
 use packwatch::alarm::{Change, Severity};
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CellModel;
-use packwatch::config;
+use packwatch::config::{self, ConfigFiles};
 use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
@@ -186,7 +186,8 @@ pub(crate) fn configuration(set: &SensorSet) -> MonitorConfig {
         .fold(include_str!("study.toml").to_owned(), |text, (name, number)| text.replace(name, &format!("{number:?}")));
     let path = folder.join("study.toml");
     let read = |asked: &Path| if asked == path { Ok(text.clone().into_bytes()) } else { std::fs::read(asked) };
-    let config = config::load_with(&path, &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")));
+    let config =
+        config::load_with(&ConfigFiles::alone(&path), &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")));
     config.monitor
 }
 

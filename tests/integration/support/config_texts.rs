@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use packwatch::config::{self, Config};
+use packwatch::config::{self, Config, ConfigFiles};
 
 /// The configuration; a faulty one ends the test with all its faults.
 pub(crate) fn load(pack: &str, dbc: &str) -> Config {
@@ -12,5 +12,6 @@ pub(crate) fn load(pack: &str, dbc: &str) -> Config {
         Some("pack.dbc") => Ok(dbc.as_bytes().to_vec()),
         _ => std::fs::read(shipped.join(path)),
     };
-    config::load_with(Path::new("pack.toml"), &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
+    let files = ConfigFiles::alone(Path::new("pack.toml"));
+    config::load_with(&files, &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
 }

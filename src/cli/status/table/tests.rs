@@ -32,6 +32,14 @@ cell  voltage    temp.           SOC          capacity   resistance  trusted
 }
 
 #[test]
+fn a_stated_vehicle_is_the_second_line() {
+    let mut document = sample(1);
+    document.vehicle.name = Some("Bus 12".to_owned());
+    document.vehicle.pack = Some("rear".to_owned());
+    assert_eq!(table(&document, false).lines().nth(1), Some("vehicle    Bus 12, pack rear"));
+}
+
+#[test]
 fn a_failing_store_and_late_estimates_are_shown() {
     let mut document = sample(1);
     let store = document.store.as_mut().unwrap();

@@ -78,7 +78,8 @@ fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Re
     let is_lost = document.store.as_ref().is_some_and(|store| store.works == Some(false));
     let style = if is_lost { theme.colour(Color::Red).add_modifier(Modifier::BOLD) } else { Style::new() };
     let stored = Span::styled(format!(" store {} ", store(document)), style);
-    let block = Block::bordered().title(" pack ").title_bottom(stored);
+    let title = if document.vehicle.is_stated() { format!(" {} ", document.vehicle) } else { " pack ".to_owned() };
+    let block = Block::bordered().title(title).title_bottom(stored);
     let inner = block.inner(area);
     frame.render_widget(block, area);
     let band = match (pack.soc_low, pack.soc_high) {

@@ -297,7 +297,8 @@ fn a_byte_order_mark_is_read_over_and_utf_16_is_named() {
             Some("cell.toml") => Ok(CELL.as_bytes().to_vec()),
             _ => Ok(dbc.clone()),
         };
-        read_all(Path::new("pack.toml"), &read).map(|_| ()).map_err(|faults| faults.0)
+        let files = ConfigFiles { main: "pack.toml".into(), drop_ins: vec![] };
+        read_all(&files, &read).map(|_| ()).map_err(|faults| faults.0)
     };
     let marked = |bytes: &[u8]| [b"\xEF\xBB\xBF", bytes].concat();
     assert_eq!(read_bytes(marked(DBC.as_bytes())), Ok(()));

@@ -29,6 +29,19 @@ fn values_have_units_and_cells_count_from_1() {
 }
 
 #[test]
+fn the_vehicle_is_one_metric_and_no_label_of_the_others() {
+    let mut document = sample(2);
+    let without = openmetrics(Some(document.clone()));
+    document.vehicle.name = Some("Bus \"12\"".to_owned());
+    document.vehicle.pack = Some("front".to_owned());
+    let text = openmetrics(Some(document));
+    let wanted = r#"packwatch_vehicle_info{name="Bus \"12\"",pack="front"} 1"#;
+    assert_eq!(samples(&text, "packwatch_vehicle_info"), [wanted]);
+    let others: Vec<&str> = text.lines().filter(|line| !line.contains("packwatch_vehicle")).collect();
+    assert_eq!(others, without.lines().collect::<Vec<_>>());
+}
+
+#[test]
 fn what_is_not_known_is_left_out() {
     let mut document = sample(2);
     document.pack.soc = None;

@@ -3,6 +3,7 @@
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
@@ -28,7 +29,12 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         wall_time: time,
         started: time.plus_secs(-11_520.0),
         uptime_s: 11_520.0,
-        config: Some(ConfigFile { path: "pack.toml".to_owned(), sha256: "0123456789abcdef".repeat(4) }),
+        config: Some(ConfigFile {
+            path: "pack.toml".to_owned(),
+            drop_ins: Vec::new(),
+            sha256: "0123456789abcdef".repeat(4),
+        }),
+        vehicle: VehicleIdentity::default(),
         state: Validity::Valid,
         interfaces: vec![interface("can0", LinkState::Up), interface("can1", LinkState::Missing)],
         pack: pack(cells),

@@ -1,0 +1,261 @@
+//! A recording in segments: compressed parts of one text, of which the oldest are deleted beyond a limit.
+//!
+//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a whole zstd frame that begins with
+//! the header of the text and holds whole lines, so it can be read alone; read one after another they are the text, whose
+//! repeated headers the reader skips. A power cut tears the last segment at most: what was flushed before is readable. The
+//! segments of an earlier run become `FILE.1.000001.zst` and so on; both together stay within the limit.
+
+use std::collections::VecDeque;
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use zstd::stream::write::Encoder;
+
+use super::place::with_suffix;
+
+/// Compression level of zstd. The frames of a pack of 96 cells become 8.0 times smaller; with level 3, which takes 2 MB more
+/// memory, 7.2 times.
+const LEVEL: i32 = 1;
+/// Digits of a segment's number, at least.
+const DIGITS: usize = 6;
+/// Least and greatest size of a segment, bytes: below, headers would fill it; above, deleting one loses days.
+pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
+/// Size of a segment where none is set, bytes: six hours of a pack of 96 cells.
+pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;
+
+/// Sizes of a recording in segments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SegmentLimits {
+    /// Size of all segments together, bytes.
+    pub total_bytes: u64,
+    /// Size at which a segment is complete, bytes.
+    pub segment_bytes: u64,
+}
+
+impl SegmentLimits {
+    /// Limits that leave room for two segments at least, the one being written and the one before it.
+    ///
+    /// # Errors
+    /// What is allowed.
+    pub fn new(total_bytes: u64, segment_bytes: u64) -> Result<Self, String> {
+        if !SEGMENT_BYTES.contains(&segment_bytes) {
+            let (least, greatest) = (SEGMENT_BYTES.start() >> 10, SEGMENT_BYTES.end() >> 30);
+            return Err(format!("a segment of {segment_bytes} bytes, must be {least} KiB to {greatest} GiB"));
+        }
+        if total_bytes / 2 < segment_bytes {
+            return Err(format!(
+                "a limit of {total_bytes} bytes, must be at least two segments of {segment_bytes} bytes"
+            ));
+        }
+        Ok(Self { total_bytes, segment_bytes })
+    }
+}
+
+/// A segment on the disk.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Segment {
+    path: PathBuf,
+    number: u64,
+}
+
+/// The name of segment `number` of `base`.
+fn path_of(base: &Path, number: u64) -> PathBuf {
+    with_suffix(base, &format!(".{number:0DIGITS$}.zst"))
+}
+
+/// Base and number of a path that is named like a segment.
+fn parse(path: &Path) -> Option<(PathBuf, u64)> {
+    let text = path.to_str()?.strip_suffix(".zst")?;
+    let (base, digits) = text.rsplit_once('.')?;
+    let is_number = digits.len() >= DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
+    Some((PathBuf::from(base), digits.parse().ok().filter(|_| is_number)?))
+}
+
+/// The segments of `base`, by number.
+fn find(base: &Path) -> io::Result<Vec<Segment>> {
+    let folder = base.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut segments = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let name = entry?.file_name();
+        let path = base.with_file_name(name);
+        segments.extend(parse(&path).filter(|(of, _)| of == base).map(|(_, number)| Segment { path, number }));
+    }
+    segments.sort_by_key(|segment| segment.number);
+    Ok(segments)
+}
+
+/// The files that are one log, and how many segments before them are deleted.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct LogParts {
+    pub paths: Vec<PathBuf>,
+    pub deleted: u64,
+}
+
+/// Takes the next log from a list of files: a file, all segments of a base name that is no file, or the segments named one
+/// after another.
+///
+/// # Errors
+/// When a segment between two others is missing.
+pub(super) fn next_log(files: &mut VecDeque<PathBuf>) -> io::Result<Option<LogParts>> {
+    let Some(first) = files.pop_front() else { return Ok(None) };
+    let mut segments: Vec<Segment> = Vec::new();
+    if let Some((base, number)) = parse(&first) {
+        segments.push(Segment { path: first.clone(), number });
+        let of_base = |path: &PathBuf| parse(path).filter(|(of, _)| *of == base);
+        while let Some((_, number)) = files.front().and_then(of_base) {
+            segments.extend(files.pop_front().map(|path| Segment { path, number }));
+        }
+    } else if !first.exists() && first != Path::new("-") {
+        segments = find(&first).unwrap_or_default();
+    }
+    if let Some(pair) = segments.windows(2).find(|pair| pair[0].number + 1 != pair[1].number) {
+        let (before, after) = (pair[0].number, pair[1].path.display());
+        return Err(io::Error::other(format!("{after} follows segment {before}, must be segment {}", before + 1)));
+    }
+    let deleted = segments.first().map_or(0, |segment| segment.number.saturating_sub(1));
+    let paths = if segments.is_empty() { vec![first] } else { segments.into_iter().map(|it| it.path).collect() };
+    Ok(Some(LogParts { paths, deleted }))
+}
+
+/// Files read as one, opened one at a time.
+pub(super) struct JoinedFiles {
+    open: File,
+    rest: VecDeque<PathBuf>,
+}
+
+impl JoinedFiles {
+    /// Opens the first.
+    ///
+    /// # Errors
+    /// When it cannot be opened, or there is none.
+    pub(super) fn open(paths: &[PathBuf]) -> io::Result<Self> {
+        let mut rest: VecDeque<PathBuf> = paths.iter().cloned().collect();
+        let first = rest.pop_front().ok_or(io::ErrorKind::NotFound)?;
+        Ok(Self { open: File::open(first)?, rest })
+    }
+}
+
+impl Read for JoinedFiles {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        loop {
+            let count = self.open.read(buffer)?;
+            if count > 0 || buffer.is_empty() {
+                return Ok(count);
+            }
+            let Some(next) = self.rest.pop_front() else { return Ok(0) };
+            self.open = File::open(next)?;
+        }
+    }
+}
+
+/// A file that counts what was written.
+#[derive(Debug)]
+struct CountedFile {
+    file: File,
+    bytes: u64,
+}
+
+impl Write for CountedFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let count = self.file.write(bytes)?;
+        self.bytes += count as u64;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// Writes segments.
+pub(super) struct SegmentWriter {
+    base: PathBuf,
+    /// First line of every segment.
+    header: &'static str,
+    limits: SegmentLimits,
+    number: u64,
+    open: Encoder<'static, CountedFile>,
+    /// Complete segments with their sizes, oldest first.
+    complete: VecDeque<(PathBuf, u64)>,
+}
+
+impl SegmentWriter {
+    /// Renames the segments of an earlier run and begins the first. The text itself brings the first `header`.
+    ///
+    /// # Errors
+    /// When a file cannot be renamed, deleted or created.
+    pub(super) fn create(base: &Path, header: &'static str, limits: SegmentLimits) -> io::Result<Self> {
+        let complete = keep_earlier(base)?;
+        let open = begin(&path_of(base, 1))?;
+        Ok(Self { base: base.to_owned(), header, limits, number: 1, open, complete })
+    }
+
+    /// Appends a piece of the text and hands it to the operating system. A full segment ends with the last whole line.
+    pub(super) fn write(&mut self, piece: &[u8]) -> io::Result<()> {
+        let is_full = self.open.get_ref().bytes >= self.limits.segment_bytes;
+        let end = memchr::memrchr(b'\n', piece).filter(|_| is_full).map(|last| last + 1);
+        match end {
+            None => self.open.write_all(piece)?,
+            Some(end) => {
+                self.open.write_all(&piece[..end])?;
+                self.next()?;
+                self.open.write_all(&piece[end..])?;
+            }
+        }
+        self.open.flush()?;
+        self.delete_oldest()
+    }
+
+    /// Completes the last segment.
+    pub(super) fn finish(mut self) -> io::Result<()> {
+        self.open.do_finish()?;
+        self.open.get_ref().file.sync_all()
+    }
+
+    fn next(&mut self) -> io::Result<()> {
+        self.open.do_finish()?;
+        let CountedFile { file, bytes } = self.open.get_ref();
+        file.sync_all()?;
+        self.complete.push_back((path_of(&self.base, self.number), *bytes));
+        self.number += 1;
+        self.open = begin(&path_of(&self.base, self.number))?;
+        writeln!(self.open, "{}", self.header)
+    }
+
+    fn delete_oldest(&mut self) -> io::Result<()> {
+        let total = |complete: &VecDeque<(PathBuf, u64)>| complete.iter().map(|(_, bytes)| bytes).sum::<u64>();
+        while total(&self.complete) + self.open.get_ref().bytes > self.limits.total_bytes {
+            let Some((path, _)) = self.complete.pop_front() else { return Ok(()) };
+            remove(&path)?;
+        }
+        Ok(())
+    }
+}
+
+fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
+    Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, LEVEL)
+}
+
+/// Renames the segments of the last run to those of `base.1`, whose own are deleted. Returns them with their sizes.
+fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
+    let earlier = with_suffix(base, ".1");
+    for segment in find(&earlier)? {
+        remove(&segment.path)?;
+    }
+    let mut kept = VecDeque::new();
+    for Segment { path, number } in find(base)? {
+        let to = path_of(&earlier, number);
+        fs::rename(&path, &to)?;
+        kept.push_back((to.clone(), fs::metadata(&to)?.len()));
+    }
+    Ok(kept)
+}
+
+/// Deletes a file; one that is gone already is no error.
+fn remove(path: &Path) -> io::Result<()> {
+    fs::remove_file(path).or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
+}
+
+#[cfg(test)]
+mod tests;
