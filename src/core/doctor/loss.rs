@@ -1,8 +1,9 @@
 //! Frames missing from a cyclic signal.
 //!
 //! In: the times between two readings, s. Out: the share of readings that are missing. The cycle is the median of the first
-//! gaps; afterwards a gap of n cycles is n - 1 missing readings. A sender without a cycle differs from one that loses frames
-//! by its gaps, which are not multiples.
+//! gaps; afterwards a gap of n cycles is n - 1 missing readings, as far as fewer readings came than the time has cycles: late
+//! ones that are caught up with are not missing. A sender without a cycle differs from one that loses frames by its gaps,
+//! which are not multiples.
 
 use super::series::median;
 
@@ -25,6 +26,8 @@ pub(crate) struct LossCounter {
     gaps: u32,
     regular: u32,
     missing: u32,
+    /// Sum of the gaps, cycles.
+    elapsed: f64,
 }
 
 impl LossCounter {
@@ -41,6 +44,7 @@ impl LossCounter {
             return;
         }
         self.gaps = self.gaps.saturating_add(1);
+        self.elapsed += cycles;
         let whole = cycles.round();
         if whole >= 1.0 && (cycles - whole).abs() <= TOLERANCE {
             self.regular = self.regular.saturating_add(1);
@@ -51,7 +55,8 @@ impl LossCounter {
 
     /// Share of the readings that are missing, and the cycle, s; `None` = too few gaps, or no cycle.
     pub(crate) fn share(&self) -> Option<(f64, f64)> {
-        let (gaps, missing) = (f64::from(self.gaps), f64::from(self.missing));
+        let gaps = f64::from(self.gaps);
+        let missing = f64::from(self.missing).min((self.elapsed - gaps).max(0.0));
         let is_cyclic = self.gaps >= FEWEST && f64::from(self.regular) >= REGULAR * gaps;
         self.cycle_s.filter(|_| is_cyclic).map(|cycle_s| (missing / (gaps + missing), cycle_s))
     }
@@ -76,7 +81,14 @@ mod tests {
     #[test]
     fn jitter_pauses_and_senders_without_a_cycle_are_no_loss() {
         let jitter = share((0..700).map(|n| 0.01 + 0.002 * f64::from(n % 3 - 1)));
-        assert_eq!(jitter, Some(0.0));
+        assert!(jitter.is_some_and(|share| share < 0.01), "{jitter:?}");
+        // A busy computer sends two frames late, and catches up.
+        let late = share((0..700).map(|n| match n % 15 {
+            7 => 0.03,
+            8 | 9 => 0.0001,
+            _ => 0.01,
+        }));
+        assert!(late.is_none_or(|share| share < 0.01), "{late:?}");
         assert_eq!(share((0..700).map(|n| if n % 100 == 50 { 3.0 } else { 0.01 })), Some(0.0));
         assert_eq!(share((0..700).map(|n| 0.01 * (1.0 + 0.13 * f64::from(n % 10)))), None);
         assert_eq!(share((0..20).map(|_| 0.01)), None);
