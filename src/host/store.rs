@@ -203,6 +203,7 @@ impl Store {
             write_queue: Arc::clone(&write_queue),
             vehicle: vehicle.clone(),
             is_vehicle_noted: false,
+            keep_years: config.keep_years,
             folder,
             database,
             progress: sender,

@@ -178,5 +178,7 @@ section! {
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
         /// Half-cycles kept, one per cell each. Beyond this number every second transition of the older half is deleted, as often as needed. The default holds a year of ten half-cycles a day of 50 cells, in some 15 MB. Capacities, alarms and resets are kept for ever.
         max_half_cycles: u32, "", Between(1000.0, 1e8), Default("200000");
+        /// Half-cycles older than this are deleted, a few at each checkpoint. Capacities, alarms and resets are kept for ever. The age is that on the computer's clock, and nothing is deleted while no hardware clock or time server confirms that clock. Without it: only `max_half_cycles` bounds the history.
+        keep_years: Option<f64>, "years", Between(0.1, 100.0), Optional;
     }
 }

@@ -89,6 +89,8 @@ pub(super) struct Database {
     meta: Meta,
     delta_encoder: DeltaEncoder,
     max_half_cycles: i64,
+    /// Half-cycles before this wall clock are deleted, ns since 1970; `None` = none.
+    horizon_ns: Option<i64>,
 }
 
 /// Rows in the history.
@@ -136,13 +138,18 @@ impl Database {
         let meta = open_pack(&connection, now)?;
         // A damaged record is reported by [`Self::state`].
         let delta_encoder = read_base(&connection, STATE)?;
-        Ok(Self { connection, meta, delta_encoder, max_half_cycles: i64::from(max_half_cycles) })
+        Ok(Self { connection, meta, delta_encoder, max_half_cycles: i64::from(max_half_cycles), horizon_ns: None })
     }
 
     /// Rows so far.
     pub(super) fn counts(&self) -> Counts {
         let Meta { head, half_cycles, pack, .. } = self.meta;
         Counts { chained: head.count, half_cycles, packs: pack }
+    }
+
+    /// Sets the wall clock before which checkpoints delete half-cycles, ns since 1970; `None` = they delete none.
+    pub(super) fn set_horizon_ns(&mut self, horizon_ns: Option<i64>) {
+        self.horizon_ns = horizon_ns;
     }
 
     /// Notes which vehicle the history is of, if it is not noted yet.
@@ -162,6 +169,9 @@ impl Database {
         }
         if batches.is_empty() {
             retention::thin(&transaction, &mut meta, self.max_half_cycles)?;
+            if let Some(horizon_ns) = self.horizon_ns {
+                retention::expire(&transaction, &mut meta, horizon_ns)?;
+            }
         }
         let packed = match state {
             None => None,

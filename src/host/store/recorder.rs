@@ -21,6 +21,7 @@ pub struct Recorder {
     folder: Folder,
     history_filter: HistoryFilter,
     checkpoint_s: f64,
+    keep_years: Option<f64>,
     checkpointed: Option<Timestamp>,
 }
 
@@ -41,7 +42,8 @@ impl Recorder {
             .map_err(|error| format!("{shown}: {error}"))?;
         database.set_vehicle(vehicle).map_err(|error| format!("{shown}: {error}"))?;
         let (history_filter, checkpoint_s) = (HistoryFilter::default(), config.checkpoint_s);
-        Ok(Self { database, folder, history_filter, checkpoint_s, checkpointed: None })
+        let keep_years = config.keep_years;
+        Ok(Self { database, folder, history_filter, checkpoint_s, keep_years, checkpointed: None })
     }
 
     /// Writes the rows of one input's events, and the checkpoint when it is due.
@@ -64,6 +66,7 @@ impl Recorder {
 
     fn write(&mut self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp, exact: bool) -> Result<(), String> {
         let stamp = Stamp::replayed(now);
+        self.database.set_horizon_ns(self.keep_years.and_then(|years| stamp.years_ago_ns(years)));
         let folder = self.folder.to_string();
         let document = StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot()) };
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp, rows });

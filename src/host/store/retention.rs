@@ -1,5 +1,5 @@
 //! Bounds the history: beyond the configured number of half-cycles, every second transition of the older half is deleted,
-//! with its moment where no other row belongs to it.
+//! and beyond the configured age every transition, with its moment where no other row belongs to it.
 //!
 //! Deletes a little at each checkpoint, so that no commit is long. Capacities, alarms and resets are never thinned.
 
@@ -7,8 +7,9 @@ use rusqlite::{Connection, OptionalExtension, params};
 
 use super::meta::Meta;
 use super::rows::HistoryTable;
+use super::stamp::{BootId, SANE_WALL_NS};
 
-/// Transitions deleted at one checkpoint: far more than one minute adds.
+/// Transitions deleted at one checkpoint for their number, and as many for their age: far more than one minute adds.
 const MAX_STEPS: usize = 4;
 
 /// Deletes transitions beyond the limit, at most [`MAX_STEPS`].
@@ -29,18 +30,42 @@ pub(super) fn thin(connection: &Connection, meta: &mut Meta, max_half_cycles: i6
         };
         match dropped.filter(|&dropped| dropped <= middle) {
             Some(dropped) => {
-                let rows = connection.execute("DELETE FROM half_cycle WHERE moment = ?1", params![dropped])?;
-                let rows = i64::try_from(rows).unwrap_or(i64::MAX);
-                meta.half_cycles -= rows;
-                meta.thinned += rows;
+                delete_transition(connection, meta, dropped)?;
                 meta.thinned_to = dropped;
-                thin_moment(connection, dropped)?;
             }
             // The next round begins at the oldest.
             None => meta.thinned_to = 0,
         }
     }
     Ok(())
+}
+
+/// Deletes transitions before `horizon_ns` of the wall clock, at most [`MAX_STEPS`]. One that was written while the clock
+/// was not set is at least as old as those after it.
+pub(super) fn expire(connection: &Connection, meta: &mut Meta, horizon_ns: i64) -> rusqlite::Result<()> {
+    for _ in 0..MAX_STEPS {
+        let oldest_known: Option<i64> = connection
+            .prepare_cached(
+                "SELECT m.wall_ns FROM half_cycle h JOIN moment m ON m.id = h.moment WHERE m.wall_ns >= ?1 OR m.boot = ?2 \
+                 ORDER BY h.moment LIMIT 1",
+            )?
+            .query_row(params![SANE_WALL_NS, BootId::REPLAY.0], |row| row.get(0))
+            .optional()?;
+        if oldest_known.is_none_or(|wall_ns| wall_ns >= horizon_ns) {
+            return Ok(());
+        }
+        let Some(oldest) = next_transition(connection, 0)? else { return Ok(()) };
+        delete_transition(connection, meta, oldest)?;
+    }
+    Ok(())
+}
+
+fn delete_transition(connection: &Connection, meta: &mut Meta, moment: i64) -> rusqlite::Result<()> {
+    let rows = connection.execute("DELETE FROM half_cycle WHERE moment = ?1", params![moment])?;
+    let rows = i64::try_from(rows).unwrap_or(i64::MAX);
+    meta.half_cycles -= rows;
+    meta.thinned += rows;
+    thin_moment(connection, moment)
 }
 
 fn next_transition(connection: &Connection, after: i64) -> rusqlite::Result<Option<i64>> {

@@ -18,7 +18,10 @@ use crate::monitor::Downtime;
 use crate::quantity::Timestamp;
 
 /// A wall clock before this (2024-01-01) has not been set.
-const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
+pub(super) const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
+
+/// Nanoseconds in a year of 365.25 days.
+const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 
 /// The kernel's list of hardware clocks; readable in a sandbox that must not call `adjtimex`.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
@@ -135,6 +138,13 @@ impl Stamp {
     /// Bus time of a record: the only clock there is.
     pub(super) fn replayed(time: Timestamp) -> Self {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
+    }
+
+    /// The wall clock this many years ago, ns since 1970; `None` = the clock is not confirmed.
+    pub(super) fn years_ago_ns(&self, years: f64) -> Option<i64> {
+        let is_reliable = self.boot == BootId::REPLAY || WallClock::assess(self) == WallClock::Reliable;
+        // Saturates.
+        is_reliable.then(|| self.wall_ns.saturating_sub((years * NS_PER_YEAR) as i64))
     }
 
     /// Whether both belong to one boot that is known.

@@ -140,6 +140,8 @@ pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
     /// Which vehicle the history is of.
     pub(super) vehicle: VehicleIdentity,
+    /// Half-cycles older than this are deleted, years.
+    pub(super) keep_years: Option<f64>,
     /// The open database has the vehicle.
     pub(super) is_vehicle_noted: bool,
     pub(super) folder: Folder,
@@ -243,6 +245,9 @@ impl Writer {
         if !self.is_vehicle_noted {
             database.set_vehicle(&self.vehicle).map_err(|error| error.to_string())?;
             self.is_vehicle_noted = true;
+        }
+        if batches.is_empty() {
+            database.set_horizon_ns(self.keep_years.and_then(|years| document.stamp.years_ago_ns(years)));
         }
         // Opening it may have found a state to set aside.
         let record = StateRecord { sets_aside: self.sets_aside, ..record };

@@ -132,6 +132,47 @@ fn half_cycles_are_thinned_and_nothing_else() {
 }
 
 #[test]
+fn half_cycles_beyond_the_horizon_are_deleted_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    for day in 0..40_u32 {
+        let learned = [half_cycle(0), half_cycle(1), capacity(0, Some(2.0), 1.9)];
+        database.commit(&[batch(86_400.0 * f64::from(day), &learned)], None).unwrap();
+    }
+    database.commit(&[], None).unwrap();
+    assert_eq!(database.counts().half_cycles, 80, "without a horizon all are kept");
+    database.set_horizon_ns(Some(10 * 86_400_000_000_000));
+    database.commit(&[], None).unwrap();
+    assert_eq!(database.counts().half_cycles, 72, "a few at each checkpoint");
+    (0..10).for_each(|_| database.commit(&[], None).unwrap());
+    let counts = database.counts();
+    assert_eq!((counts.half_cycles, counts.chained), (60, 40));
+    let sql = "SELECT min(m.wall_ns) FROM half_cycle h JOIN moment m ON m.id = h.moment";
+    let oldest: i64 = database.connection().query_row(sql, [], |row| row.get(0)).unwrap();
+    assert_eq!(oldest, 10 * 86_400_000_000_000);
+    assert_eq!(verify::verify(database.connection()).unwrap().broken, None);
+}
+
+#[test]
+fn a_half_cycle_of_unknown_age_is_deleted_with_those_after_it() {
+    const WALL_S: f64 = 1.8e9;
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    let write = |database: &mut Database, wall_s: f64| {
+        let stamp = Stamp { boot: BootId([7; 16]), ..stamp(wall_s) };
+        database.commit(&[RowBatch { stamp, rows: vec![HistoryRow::Event(half_cycle(0))] }], None).unwrap();
+    };
+    // The clock shows 1970 until it is set.
+    [0.0, 60.0, WALL_S].into_iter().for_each(|wall_s| write(&mut database, wall_s));
+    database.set_horizon_ns(Some(WALL_S as i64 * 1_000_000_000));
+    database.commit(&[], None).unwrap();
+    assert_eq!(database.counts().half_cycles, 3, "of unknown age, perhaps new");
+    database.set_horizon_ns(Some((WALL_S as i64 + 1) * 1_000_000_000));
+    database.commit(&[], None).unwrap();
+    assert_eq!(database.counts().half_cycles, 0, "older than one that is too old");
+}
+
+#[test]
 fn another_pack_closes_one_history_and_opens_the_next() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
