@@ -49,11 +49,14 @@
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs` |
 //! | a configuration key | its table in `host/config/keys/` (`input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
+//! | how drop-ins are found and merged | `host/config/source.rs`, `host/config/document.rs` |
+//! | what identifies the vehicle | `host/config/vehicle.rs` |
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
+//! | segments of a recording | `host/io/segments.rs` |
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
 //! | what an OBDb signal set becomes | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |

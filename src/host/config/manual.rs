@@ -25,6 +25,8 @@ pub fn manual() -> String {
     sections(&mut page, cell_model::SECTIONS);
     page.push_str(
         ".SH FILES\n.TP\n.I /etc/packwatch/packwatch.toml\nWhat the service reads.\n\
+         .TP\n.I /etc/packwatch/packwatch.toml.d/*.toml\nDrop\\-ins, merged into it in the order of their names.\n\
+         .TP\n.I /etc/packwatch/NAME.toml\nWhat the instance packwatch@NAME reads, with NAME.toml.d.\n\
          .SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch\\-check (1),\n.BR packwatch\\-run (1)\n",
     );
     page
