@@ -306,6 +306,8 @@ impl Stages {
         let is_judged = silence == Silence::None;
         if is_judged {
             self.sampling.poll(now, out);
+        }
+        if silence != Silence::Lasts {
             self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
         }
         if !self.sampling.sampler.voltages_fresh(now) {
