@@ -177,6 +177,19 @@ impl AgedOcv {
         }
     }
 
+    /// Adds to each mix of losses a mode of the curve's spread between cells, V per standard deviation at the SOC breakpoints: it
+    /// is there at every capacity. Where mix and mode have the same direction they add, so that neither hides the other.
+    pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
+        self.is_shift = false;
+        for (table, mode_v) in self.mixes_v.iter_mut().zip(modes_v) {
+            for row in table {
+                let product: f64 = row.iter().zip(mode_v).map(|(mix_v, mode_v)| mix_v * mode_v).sum();
+                let sign = if product < 0.0 { -1.0 } else { 1.0 };
+                row.iter_mut().zip(mode_v).for_each(|(mix_v, mode_v)| *mix_v = sign * *mix_v + mode_v);
+            }
+        }
+    }
+
     /// Offset at a capacity over the interval from SOC breakpoint `s`.
     pub fn line(&self, soc: &[f64], s: usize, capacity_ah: f64) -> OffsetLine {
         let line = |rows: &[Vec<f64>], change: bool| {

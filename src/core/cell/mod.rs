@@ -5,6 +5,7 @@
 //! beyond the gate change no estimate.
 
 pub mod aged_ocv;
+pub mod chemistry;
 pub mod circuit;
 pub mod config;
 pub mod electrodes;
@@ -14,6 +15,7 @@ pub mod model;
 pub mod model_check;
 
 pub use aged_ocv::AgedOcv;
+pub use chemistry::{Chemistry, Label};
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
@@ -22,6 +24,6 @@ pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use loss_modes::LossModes;
 pub use model::{
-    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
+    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal, arrhenius,
 };
 pub use model_check::{ModelCheck, ModelEvidence};

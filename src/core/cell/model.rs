@@ -92,6 +92,22 @@ pub struct CellModel {
     pub voltage_error_v: Option<Table>,
     /// Thermal parameters; `None` = no temperature fallback.
     pub thermal: Option<Thermal>,
+    /// How far a cell may be from the model; `None` = as cells of one type are.
+    pub spread: Option<ModelSpread>,
+}
+
+/// Standard deviations of a cell from a model that is not of its own type. The modes of its open-circuit curve are with those of
+/// ageing ([`AgedOcv::add_spread`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ModelSpread {
+    /// Constant error of the open-circuit curve beside its modes, V.
+    pub curve_v: f64,
+    /// ln(resistance relative to the model).
+    pub log_resistance: f64,
+    /// Resistance of the slowest branch beside the others, fraction.
+    pub slow_branch: f64,
+    /// Capacity, fraction.
+    pub capacity: f64,
 }
 
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.

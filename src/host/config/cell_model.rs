@@ -238,6 +238,7 @@ fn model(
         branches: branches.iter().map(BranchTables::config).collect(),
         voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
         thermal: thermal.map(|keys| keys.config()),
+        spread: None,
     }
 }
 

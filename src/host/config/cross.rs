@@ -2,6 +2,7 @@
 
 use super::alarm::{self, RatedCell};
 use super::document::{Faults, TablePlace};
+use super::label;
 use super::keys::{CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput};
 use super::tables::RawTables;
 use crate::cell::{CapacityState, CellModel};
@@ -21,6 +22,7 @@ pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Fau
     voltages(raw, faults);
     if let Some(pack) = &raw.pack {
         temperatures(pack, raw, faults);
+        label::check(pack, faults);
     }
     limits(raw, faults);
     health(raw, model, faults);

@@ -18,7 +18,7 @@ use super::{StoreConfig, VehicleIdentity};
 
 use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
-use crate::cell::{CapacityState, Discretisation};
+use crate::cell::{CapacityState, Chemistry, Discretisation};
 use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
 
@@ -77,6 +77,14 @@ choice!(E2eKey {
     "5" => Self(Some(Profile::P05)),
 });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
+choice!(Chemistry {
+    "nmc811-graphite" => Self::Nmc811Graphite,
+    "nmc-graphite" => Self::NmcGraphite,
+    "nca-graphite" => Self::NcaGraphite,
+    "lco-graphite" => Self::LcoGraphite,
+    "lmo-graphite" => Self::LmoGraphite,
+    "lfp-graphite" => Self::LfpGraphite,
+});
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
 choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
 choice!(Profile { "1A" => Self::P01A, "1C" => Self::P01C, "5" => Self::P05 });
@@ -116,8 +124,14 @@ section! {
         cells: u16, "", Between(1.0, MAX_CELLS as f64), Required;
         /// Parallel strings; each is assumed to carry an equal share of the pack current.
         strings: u16, "", Between(1.0, 1024.0), Default("1");
-        /// Cell model file, relative to this file.
-        cell_model: String, "", NotEmpty, Required;
+        /// Cell model file, relative to this file. Without it: `chemistry` and `rated_capacity_ah` give a model.
+        cell_model: Option<String>, "", NotEmpty, Optional;
+        /// Chemistry of a cell without a model file: estimates begin with what all such cells have in common, and their intervals are as wide as these cells differ. LMO is that of early electric cars, blended with a layered oxide; "nmc-graphite" when the nickel content is not known. Without it: `cell_model` is needed.
+        chemistry: Option<Chemistry>, "", Any, Optional;
+        /// Lowest voltage of a cell without a model file: empty. Without it: usual of the chemistry (NMC, NCA and LFP 2.5 V, else 3.0 V).
+        voltage_min_v: Option<f64>, "V", Above(0.0, 100.0), Optional;
+        /// Highest voltage of a cell without a model file: full. Without it: usual of the chemistry (LFP 3.65 V, else 4.2 V).
+        voltage_max_v: Option<f64>, "V", Above(0.0, 100.0), Optional;
         /// Capacity on the label of one cell, which SOH is relative to. Without it: the cell model's.
         rated_capacity_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
         /// Capacity of a cell to start from, before any is learned. Without it: the cell model's `capacity_ah`.

@@ -48,6 +48,7 @@ mod document;
 mod input_tables;
 mod j1939;
 mod keys;
+mod label;
 mod manual;
 mod merged;
 mod output;
@@ -196,7 +197,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let sources = Sources::read(files, read, faults)?;
     let document = Document::parse(&sources, faults);
     let raw = RawTables::read(&document, faults);
-    let model = read_model(path, &document, read, faults);
+    let model = read_model(path, &document, &raw, read, faults);
     cross::check(&raw, model.as_ref(), faults);
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
@@ -238,9 +239,18 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     Some((config, description))
 }
 
-/// The cell model that `pack.cell_model` names, also where another key of `[pack]` is faulty.
-fn read_model(path: &Path, document: &Document<'_>, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
-    cell_model::load_with(&beside(path, document.text("pack.cell_model")?), read, faults)
+/// The cell model that `pack.cell_model` names, also where another key of `[pack]` is faulty; without it, that of the label.
+fn read_model(
+    path: &Path,
+    document: &Document<'_>,
+    raw: &RawTables,
+    read: ReadFile<'_>,
+    faults: &mut Faults,
+) -> Option<CellModel> {
+    match document.text("pack.cell_model") {
+        Some(named) => cell_model::load_with(&beside(path, named), read, faults),
+        None => label::model(raw, faults),
+    }
 }
 
 /// `named`, relative to the folder of `path`.

@@ -41,7 +41,7 @@ impl PartialConfig {
         let document = Document::parse(&sources, again);
         let raw = RawTables::read(&document, again);
         let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
-        let model = read_model(path, &document, &read_file, again);
+        let model = read_model(path, &document, &raw, &read_file, again);
         Ok(Self { config, faults, raw, databases, model })
     }
 

@@ -22,6 +22,7 @@ pub(crate) fn small_model() -> CellModel {
         }],
         voltage_error_v: None,
         thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
+        spread: None,
     }
 }
 

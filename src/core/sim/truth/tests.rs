@@ -21,6 +21,7 @@ pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
         branches: vec![Branch { r_ohm: flat(0.02 / k), c_farad: flat(2000.0 * k) }],
         voltage_error_v: None,
         thermal: Some(Thermal { heat_capacity_j_per_k: 45.0 * k, resistance_k_per_w: 8.0 / k }),
+        spread: None,
     }
 }
 

@@ -4,7 +4,7 @@
 use super::{DEVIATION, MethodKey, Pack, TEMPERATURE_C};
 use crate::cell::{
     CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
-    InitialState, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
+    InitialState, ModelSpread, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
@@ -38,8 +38,8 @@ section! {
         initial_soc_std: f64, "fraction", Above(0.0, 1.0), Default("0.3");
         /// Standard deviation of the first branch voltages.
         initial_branch_std_v: f64, "V", Between(0.0, 10.0), Default("0.05");
-        /// Standard deviation of the logarithm of the resistance relative to new, at the start.
-        initial_log_resistance_std: f64, "", Between(0.0, 5.0), Default("0.2");
+        /// Standard deviation of the logarithm of the resistance relative to new, at the start. Without it: 0.2, or what the cell model states for its cells.
+        initial_log_resistance_std: Option<f64>, "", Between(0.0, 5.0), Optional;
         /// Process noise of the SOC.
         soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("3e-5");
         /// Process noise of the SOC per charge moved: errors of the current reading.
@@ -60,9 +60,9 @@ section! {
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. Where the signals have coarser steps than this, their rounding is added: 5.8 mV for steps of 20 mV.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
-        /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out.
+        /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out. What a cell model states for its cells is added.
         voltage_offset_std_v: f64, "V", DEVIATION, Default("0.004");
-        /// Standard deviation of the slowest branch's resistance in a cell, relative to the model's: diffusion varies between cells and ages apart from the other resistances. In a model with several branches it is learned. Without it: 0.2, and 0.1 in a model with one branch.
+        /// Standard deviation of the slowest branch's resistance in a cell, relative to the model's: diffusion varies between cells and ages apart from the other resistances. In a model with several branches it is learned. Without it: what the cell model states for its cells, else 0.2, and 0.1 in a model with one branch.
         slow_branch_std: Option<f64>, "fraction", DEVIATION, Optional;
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second add no information beyond this. A `voltage_error_v` of the cell model replaces it.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
@@ -96,6 +96,12 @@ impl Estimator {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
 
+    /// Spread of the cells of one type.
+    fn usual_spread(model: &CellModel) -> ModelSpread {
+        let slow_branch = if model.branches.len() > 1 { 0.2 } else { 0.1 };
+        ModelSpread { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1 }
+    }
+
     /// The parameters these keys stand for; `voltage_step_v` is the resolution of the cells' voltages.
     pub(crate) fn config(
         &self,
@@ -106,6 +112,7 @@ impl Estimator {
     ) -> EstimatorConfig {
         let rounding_v = self.rounding_v(voltage_step_v);
         let initial_ah = pack.initial_capacity_ah.unwrap_or(model.capacity_ah);
+        let spread = model.spread.unwrap_or(Self::usual_spread(model));
         EstimatorConfig {
             points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
             discretisation: self.discretisation,
@@ -115,14 +122,14 @@ impl Estimator {
                 soc_std: self.initial_soc_std,
                 branch_std_v: self.initial_branch_std_v,
                 capacity_ah: initial_ah,
-                capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * initial_ah),
+                capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(spread.capacity * initial_ah),
                 curve: match self.capacity_state {
                     CapacityState::Joint => {
                         ScalarGaussian::from_std(model.capacity_ah, FIRST_LOSS_STD * model.capacity_ah)
                     }
                     CapacityState::Held => ScalarGaussian::from_std(initial_ah, 0.0),
                 },
-                log_resistance_std: self.initial_log_resistance_std,
+                log_resistance_std: self.initial_log_resistance_std.unwrap_or(spread.log_resistance),
             },
             process: ProcessNoise {
                 soc_per_sqrt_s: self.soc_noise_per_sqrt_s,
@@ -148,10 +155,10 @@ impl Estimator {
             sensor: match self.capacity_state {
                 CapacityState::Joint => SensorErrors {
                     // At rest all readings are rounded alike.
-                    voltage_offset_v: self.voltage_offset_std_v.hypot(rounding_v),
+                    voltage_offset_v: self.voltage_offset_std_v.hypot(rounding_v).hypot(spread.curve_v),
                     current_offset_a: capacity.current_offset_std_a,
                     current_gain: capacity.current_gain_std,
-                    slow_branch: self.slow_branch_std.unwrap_or(if model.branches.len() > 1 { 0.2 } else { 0.1 }),
+                    slow_branch: self.slow_branch_std.unwrap_or(spread.slow_branch),
                 },
                 CapacityState::Held => SensorErrors::NONE,
             },

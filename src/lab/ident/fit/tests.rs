@@ -76,6 +76,7 @@ fn truth() -> CellModel {
         aged_ocv: crate::cell::AgedOcv::default(),
         voltage_error_v: None,
         thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
+        spread: None,
     }
 }
 

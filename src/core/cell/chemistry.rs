@@ -1,0 +1,194 @@
+//! The cell nobody measured: a cell model from what is on the label, with the spread of cells of that chemistry.
+//!
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`] whose [`ModelSpread`] and curve modes say how
+//! far a cell may be from it. No measured cell is needed, and none of those that judge it has been used for its curve.
+//!
+//! * Open-circuit voltage: mean and covariance over cells of published half-cell potentials ([`curve`]).
+//! * Resistances: in proportion to 1 / capacity. Medians and deviations per chemistry-independent class of cell, found on five
+//!   fitted cells of 2.9 to 280 Ah ([`RESISTANCE`]); between temperatures by [`arrhenius`](super::arrhenius).
+
+pub mod curve;
+
+use super::aged_ocv::AgedOcv;
+use super::electrodes::{NegativeMaterial as Negative, PositiveMaterial as Positive};
+use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
+use curve::{CurvePrior, PositiveElectrode};
+
+/// Materials of both electrodes, by what is on the label or in a data sheet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Chemistry {
+    /// Nickel-rich NMC (811).
+    Nmc811Graphite,
+    /// NMC, its nickel content not known.
+    NmcGraphite,
+    /// NCA.
+    NcaGraphite,
+    /// LCO: consumer cells.
+    LcoGraphite,
+    /// LMO blended with a layered oxide: cars of the first generations.
+    LmoGraphite,
+    /// LFP.
+    LfpGraphite,
+}
+
+impl Chemistry {
+    /// Every chemistry, with its name in a configuration.
+    pub const ALL: [(Self, &'static str); 6] = [
+        (Self::Nmc811Graphite, "nmc811-graphite"),
+        (Self::NmcGraphite, "nmc-graphite"),
+        (Self::NcaGraphite, "nca-graphite"),
+        (Self::LcoGraphite, "lco-graphite"),
+        (Self::LmoGraphite, "lmo-graphite"),
+        (Self::LfpGraphite, "lfp-graphite"),
+    ];
+
+    /// Its name in a configuration.
+    pub fn name(self) -> &'static str {
+        Self::ALL.iter().find(|(chemistry, _)| *chemistry == self).map_or("", |found| found.1)
+    }
+
+    /// Usual cut-off voltages of such cells, lowest and highest, V.
+    pub fn usual_voltages_v(self) -> (f64, f64) {
+        match self {
+            Self::LfpGraphite => (2.5, 3.65),
+            Self::LcoGraphite | Self::LmoGraphite => (3.0, 4.2),
+            Self::Nmc811Graphite | Self::NmcGraphite | Self::NcaGraphite => (2.5, 4.2),
+        }
+    }
+
+    /// Positive electrodes of such cells. Cells of one label differ in their materials: NMC without a number is of any nickel
+    /// content, LMO is blended.
+    fn positives(self) -> Vec<PositiveElectrode> {
+        let blend = |share: f64| PositiveElectrode::blend(Positive::Lmo, share, Positive::Nco);
+        match self {
+            Self::Nmc811Graphite => vec![Positive::Nmc811.into()],
+            Self::NmcGraphite => vec![Positive::Nmc811.into(), Positive::Nmc532.into(), Positive::Nco.into()],
+            Self::NcaGraphite => vec![Positive::Nca.into()],
+            Self::LcoGraphite => vec![Positive::Lco.into(), Positive::LcoRamadass.into()],
+            Self::LmoGraphite => vec![blend(0.3), blend(0.5), blend(0.7)],
+            Self::LfpGraphite => vec![Positive::Lfp.into()],
+        }
+    }
+
+    /// Hysteresis of the open-circuit voltage between charge and discharge, half of the difference, V: Dreyer et al., Nature
+    /// Mater. 9 (2010) 448 for LFP; silicon in graphite for the others.
+    fn hysteresis_v(self) -> f64 {
+        if self == Self::LfpGraphite { 0.010 } else { 0.004 }
+    }
+}
+
+/// Negative electrodes that cells are made of; those of the library whose plateaus are those of graphite against lithium.
+const NEGATIVES: [Negative; 3] = [Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged];
+
+/// What is on the label of a cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Label {
+    /// Chemistry.
+    pub chemistry: Chemistry,
+    /// Rated capacity, Ah.
+    pub rated_ah: f64,
+    /// Lowest voltage, V.
+    pub voltage_min_v: f64,
+    /// Highest voltage, V.
+    pub voltage_max_v: f64,
+}
+
+/// SOC breakpoints of a model from a label.
+const SOC: [f64; 21] = [
+    0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0,
+];
+
+/// Temperature breakpoints, degrees C: Arrhenius' law holds between them.
+const TEMPERATURE_C: [f64; 4] = [-30.0, 0.0, 25.0, 60.0];
+
+/// One resistance of a usual cell at 25 degrees C.
+struct UsualResistance {
+    /// Resistance times capacity at half charge, ohm Ah.
+    ohm_ah: f64,
+    /// Time constant, s; 0 = series resistance.
+    tau_s: f64,
+    /// Resistance relative to half charge at the SOC of [`SHAPE_SOC`].
+    shape: [f64; 5],
+}
+
+const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
+
+/// Geometric means over models fitted to Panasonic 18650PF, LG HG2, LG M50 (simulated), EVE LF280 and a Leaf cell.
+const RESISTANCE: [UsualResistance; 3] = [
+    UsualResistance { ohm_ah: 0.073, tau_s: 0.0, shape: [1.6, 1.4, 1.25, 1.08, 1.0] },
+    UsualResistance { ohm_ah: 0.031, tau_s: 10.0, shape: [3.5, 2.5, 1.8, 1.2, 1.1] },
+    UsualResistance { ohm_ah: 0.059, tau_s: 150.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
+];
+
+/// Deviation of ln(resistance) between cells, found on the same five. The temperature's law adds to it away from 25 degrees C.
+const LOG_RESISTANCE_STD: f64 = 0.45;
+
+/// Deviation of the slowest branch relative to the other resistances, found on the same five.
+const SLOW_BRANCH_STD: f64 = 0.5;
+
+/// Deviation of the capacity from the label, fraction: tolerance, age of the cell.
+const CAPACITY_STD: f64 = 0.1;
+
+impl Label {
+    /// The label with the chemistry's usual cut-off voltages.
+    pub fn usual(chemistry: Chemistry, rated_ah: f64) -> Self {
+        let (voltage_min_v, voltage_max_v) = chemistry.usual_voltages_v();
+        Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
+    }
+
+    /// Mean and spread of the open-circuit curves of such cells; `None` when no cell of this chemistry has these cut-offs.
+    pub fn curve(&self) -> Option<CurvePrior> {
+        let ends_v = (self.voltage_min_v, self.voltage_max_v);
+        CurvePrior::new(&self.chemistry.positives(), &NEGATIVES, ends_v, self.chemistry.hysteresis_v(), &SOC)
+    }
+
+    /// The model of such a cell; `None` when no cell of this chemistry has these cut-offs.
+    pub fn model(&self) -> Option<CellModel> {
+        let curve = self.curve()?;
+        let rows = vec![curve.mean_v.clone(); TEMPERATURE_C.len()];
+        let (modes_v, rest_v) = curve.modes_v();
+        let mut aged_ocv = curve
+            .electrodes
+            .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, self.rated_ah, &rows))
+            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, self.rated_ah, &rows));
+        aged_ocv.add_spread(&modes_v);
+        let table = |resistance: &UsualResistance| {
+            let at = |soc: f64| resistance.ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, &resistance.shape, soc);
+            let row = |t: &f64| SOC.iter().map(|&soc| at(soc) * arrhenius(*t)).collect();
+            Table { values: TEMPERATURE_C.iter().map(row).collect() }
+        };
+        let branch = |resistance: &UsualResistance| {
+            let r_ohm = table(resistance);
+            let farad = |row: &Vec<f64>| row.iter().map(|r| resistance.tau_s / r).collect();
+            Branch { c_farad: Table { values: r_ohm.values.iter().map(farad).collect() }, r_ohm }
+        };
+        let [series, branches @ ..] = &RESISTANCE;
+        Some(CellModel {
+            name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
+            rated_capacity_ah: self.rated_ah,
+            capacity_ah: self.rated_ah,
+            voltage_min_v: self.voltage_min_v,
+            voltage_max_v: self.voltage_max_v,
+            soc: SOC.to_vec(),
+            temperature_c: TEMPERATURE_C.to_vec(),
+            ocv_v: Table { values: rows },
+            aged_ocv,
+            r0_ohm: table(series),
+            branches: branches.iter().map(branch).collect(),
+            voltage_error_v: Some(Table { values: vec![rest_v.clone(); TEMPERATURE_C.len()] }),
+            thermal: None,
+            spread: Some(ModelSpread {
+                curve_v: curve::median(&rest_v),
+                log_resistance: LOG_RESISTANCE_STD,
+                slow_branch: SLOW_BRANCH_STD,
+                capacity: CAPACITY_STD,
+            }),
+        })
+    }
+}
+
+/// Shift of the curve of an ageing cell whose electrodes are not in the library.
+const AGEING_SHIFT: f64 = 0.5;
+
+#[cfg(test)]
+mod tests;

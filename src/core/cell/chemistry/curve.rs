@@ -1,0 +1,217 @@
+//! Mean and spread of the open-circuit curves of cells of one chemistry, from half-cell potentials.
+//!
+//! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
+//!
+//! A cell is a pair of materials, the lithium content of its full negative and of its empty positive electrode; the other two
+//! contents follow from the cut-off voltages. Every pair and every content of a grid is equally likely. What no pair of the
+//! library has is a smooth deviation of [`MATERIAL_V`] and half of the hysteresis.
+
+use nalgebra::{DMatrix, SymmetricEigen};
+
+use crate::cell::aged_ocv::MIXES;
+use crate::cell::electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
+use crate::filter::bisect;
+
+/// Contents of the full negative electrode: designs between fast charging and high energy.
+const FULL_NEGATIVE: [f64; 4] = [0.78, 0.84, 0.90, 0.95];
+/// Contents of the empty positive electrode: lithium lost in the first cycles.
+const EMPTY_POSITIVE: [f64; 4] = [0.84, 0.88, 0.92, 0.97];
+/// Largest content of the empty negative electrode.
+const MAX_EMPTY_NEGATIVE: f64 = 0.15;
+/// Smooth deviation of a cell's own materials from those of one name, V, and the same below [`LOW_SOC`], where curves fall
+/// steeply (the deviations that the fit of electrodes allows, `ident::electrodes`).
+const MATERIAL_V: f64 = 0.010;
+const LOW_SOC_V: f64 = 0.030;
+const LOW_SOC: f64 = 0.05;
+/// Distance over which that deviation changes, SOC.
+const MATERIAL_SOC: f64 = 0.15;
+/// Least error of a curve, V.
+const LEAST_V: f64 = 0.004;
+/// Largest distance of an end of a curve from its cut-off voltage, V.
+const END_TOLERANCE_V: f64 = 0.002;
+/// Points of a blend's table.
+const BLEND_POINTS: u32 = 400;
+/// Voltages of a blend's table, V.
+const BLEND_V: (f64, f64) = (2.5, 4.8);
+/// Slope below which a curve's error is not restated as SOC, V per unit of SOC: there, any voltage is of every SOC.
+const LEAST_SLOPE_V: f64 = 0.1;
+
+/// A positive electrode of one material or of two.
+#[derive(Debug, Clone)]
+pub enum PositiveElectrode {
+    /// One material.
+    One(PositiveMaterial),
+    /// A blend: content over falling potential, V, in steps of equal size from the lowest.
+    Blend(Vec<f64>),
+}
+
+impl From<PositiveMaterial> for PositiveElectrode {
+    fn from(material: PositiveMaterial) -> Self {
+        Self::One(material)
+    }
+}
+
+impl PositiveElectrode {
+    /// Two materials in one electrode, at one potential: the contents add. `share` is the capacity of `a` in it.
+    pub fn blend(a: PositiveMaterial, share: f64, b: PositiveMaterial) -> Self {
+        let content = |material: PositiveMaterial, potential_v: f64| {
+            let ends = (material.least_content(), 1.0);
+            let (low, high) = bisect(ends, 40, |y| material.potential_v(y) > potential_v);
+            0.5 * (low + high)
+        };
+        let (low_v, high_v) = BLEND_V;
+        let at = |k: u32| low_v + (high_v - low_v) * f64::from(k) / f64::from(BLEND_POINTS);
+        Self::Blend((0..=BLEND_POINTS).map(at).map(|v| share * content(a, v) + (1.0 - share) * content(b, v)).collect())
+    }
+
+    fn potential_v(&self, y: f64) -> f64 {
+        match self {
+            Self::One(material) => material.potential_v(y),
+            Self::Blend(contents) => {
+                let above = contents.partition_point(|&content| content > y).clamp(1, contents.len() - 1);
+                let (lower, upper) = (contents[above - 1], contents[above]);
+                let along = if lower > upper { ((lower - y) / (lower - upper)).clamp(0.0, 1.0) } else { 0.0 };
+                let step_v = (BLEND_V.1 - BLEND_V.0) / f64::from(BLEND_POINTS);
+                BLEND_V.0 + step_v * ((above - 1) as f64 + along)
+            }
+        }
+    }
+
+    fn least_content(&self) -> f64 {
+        match self {
+            Self::One(material) => material.least_content(),
+            Self::Blend(contents) => contents.last().copied().unwrap_or(0.0),
+        }
+    }
+}
+
+/// Open-circuit curves of cells of one chemistry.
+#[derive(Debug, Clone)]
+pub struct CurvePrior {
+    /// SOC breakpoints.
+    pub soc: Vec<f64>,
+    /// Mean, V, strictly rising.
+    pub mean_v: Vec<f64>,
+    /// Covariance between breakpoints, V^2.
+    pub covariance: DMatrix<f64>,
+    /// The electrodes of the cell nearest to the mean; `None` when these are blends.
+    pub electrodes: Option<Electrodes>,
+}
+
+/// One cell's contents [negative empty, negative full, positive empty, positive full] and curve, V.
+struct PossibleCell {
+    contents: [f64; 4],
+    curve_v: Vec<f64>,
+}
+
+impl CurvePrior {
+    /// From every pair of materials; `None` when no pair has a cell between the cut-off voltages `ends_v`, lowest and highest.
+    pub fn new(
+        positives: &[PositiveElectrode],
+        negatives: &[NegativeMaterial],
+        ends_v: (f64, f64),
+        hysteresis_v: f64,
+        soc: &[f64],
+    ) -> Option<Self> {
+        let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
+        let with_contents = |(p, n)| {
+            let contents = FULL_NEGATIVE.iter().flat_map(|&x| EMPTY_POSITIVE.iter().map(move |&y| (x, y)));
+            contents.filter_map(move |(x, y)| Some(((p, n), possible_cell((p, n), (x, y), ends_v, soc)?)))
+        };
+        let cells: Vec<_> = pairs.flat_map(with_contents).collect();
+        let count = cells.len() as f64;
+        if cells.is_empty() {
+            return None;
+        }
+        let mean_v: Vec<f64> =
+            (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
+        let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
+        let material_v = |s: usize| if soc[s] < LOW_SOC { LOW_SOC_V } else { MATERIAL_V };
+        let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
+            let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
+            let distance = (soc[a] - soc[b]) / MATERIAL_SOC;
+            let material = material_v(a) * material_v(b) * libm::exp(-0.5 * distance * distance);
+            between + material + hysteresis_v * hysteresis_v
+        });
+        let distance = |cell: &PossibleCell| (0..soc.len()).map(|s| off_v(cell, s) * off_v(cell, s)).sum::<f64>();
+        let nearest = cells.iter().min_by(|a, b| distance(&a.1).total_cmp(&distance(&b.1)));
+        let electrodes = nearest.and_then(|((positive, negative), cell)| match positive {
+            PositiveElectrode::One(positive) => Some(Electrodes {
+                positive: *positive,
+                negative: *negative,
+                positive_content: [cell.contents[2], cell.contents[3]],
+                negative_content: [cell.contents[0], cell.contents[1]],
+            }),
+            PositiveElectrode::Blend(_) => None,
+        });
+        Some(Self { soc: soc.to_vec(), mean_v, covariance, electrodes })
+    }
+
+    /// The largest independent modes of the spread, V per standard deviation, and the standard deviation of the rest, V. Modes
+    /// are ordered by their effect on a SOC that is read from the voltage.
+    pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
+        let n = self.soc.len();
+        let slope_v = |s: usize| {
+            let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
+            ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(LEAST_SLOPE_V)
+        };
+        let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
+        let weight: Vec<f64> = (0..n).map(|s| width(s).sqrt() / slope_v(s)).collect();
+        let weighted = DMatrix::from_fn(n, n, |a, b| weight[a] * self.covariance[(a, b)] * weight[b]);
+        let eigen = SymmetricEigen::new(weighted);
+        let mut order: Vec<usize> = (0..n).collect();
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        let mode = |k: usize| {
+            let (column, scale) = (eigen.eigenvectors.column(order[k]), eigen.eigenvalues[order[k]].max(0.0).sqrt());
+            // The sign of an eigenvector is free: that of its largest part is positive.
+            let largest = column.iter().copied().fold(0.0, |m: f64, v| if v.abs() > m.abs() { v } else { m });
+            (0..n).map(|s| largest.signum() * scale * column[s] / weight[s]).collect::<Vec<f64>>()
+        };
+        let modes_v: [Vec<f64>; MIXES] = std::array::from_fn(mode);
+        let rest = |s: usize| {
+            let explained: f64 = modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
+            (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(LEAST_V)
+        };
+        let rest_v = (0..n).map(rest).collect();
+        (modes_v, rest_v)
+    }
+}
+
+/// The cell of a pair with these contents (full negative, empty positive) between the cut-off voltages, if there is one.
+fn possible_cell(
+    (positive, negative): (&PositiveElectrode, NegativeMaterial),
+    (negative_full, positive_empty): (f64, f64),
+    (low_v, high_v): (f64, f64),
+    soc: &[f64],
+) -> Option<PossibleCell> {
+    let middle = |(a, b): (f64, f64)| 0.5 * (a + b);
+    let full_v = |y: f64| positive.potential_v(y) - negative.potential_v(negative_full);
+    let empty_v = |x: f64| positive.potential_v(positive_empty) - negative.potential_v(x);
+    let positive_full = middle(bisect((positive.least_content(), positive_empty), 40, |y| full_v(y) > high_v));
+    let negative_empty = middle(bisect((0.0, MAX_EMPTY_NEGATIVE), 40, |x| empty_v(x) < low_v));
+    let reaches = (full_v(positive_full) - high_v).abs() < END_TOLERANCE_V
+        && (empty_v(negative_empty) - low_v).abs() < END_TOLERANCE_V;
+    let at = |soc: f64, empty: f64, full: f64| empty + soc * (full - empty);
+    let voltage_v = |soc: f64| {
+        positive.potential_v(at(soc, positive_empty, positive_full))
+            - negative.potential_v(at(soc, negative_empty, negative_full))
+    };
+    let curve_v: Vec<f64> = soc.iter().map(|&soc| voltage_v(soc)).collect();
+    let rises = curve_v.windows(2).all(|pair| pair[0] < pair[1]);
+    let contents = [negative_empty, negative_full, positive_empty, positive_full];
+    (reaches && rises).then_some(PossibleCell { contents, curve_v })
+}
+
+/// Linear between the points, which rise in `x`; constant outside.
+pub(super) fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
+    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
+    let along = ((at - x[k]) / (x[k + 1] - x[k])).clamp(0.0, 1.0);
+    y[k] + along * (y[k + 1] - y[k])
+}
+
+/// The middle value.
+pub(super) fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted[sorted.len() / 2]
+}
