@@ -108,6 +108,8 @@ pub struct ModelSpread {
     pub slow_branch: f64,
     /// Capacity, fraction.
     pub capacity: f64,
+    /// Voltage drop: fraction of it over one second, in the present and in the load of the last minutes.
+    pub drop_sqrt_s: f64,
 }
 
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.

@@ -85,6 +85,21 @@ impl PositiveElectrode {
     }
 }
 
+/// What cells of one chemistry and label have in common.
+#[derive(Debug, Clone, Copy)]
+pub struct CellType<'a> {
+    /// Positive electrodes.
+    pub positives: &'a [PositiveElectrode],
+    /// Negative electrodes.
+    pub negatives: &'a [NegativeMaterial],
+    /// Open-circuit voltage of the empty cell, V.
+    pub empty_v: f64,
+    /// Open-circuit voltages that the full cell may have, V.
+    pub full_v: &'a [f64],
+    /// Half of the difference between the curves of charge and discharge, V.
+    pub hysteresis_v: f64,
+}
+
 /// Open-circuit curves of cells of one chemistry.
 #[derive(Debug, Clone)]
 pub struct CurvePrior {
@@ -105,18 +120,16 @@ struct PossibleCell {
 }
 
 impl CurvePrior {
-    /// From every pair of materials; `None` when no pair has a cell between the cut-off voltages `ends_v`, lowest and highest.
-    pub fn new(
-        positives: &[PositiveElectrode],
-        negatives: &[NegativeMaterial],
-        ends_v: (f64, f64),
-        hysteresis_v: f64,
-        soc: &[f64],
-    ) -> Option<Self> {
+    /// From every pair of materials; `None` when no pair has a cell between the voltages.
+    pub fn new(cell_type: &CellType<'_>, soc: &[f64]) -> Option<Self> {
+        let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
             let contents = FULL_NEGATIVE.iter().flat_map(|&x| EMPTY_POSITIVE.iter().map(move |&y| (x, y)));
-            contents.filter_map(move |(x, y)| Some(((p, n), possible_cell((p, n), (x, y), ends_v, soc)?)))
+            let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));
+            ends.filter_map(move |(contents, full_v)| {
+                Some(((p, n), possible_cell((p, n), contents, (empty_v, full_v), soc)?))
+            })
         };
         let cells: Vec<_> = pairs.flat_map(with_contents).collect();
         let count = cells.len() as f64;

@@ -18,6 +18,9 @@ use crate::cell::circuit;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
 
+/// Usual load before a start under load, per rated capacity: C/2.
+const USUAL_LOAD_PER_H: f64 = 0.5;
+
 /// The estimator of one cell.
 #[derive(Debug, Clone)]
 pub struct CellEstimator {
@@ -112,7 +115,7 @@ impl CellEstimator {
             model.soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
-        let branch_variance = square(config.initial.branch_std_v).max(KNOWN_VARIANCE);
+        let branch_variance = self.first_branch_variance(model, config, step, soc.mean);
         let kept = LearnedState {
             log_resistance: self.memory.log_resistance,
             capacity: self.memory.capacity,
@@ -120,15 +123,34 @@ impl CellEstimator {
             by_constant: self.learned_by_constant(),
         };
         self.filter = Some(match model.branches.len() {
-            1 => Filter::One(initial_state(soc, branch_variance, &kept)),
-            2 => Filter::Two(initial_state(soc, branch_variance, &kept)),
-            _ => Filter::Three(initial_state(soc, branch_variance, &kept)),
+            1 => Filter::One(initial_state(soc, &branch_variance, &kept)),
+            2 => Filter::Two(initial_state(soc, &branch_variance, &kept)),
+            _ => Filter::Three(initial_state(soc, &branch_variance, &kept)),
         });
         // Trust returns through the window, not by a restart.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+    }
+
+    /// Variance of each branch's voltage at a start, V^2: under load, a usual load of unknown duration has filled it.
+    fn first_branch_variance(
+        &self,
+        model: &CellModel,
+        config: &EstimatorConfig,
+        step: &CellStep,
+        soc: f64,
+    ) -> [f64; MAX_BRANCHES] {
+        let position = model.grid_position(soc, self.memory.temperature_c.unwrap_or(step.ambient_c));
+        let ratio = libm::exp(self.memory.log_resistance.mean);
+        let is_loaded = step.current_a.is_some_and(|current_a| current_a.abs() > config.gap.rest_current_a);
+        let load_a = if is_loaded { USUAL_LOAD_PER_H * model.rated_capacity_ah } else { 0.0 };
+        let mut variance = [square(config.initial.branch_std_v).max(KNOWN_VARIANCE); MAX_BRANCHES];
+        for (i, variance) in variance.iter_mut().enumerate().take(model.branches.len()) {
+            *variance += square(model.branch_r_ohm(i, &position) * ratio * load_a);
+        }
+        variance
     }
 
     fn forget_correlation(&mut self) {

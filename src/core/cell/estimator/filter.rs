@@ -10,7 +10,7 @@ use super::state_vector::{
 };
 use super::step::CellStep;
 use crate::cell::circuit::{self, BranchAt};
-use crate::cell::{CellModel, EstimatorConfig};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::{CONSTANT_ERRORS, FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
 
 /// One filter per number of branches: N = branches + 3.
@@ -46,11 +46,11 @@ pub(super) struct LearnedState {
 /// The state at a start: SOC and branches new, the rest as learned.
 pub(super) fn initial_state<const N: usize>(
     soc: ScalarGaussian,
-    branch_variance: f64,
+    branch_variance: &[f64; MAX_BRANCHES],
     kept: &LearnedState,
 ) -> Gaussian<N> {
     let mut mean = SVector::zeros();
-    let mut variance = SVector::<f64, N>::repeat(branch_variance);
+    let mut variance = SVector::<f64, N>::from_fn(|i, _| branch_variance[i.saturating_sub(BRANCHES)]);
     (mean[0], variance[0]) = (soc.mean, soc.variance);
     let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
     for (k, (i, learned)) in [(LOG_RESISTANCE, kept.log_resistance), (CAPACITY, kept.capacity)].into_iter().enumerate()

@@ -99,7 +99,7 @@ impl Estimator {
     /// Spread of the cells of one type.
     fn usual_spread(model: &CellModel) -> ModelSpread {
         let slow_branch = if model.branches.len() > 1 { 0.2 } else { 0.1 };
-        ModelSpread { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1 }
+        ModelSpread { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
     }
 
     /// The parameters these keys stand for; `voltage_step_v` is the resolution of the cells' voltages.
@@ -147,8 +147,8 @@ impl Estimator {
             voltage: VoltageError {
                 noise_v: self.voltage_noise_v.hypot(rounding_v),
                 model_error_v_sqrt_s: self.model_error_v_sqrt_s,
-                drop_error_sqrt_s: self.drop_error_sqrt_s,
-                load_error_sqrt_s: self.load_error_sqrt_s,
+                drop_error_sqrt_s: self.drop_error_sqrt_s.hypot(spread.drop_sqrt_s),
+                load_error_sqrt_s: self.load_error_sqrt_s.hypot(spread.drop_sqrt_s),
                 load_memory_s: self.load_memory_s,
                 max_information_s: self.max_information_s,
             },
