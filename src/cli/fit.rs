@@ -4,29 +4,41 @@
 
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
+use super::label::{LabelArgs, one_of_chemistries};
 use super::numbers::{above_0, finite, share};
 use super::output::{failure, progress_bar, unless_closed};
+use super::replay::{InputArgs, log_options};
 use crate::cell::MAX_BRANCHES;
 use crate::lab;
-use crate::lab::fit::{self, FitRequest};
+use crate::config;
+use crate::lab::fit::logs::LogRequest;
+use crate::lab::fit::{self, FitProgress, FitRequest};
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Measured files: CSV, plain or compressed, with time_s, current_a (positive = discharge), voltage_v, and where there
-    /// are temperature_c, discharged_ah, cycle and type. Each begins with a full cell
+    /// are temperature_c, discharged_ah, cycle and type. Each begins with a full cell; with --log, any logs of a pack
     #[arg(required = true, value_name = "FILES")]
     files: Vec<PathBuf>,
+    /// The files are logs as `replay` reads them, of drives and charges that begin anywhere: the fit starts from the cell model of
+    /// --config, or from --chemistry and --rated, and changes it where the logs show something else
+    #[arg(long, requires = "start", conflicts_with_all = ["capacity", "ageing_shift", "ocv", "first_cycles", "GridArgs"])]
+    log: bool,
+    #[command(flatten)]
+    start: StartArgs,
+    #[command(flatten)]
+    input: InputArgs,
     /// Cell model to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// Name of the cell for display
-    #[arg(long)]
-    name: String,
+    /// Name of the cell for display [default with --log: that of the configured model]
+    #[arg(long, required_unless_present = "log")]
+    name: Option<String>,
     /// Capacity that defines SOC, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
     #[arg(long, value_name = "AH", value_parser = above_0)]
     capacity: Option<f64>,
@@ -58,6 +70,19 @@ pub(crate) struct Args {
     /// Print JSON
     #[arg(long)]
     json: bool,
+}
+
+/// Where a fit to logs starts from.
+#[derive(Debug, clap::Args)]
+#[group(id = "start")]
+#[command(next_help_heading = "Logs")]
+struct StartArgs {
+    /// Configuration of the pack
+    #[arg(short, long, value_name = "FILE.toml", requires = "log")]
+    config: Option<PathBuf>,
+    /// Chemistry on the label of a single measured cell, with --rated, and --voltage-min and --voltage-max where they are unusual
+    #[arg(long, value_parser = one_of_chemistries(), requires_all = ["log", "rated"], conflicts_with = "config")]
+    chemistry: Option<String>,
 }
 
 /// Size and breakpoints of the model.
@@ -103,11 +128,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
     }
     let begin = Instant::now();
-    let request = request(args);
+    let mut request = request(args);
     let bar = progress_bar(None, "{spinner} {elapsed_precise} {msg}");
-    let result = fit::run(&request, |progress| report::show(&bar, progress));
+    let result = if args.log {
+        fit_logs(args, &mut request, |progress| report::show(&bar, progress))
+    } else {
+        fit::run(&request, |progress| report::show(&bar, progress)).map_err(failure)
+    };
     bar.finish_and_clear();
-    let outcome = result.map_err(failure)?;
+    let outcome = result?;
     lab::write_file(&args.out, fit::text(&request, &outcome).as_bytes()).map_err(failure)?;
     if let Some(path) = &args.plot {
         fit::write_plot(path, &outcome).map_err(failure)?;
@@ -117,9 +146,38 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(shown)
 }
 
+/// Fits to logs; completes the request by what the configuration says.
+fn fit_logs(
+    args: &Args,
+    request: &mut FitRequest,
+    progress: impl FnMut(FitProgress),
+) -> Result<fit::FitOutcome, Failure> {
+    let label = LabelArgs {
+        chemistry: args.start.chemistry.clone(),
+        rated: args.rated,
+        voltage_min: args.voltage_min,
+        voltage_max: args.voltage_max,
+    };
+    let config = match (label.configuration()?, &args.start.config) {
+        (Some(config), _) => config,
+        (None, path) => config::load(path.as_deref().unwrap_or(Path::new("")))?,
+    };
+    let model = &config.monitor.model;
+    request.name = args.name.clone().unwrap_or_else(|| model.name.clone());
+    request.rated_ah = Some(model.rated_capacity_ah);
+    let logs = LogRequest {
+        monitor: &config.monitor,
+        interfaces: config.interface_names(),
+        sleep_gap_s: args.input.sleep_gap,
+        options: &|| log_options(&args.input, &config),
+        logs: args.files.clone(),
+    };
+    fit::logs::run(&logs, progress).map_err(failure)
+}
+
 fn request(args: &Args) -> FitRequest {
     FitRequest {
-        name: args.name.clone(),
+        name: args.name.clone().unwrap_or_default(),
         capacity_ah: args.capacity,
         rated_ah: args.rated,
         voltage_min_v: args.voltage_min,

@@ -24,6 +24,8 @@ mod gpr;
 mod history;
 #[cfg(feature = "lab")]
 mod import;
+#[cfg(feature = "lab")]
+mod label;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod numbers;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]

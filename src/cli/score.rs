@@ -8,16 +8,11 @@ use std::path::{Path, PathBuf};
 pub(crate) use args::Args;
 
 use super::Failure;
+use super::label::BUILT_IN;
 use super::output::{create_folder, failure, short_names, unless_closed};
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 use crate::health::UsableConfig;
 use crate::lab::score::{self, Case, CycleTable, ScoreJob, ScoreSettings};
-
-/// The configuration used when none is given, and what it names; the cell model comes from the command line.
-const BUILT_IN: [(&str, &[u8]); 2] = [
-    ("score.toml", include_bytes!("../../config/score.toml")),
-    ("measured.dbc", include_bytes!("../../config/measured.dbc")),
-];
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -39,8 +34,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn configuration(args: &Args) -> Result<Config, Failure> {
     let built_in = args.config.is_none();
     let path = args.config.clone().unwrap_or_else(|| PathBuf::from("score.toml"));
-    if let Some(keys) = args.label.keys() {
-        return of_label(&keys);
+    if let Some(config) = args.label.configuration()? {
+        return Ok(config);
     }
     let Some(cell) = &args.cell else { return Ok(config::load(&path)?) };
     // Faults of the model are reported with its own file name.
@@ -53,20 +48,6 @@ fn configuration(args: &Args) -> Result<Config, Failure> {
     let named = named_cell(&files, &read)?;
     let read = |file: &Path| if file == named { std::fs::read(cell) } else { read(file) };
     Ok(config::load_with(&files, &read)?)
-}
-
-/// The built-in configuration with the keys of a label in place of the cell model.
-fn of_label(keys: &str) -> Result<Config, Failure> {
-    let read = |file: &Path| {
-        let known = BUILT_IN.iter().find(|(name, _)| Path::new(name) == file);
-        let (name, bytes) = known.ok_or(std::io::ErrorKind::NotFound)?;
-        if *name != BUILT_IN[0].0 {
-            return Ok(bytes.to_vec());
-        }
-        let with_label = |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { format!("{line}\n") };
-        Ok(String::from_utf8_lossy(bytes).lines().map(with_label).collect::<String>().into_bytes())
-    };
-    Ok(config::load_with(&ConfigFiles::alone(Path::new(BUILT_IN[0].0)), &read)?)
 }
 
 /// The path of the cell model that a configuration names.

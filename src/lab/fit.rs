@@ -5,6 +5,7 @@
 //! One error names all files whose SOC cannot be determined, with the reasons.
 
 mod limits;
+pub mod logs;
 mod nodes;
 mod picture;
 mod prepare;

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::cell::Chemistry;
 use crate::cli::Failure;
+use crate::cli::label::LabelArgs;
 use crate::cli::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
 use crate::cli::output::check_distinct;
 use crate::lab::score::Start;
@@ -45,44 +45,6 @@ pub(crate) struct Args {
     pub(crate) life: LifeArgs,
     #[command(flatten)]
     pub(crate) output: OutputArgs,
-}
-
-/// A cell without a model.
-#[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Label, instead of a cell model")]
-pub(crate) struct LabelArgs {
-    /// Chemistry on the label, as in [pack] chemistry
-    #[arg(long, value_parser = one_of_chemistries(), requires = "rated", conflicts_with_all = ["config", "cell"])]
-    pub(crate) chemistry: Option<String>,
-    /// Capacity on the label, Ah
-    #[arg(long, value_name = "AH", value_parser = above_0, requires = "chemistry")]
-    pub(crate) rated: Option<f64>,
-    /// Lowest voltage [default: usual of the chemistry]
-    #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
-    pub(crate) voltage_min: Option<f64>,
-    /// Highest voltage [default: usual of the chemistry]
-    #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
-    pub(crate) voltage_max: Option<f64>,
-}
-
-impl LabelArgs {
-    /// The keys of [pack] that they stand for; `None` without a chemistry.
-    pub(crate) fn keys(&self) -> Option<String> {
-        let mut text = format!("chemistry = \"{}\"\n", self.chemistry.as_ref()?);
-        let numbers = [
-            ("rated_capacity_ah", self.rated),
-            ("voltage_min_v", self.voltage_min),
-            ("voltage_max_v", self.voltage_max),
-        ];
-        for (key, value) in numbers {
-            value.iter().for_each(|value| text.push_str(&format!("{key} = {value:?}\n")));
-        }
-        Some(text)
-    }
-}
-
-fn one_of_chemistries() -> clap::builder::PossibleValuesParser {
-    Chemistry::ALL.map(|(_, name)| name).into()
 }
 
 /// Starts of the estimator.

@@ -14,7 +14,7 @@ const DEFAULT_C: f64 = 25.0;
 /// Temperatures of files closer than this share a node, K.
 const NODE_GAP_K: f64 = 5.0;
 /// Voltages further than this beyond the cell's limits are not credible, V.
-const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
+pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
 /// Weight of a charge relative to a discharge of an ageing cell: its voltage carries slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 /// Least share of the capacity that a slow test must discharge.

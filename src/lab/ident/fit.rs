@@ -152,7 +152,7 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
     let of_group = |group: &Group<'_>| {
         let mut normal = NormalEquations::new(layout.len());
         for (record, scale) in group {
-            accumulate(record, *scale, layout, tables, &mut normal);
+            accumulate(record, *scale, layout, tables, None, &mut normal);
         }
         normal
     };
@@ -227,7 +227,7 @@ fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     found.get(found.len() / 2).copied()
 }
 
-fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
+pub(super) fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
     let grid = &settings.grid;
     let (mut low, mut high) = (start.to_vec(), start.to_vec());
     let (least_v, most_v) = settings.voltage_v;

@@ -17,6 +17,7 @@ pub mod prior;
 pub mod record;
 pub mod solve;
 pub mod thermal;
+pub mod unanchored;
 
 /// A tester holds the voltage where the current is below this part of the load's, and the voltage at its lowest.
 const HELD_CURRENT: f64 = 0.97;

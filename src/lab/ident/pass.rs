@@ -6,7 +6,7 @@
 //! [`FADED_V`] are dropped, so a row touches a few nodes only and the work per row does not grow with the tables.
 //! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
 
-use super::grid::Corners;
+use super::grid::{Corners, Grid};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
@@ -155,12 +155,44 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights.
+/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - charge / capacity, both parameters.
+#[derive(Debug, Clone, Copy)]
+pub struct FreeScale<'a> {
+    /// Breakpoints.
+    pub grid: &'a Grid,
+    /// Index of ln(capacity).
+    pub log_capacity: usize,
+    /// Index of the record's SOC at its first row.
+    pub beginning: usize,
+    /// Its value.
+    pub beginning_soc: f64,
+}
+
+impl FreeScale<'_> {
+    /// Adds the derivatives of a row's residual: the SOC moves the open-circuit voltage, and hardly the resistances.
+    fn derivatives(&self, row: &FitRow, tables: &ParameterTables, index: &mut Vec<usize>, j: &mut Vec<f64>) {
+        let place = self.grid.place(row.soc, row.temperature_c);
+        let columns = self.grid.soc.len();
+        let rise_v = |t: usize| {
+            let first = t * columns + place.s;
+            tables.ocv_v[first + 1] - tables.ocv_v[first]
+        };
+        let upper_v = if place.along_t == 0.0 { 0.0 } else { place.along_t * rise_v(place.t + 1) };
+        let slope_v = ((1.0 - place.along_t) * rise_v(place.t) + upper_v)
+            / (self.grid.soc[place.s + 1] - self.grid.soc[place.s]);
+        index.extend([self.log_capacity, self.beginning]);
+        j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v]);
+    }
+}
+
+/// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights; with `free` also those of the
+/// record's SOC.
 pub fn accumulate(
     record: &Record,
     scale: f64,
     layout: &Layout,
     tables: &ParameterTables,
+    free: Option<&FreeScale<'_>>,
     normal: &mut NormalEquations,
 ) {
     let mut branches: Vec<_> = (0..layout.branches).map(|_| BranchRun::new(layout.nodes)).collect();
@@ -177,6 +209,9 @@ pub fn accumulate(
         }
         if row.weight_s > 0.0 {
             derivatives(row, layout, tables, &branches, &mut index, &mut j);
+            if let Some(free) = free {
+                free.derivatives(row, tables, &mut index, &mut j);
+            }
             let residual = row.voltage_v - model_v;
             let (cost, robust) = huber(residual);
             let weight = scale * row.weight_s / (SIGMA_V * SIGMA_V * REPEATS_S);

@@ -61,6 +61,19 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
+    /// Round a chemistry's resistances: deviations as between five fitted cells (`cell::chemistry`), shared by the nodes of a table.
+    pub const CHEMISTRY: Self = Self {
+        ocv_by_temperature_v: 0.006,
+        r0_curvature: 0.15,
+        r_curvature: 0.15,
+        tau_curvature: 0.05,
+        r_by_temperature: 0.2,
+        tau_by_temperature: 0.1,
+        r_level: 2.0,
+        tau_level: 1.0,
+        ..Self::FREE_OCV
+    };
+
     /// For an ageing cell. Discharges and charges at one current each separate R0 from the branch only at their beginnings:
     /// R0 hardly bends, the time constant stays. They do not separate the branch from the OCV at the empty end either, where
     /// both turn steeply: the branch bends as little as drives allow ([`PriorDeviations::SLOW_TEST`]), so that the OCV takes the knee.
@@ -110,6 +123,26 @@ impl Prior {
             prior.curvature(grid, tau, &flat, deviations.tau_curvature);
             prior.by_temperature(grid, tau, &flat, deviations.tau_by_temperature);
             prior.level(tau, level(tau), deviations.tau_level);
+        }
+        prior
+    }
+
+    /// Creates the prior around known values `start` of resistances and time constants, in shape and in size; the OCV has only its
+    /// differences between temperatures here.
+    pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
+        let mut prior = Self(Vec::new());
+        let of = |first: usize| &start[first..first + layout.nodes];
+        prior.by_temperature(grid, 0, of(0), deviations.ocv_by_temperature_v);
+        let mut block = |first: usize, curvature: f64, by_temperature: f64, level: f64| {
+            prior.curvature(grid, first, of(first), curvature);
+            prior.by_temperature(grid, first, of(first), by_temperature);
+            prior.level(first, of(first), level);
+        };
+        let PriorDeviations { r_by_temperature, tau_by_temperature, r_level, tau_level, .. } = *deviations;
+        block(layout.r0(), deviations.r0_curvature, r_by_temperature, r_level);
+        for i in 0..layout.branches {
+            block(layout.branch_r(i), deviations.r_curvature, r_by_temperature, r_level);
+            block(layout.branch_tau(i), deviations.tau_curvature, tau_by_temperature, tau_level);
         }
         prior
     }

@@ -1,0 +1,282 @@
+//! Fits a cell model to logs of a whole pack: ordinary drives and charges that begin anywhere.
+//!
+//! In: a configuration, with a cell model or a label, and logs as the daemon reads them. Out: a [`FitOutcome`] whose tables stay
+//! those of the configured model where the logs show nothing.
+//!
+//! Every log goes through the monitor, so that limits, decoding and faults are those of the daemon. All cells are of one kind:
+//! their mean voltage is fitted, as one cell. A hole in the record begins a new stretch, whose SOC is another unknown.
+
+use std::cell::RefCell;
+use std::path::PathBuf;
+use std::rc::Rc;
+
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+
+use super::prepare::CREDIBLE_BEYOND_V;
+use super::{ELECTRODES_C, FileResidual, FitOutcome, FitProgress, MeasuredRange, judged, verdict};
+use crate::cell::{AgedOcv, CellModel};
+use crate::error::LabError;
+use crate::ident::fit::{FitSettings, judge};
+use crate::ident::grid::Grid;
+use crate::ident::parameters::ParameterTables;
+use crate::ident::prior::PriorDeviations;
+use crate::ident::record::{self, Limits, Record};
+use crate::ident::unanchored::{self, Known, UnanchoredRecord};
+use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
+use crate::io::log::{LogOptions, LogSource};
+use crate::monitor::{Estimate, Monitor, MonitorConfig, Outputs};
+use crate::replay::{self, ReplaySettings, Sinks};
+
+/// A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
+const HOLE_S: f64 = 120.0;
+/// Rows of the shortest stretch that is used.
+const LEAST_ROWS: usize = 20;
+/// Least standard deviation of the SOC at which a stretch begins.
+const BEGINNING_STD: f64 = 0.02;
+/// Temperatures of stretches closer than this share a node, K.
+const NODE_GAP_K: f64 = 5.0;
+/// Least error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
+const CURVE_V: (f64, f64) = (0.004, 0.002);
+const CURVE_SOC: f64 = 0.1;
+/// SOC breakpoints of the fitted tables.
+const SOC: [f64; 25] = [
+    0.0, 0.02, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9,
+    0.93, 0.96, 0.98, 1.0,
+];
+
+/// Logs of a pack, and how they are read.
+pub struct LogRequest<'a> {
+    /// Configuration of the monitor; its cell model is where the fit starts from.
+    pub monitor: &'a MonitorConfig,
+    /// Names of the interfaces.
+    pub interfaces: Vec<String>,
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub sleep_gap_s: f64,
+    /// How one log is read.
+    pub options: &'a (dyn Fn() -> LogOptions + Sync),
+    /// Logs; each is replayed by itself.
+    pub logs: Vec<PathBuf>,
+}
+
+/// One stretch of a log without a hole: the mean of all cells.
+#[derive(Debug, Clone, Default)]
+struct Stretch {
+    log: usize,
+    part: MeasuredPart,
+    /// SOC at its first row with its standard deviation.
+    beginning: (f64, f64),
+}
+
+/// Puts the cells of a pack together, reading by reading.
+#[derive(Debug, Default)]
+struct MeanCell {
+    stretches: Vec<Stretch>,
+    seen: Vec<bool>,
+    count: f64,
+    sums: [f64; 6],
+}
+
+impl MeanCell {
+    fn new(cells: usize) -> Self {
+        Self { seen: vec![false; cells], ..Self::default() }
+    }
+
+    fn take(&mut self, estimate: &Estimate) {
+        let cell = estimate.cell.index();
+        if self.seen.get(cell) == Some(&true) {
+            self.close();
+        }
+        if let Some(seen) = self.seen.get_mut(cell) {
+            *seen = true;
+        }
+        let measured = &estimate.measured;
+        let values = [
+            estimate.time.secs(),
+            measured.current_a,
+            measured.voltage_v,
+            measured.temperature_c,
+            estimate.soc,
+            estimate.soc_std,
+        ];
+        self.count += 1.0;
+        self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+    }
+
+    fn close(&mut self) {
+        let [time_s, current_a, voltage_v, temperature_c, soc, soc_std] = self.sums.map(|sum| sum / self.count);
+        (self.count, self.sums) = (0.0, [0.0; 6]);
+        self.seen.fill(false);
+        if !(time_s.is_finite() && current_a.is_finite() && voltage_v.is_finite()) {
+            return;
+        }
+        let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
+        if last_s.is_none_or(|last_s| time_s - last_s > HOLE_S || time_s < last_s) {
+            let beginning = (soc, soc_std.hypot(BEGINNING_STD));
+            self.stretches.push(Stretch { beginning, ..Stretch::default() });
+        }
+        if let Some(stretch) = self.stretches.last_mut() {
+            stretch.part.push(time_s, current_a, voltage_v, temperature_c, f64::NAN);
+        }
+    }
+}
+
+/// Reads the logs and fits the model.
+///
+/// # Errors
+/// Logs that cannot be read, and data that do not support a fit: one line each.
+pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
+    let numbered: Vec<(usize, &PathBuf)> = request.logs.iter().enumerate().collect();
+    let read: Result<Vec<_>, LabError> = numbered.par_iter().map(|(log, path)| stretches(request, *log, path)).collect();
+    let stretches: Vec<Stretch> = read?.into_iter().flatten().filter(|s| s.part.len() >= LEAST_ROWS).collect();
+    progress(FitProgress::Read(request.logs.len(), request.logs.len()));
+    if stretches.is_empty() {
+        return Err(LabError(format!("no stretch of {LEAST_ROWS} readings with current and voltage in the logs")));
+    }
+    let model = &request.monitor.model;
+    let grid = Grid { soc: SOC.to_vec(), temperature_c: temperature_nodes(&stretches) };
+    let records: Vec<UnanchoredRecord> = stretches.iter().map(|stretch| unanchored(stretch, &grid, model)).collect();
+    let settings = FitSettings {
+        grid: grid.clone(),
+        tau_s: vec![],
+        voltage_v: (model.voltage_min_v, model.voltage_max_v),
+        ocv: vec![],
+        min_slope_v: vec![],
+        deviations: PriorDeviations::CHEMISTRY,
+    };
+    let known = known(model, &grid, request.monitor);
+    let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
+        .map_err(LabError)?;
+    let file_of_record: Vec<usize> = stretches.iter().map(|stretch| stretch.log).collect();
+    let capacity_ah = fit.capacity_ah;
+    let errors_v = error_table::table(&fit.fitted, &judged(&fit.records, &file_of_record), capacity_ah);
+    let voltage_error_v = errors_v.iter().zip(&fit.ocv_std_v).map(|(a, b)| a.hypot(*b)).collect();
+    let found = electrodes::identify(|soc| fit.fitted.ocv_v(soc, ELECTRODES_C));
+    let rows: Vec<Vec<f64>> = fit.fitted.tables.ocv_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
+    let electrodes =
+        found.filter(|found| AgedOcv::of_electrodes(&found.electrodes, &grid.soc, capacity_ah, &rows).is_some());
+    let thermal = thermal::fit(&fit.records, &fit.fitted.tables, capacity_ah * fit.fitted.mean_ocv_v());
+    let mut outcome = FitOutcome {
+        electrodes,
+        capacity_ah,
+        voltage_v: settings.voltage_v,
+        thermal: thermal.ok(),
+        voltage_error_v,
+        measured: MeasuredRange::of(&fit.records),
+        by_kind: None,
+        files: files(request, &fit.records, &file_of_record, &fit.fitted.tables),
+        records: fit.records,
+        file_of_record,
+        notes: vec![],
+        verdict: vec![],
+        fit: fit.fitted,
+    };
+    let std_ah = fit.capacity_std_ah;
+    outcome.notes.push(format!(
+        "capacity {capacity_ah:.3} +/- {std_ah:.3} Ah per cell, {:+.1} % of the {} Ah of {:?}",
+        100.0 * (capacity_ah / model.capacity_ah - 1.0),
+        model.capacity_ah,
+        model.name
+    ));
+    outcome.verdict = verdict::verdict(&outcome);
+    Ok(outcome)
+}
+
+/// The stretches of one log.
+fn stretches(request: &LogRequest<'_>, log: usize, path: &PathBuf) -> Result<Vec<Stretch>, LabError> {
+    let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
+    let watched = Rc::clone(&mean);
+    let watch = move |out: &Outputs| out.estimates.iter().for_each(|estimate| watched.borrow_mut().take(estimate));
+    let sinks = Sinks { watch: Some(Box::new(watch)), ..Sinks::default() };
+    let mut source = LogSource::new([path.clone()], (request.options)());
+    let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
+    let monitor = Monitor::new(request.monitor.clone());
+    replay::run(&mut source, monitor, sinks, settings, &mut |_| ()).map_err(|error| LabError(error.to_string()))?;
+    let mut mean = mean.borrow_mut();
+    mean.close();
+    let stretches = std::mem::take(&mut mean.stretches);
+    Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
+}
+
+/// The stretch as rows of the fit, its SOC the charge taken out, with negative sign, Ah.
+fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
+    let mut part = stretch.part.clone();
+    let first_s = part.time_s[0];
+    part.time_s.iter_mut().for_each(|time_s| *time_s -= first_s);
+    part.soc = charge_ah(&part.time_s, &part.current_a).iter().map(|ah| -ah).collect();
+    let limits = Limits {
+        voltage_low_v: model.voltage_min_v - CREDIBLE_BEYOND_V.0,
+        voltage_high_v: model.voltage_max_v + CREDIBLE_BEYOND_V.1,
+        capacity_ah: 1.0,
+    };
+    let record = Record::prepare(&part, &[], grid, &limits);
+    let scale = record::share(&record) * record::weight(&record) / model.rated_capacity_ah;
+    UnanchoredRecord { record, scale, beginning: stretch.beginning }
+}
+
+/// A node per group of temperatures; stretches without a temperature have that of the surroundings.
+fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
+    let median = |stretch: &Stretch| {
+        let mut sorted = stretch.part.temperature_c.clone();
+        sorted.sort_by(f64::total_cmp);
+        sorted[sorted.len() / 2]
+    };
+    let mut medians: Vec<f64> = stretches.iter().map(median).collect();
+    medians.sort_by(f64::total_cmp);
+    let groups = medians.chunk_by(|a, b| b - a < NODE_GAP_K);
+    groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
+}
+
+/// What the configured model says before the fit.
+fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
+    let per_node = |value: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
+        grid.temperature_c.iter().flat_map(|&t| grid.soc.iter().map(move |&soc| (soc, t))).map(|(soc, t)| value(soc, t)).collect()
+    };
+    let at = |soc: f64, t: f64| model.grid_position(soc, t);
+    let branches = 0..model.branches.len();
+    let tables = ParameterTables {
+        ocv_v: per_node(&|soc, t| model.ocv_v(&at(soc, t))),
+        r0_ohm: per_node(&|soc, t| model.r0_ohm(&at(soc, t))),
+        r_ohm: branches.clone().map(|i| per_node(&|soc, t| model.branch_r_ohm(i, &at(soc, t)))).collect(),
+        tau_s: branches.map(|i| per_node(&|soc, t| model.branch_tau_s(i, &at(soc, t)))).collect(),
+    };
+    let distance = |t: usize| (grid.temperature_c[t] - ELECTRODES_C).abs();
+    let curve_row = (0..grid.temperature_c.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
+    let position = |s: usize| at(grid.soc[s], grid.temperature_c[curve_row]);
+    let modes_v: Vec<_> = (0..SOC.len()).map(|s| model.aged_ocv_changes_v(&position(s), model.capacity_ah).1).collect();
+    let rest_v = |s: usize| model.voltage_error_v(&position(s)).unwrap_or(0.0).hypot(CURVE_V.0);
+    let curve_covariance = DMatrix::from_fn(SOC.len(), SOC.len(), |a, b| {
+        let modes: f64 = modes_v[a].iter().zip(&modes_v[b]).map(|(a, b)| a * b).sum();
+        let apart = (grid.soc[a] - grid.soc[b]) / CURVE_SOC;
+        let alone = if a == b { CURVE_V.1 * CURVE_V.1 } else { 0.0 };
+        modes + rest_v(a) * rest_v(b) * libm::exp(-0.5 * apart * apart) + alone
+    });
+    let initial = &monitor.estimator.initial;
+    Known {
+        tables,
+        curve_covariance,
+        curve_row,
+        capacity_ah: initial.capacity_ah,
+        capacity_std: initial.capacity_std_ah / initial.capacity_ah,
+    }
+}
+
+fn files(
+    request: &LogRequest<'_>,
+    records: &[Record],
+    file_of_record: &[usize],
+    tables: &ParameterTables,
+) -> Vec<FileResidual> {
+    let of_log = |(log, path): (usize, &PathBuf)| {
+        let own: Vec<Record> =
+            records.iter().zip(file_of_record).filter(|(_, file)| **file == log).map(|(r, _)| r.clone()).collect();
+        FileResidual {
+            path: path.clone(),
+            rows: own.iter().map(|record| record.raw_rows).sum(),
+            seconds: own.iter().map(Record::seconds).sum(),
+            outliers: own.iter().map(|record| record.outliers).sum(),
+            residual: judge(&own, tables),
+        }
+    };
+    request.logs.iter().enumerate().map(of_log).collect()
+}

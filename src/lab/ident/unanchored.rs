@@ -1,0 +1,199 @@
+//! Fits tables to records whose SOC is not known: ordinary drives and charges that begin anywhere.
+//!
+//! In: records with the charge taken out since their first row, a prior of the open-circuit curve (V, V^2) and of the
+//! resistances, the label's capacity (Ah). Out: tables, capacity, and the SOC at which each record began.
+//!
+//! SOC = s_k - q / C: the beginning s_k of record k and ln C are parameters beside those of the tables, and all are found
+//! together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
+//! as in the prior. The rows are placed in the tables anew in every pass.
+
+use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
+
+use super::fit::{FitSettings, FittedTables, MIN_ROWS, judge, space};
+use super::parameters::{Layout, ParameterTables};
+use super::pass::{FreeScale, NormalEquations, accumulate, visits};
+use super::prior::Prior;
+use super::record::Record;
+use super::solve::minimise;
+
+/// Least and largest SOC of a record's beginning.
+const BEGINNING: (f64, f64) = (-0.05, 1.05);
+/// Largest factor between the capacity and the label's.
+const CAPACITY_FACTOR: f64 = 1.6;
+
+/// What is known before the fit.
+#[derive(Debug, Clone)]
+pub struct Known {
+    /// Tables of the parameters in node order: the prior's means.
+    pub tables: ParameterTables,
+    /// Covariance of the open-circuit voltage between SOC breakpoints, V^2; for the row of temperature `curve_row`.
+    pub curve_covariance: DMatrix<f64>,
+    /// Row of the temperature at which it holds.
+    pub curve_row: usize,
+    /// Capacity, Ah.
+    pub capacity_ah: f64,
+    /// Its standard deviation, fraction.
+    pub capacity_std: f64,
+}
+
+/// A record with the charge of its rows.
+#[derive(Debug, Clone)]
+pub struct UnanchoredRecord {
+    /// Rows; `soc` of each is the charge taken out since the first row with negative sign, Ah.
+    pub record: Record,
+    /// Weight of its seconds.
+    pub scale: f64,
+    /// SOC at the first row, as far as it is known, with its standard deviation.
+    pub beginning: (f64, f64),
+}
+
+/// A fit of tables, capacity and beginnings.
+#[derive(Debug, Clone)]
+pub struct UnanchoredFit {
+    /// Tables.
+    pub fitted: FittedTables,
+    /// Capacity, Ah.
+    pub capacity_ah: f64,
+    /// Its standard deviation, Ah.
+    pub capacity_std_ah: f64,
+    /// Standard deviation of the open-circuit voltage that the data leave, V, in node order.
+    pub ocv_std_v: Vec<f64>,
+    /// The records with the SOC found.
+    pub records: Vec<Record>,
+}
+
+/// Rows of the whitened prior of the curve: residual = row . (ocv - mean).
+struct CurvePriorRows {
+    first: usize,
+    whitening: DMatrix<f64>,
+    mean_v: DVector<f64>,
+}
+
+impl CurvePriorRows {
+    fn new(known: &Known, layout: &Layout) -> Result<Self, String> {
+        let first = known.curve_row * layout.columns;
+        let factor = known.curve_covariance.clone().cholesky().ok_or("the prior of the curve has no factor")?;
+        let whitening = factor.l().try_inverse().ok_or("the prior of the curve has no inverse")?;
+        let mean_v = DVector::from_column_slice(&known.tables.ocv_v[first..first + layout.columns]);
+        Ok(Self { first, whitening, mean_v })
+    }
+
+    fn accumulate(&self, theta: &[f64], normal: &mut NormalEquations) {
+        let n = self.mean_v.len();
+        let off_v = DVector::from_column_slice(&theta[self.first..self.first + n]) - &self.mean_v;
+        let residuals = &self.whitening * off_v;
+        let index: Vec<usize> = (self.first..self.first + n).collect();
+        for row in 0..n {
+            let j: Vec<f64> = self.whitening.row(row).iter().copied().collect();
+            normal.cost += 0.5 * residuals[row] * residuals[row];
+            normal.add(&index, &j, residuals[row], 1.0);
+        }
+    }
+}
+
+/// Fits tables, capacity and beginnings; `progress` receives the pass number and the cost.
+///
+/// # Errors
+/// Too few rows, or numbers that are not finite.
+pub fn fit(
+    settings: &FitSettings,
+    known: &Known,
+    records: &[UnanchoredRecord],
+    progress: impl FnMut(usize, f64),
+) -> Result<UnanchoredFit, String> {
+    let judged = records.iter().flat_map(|r| &r.record.rows).filter(|row| row.weight_s > 0.0).count();
+    if judged < MIN_ROWS {
+        return Err(format!("{judged} rows can be judged, at least {MIN_ROWS} are needed"));
+    }
+    let grid = &settings.grid;
+    let layout = Layout::new(grid, known.tables.r_ohm.len());
+    let log_capacity = layout.len();
+    let beginning = |k: usize| log_capacity + 1 + k;
+    let ln = |values: &[f64]| values.iter().map(|&x| libm::log(x)).collect::<Vec<f64>>();
+    let mut start = known.tables.ocv_v.clone();
+    start.extend(ln(&known.tables.r0_ohm));
+    for (r_ohm, tau_s) in known.tables.r_ohm.iter().zip(&known.tables.tau_s) {
+        start.extend(ln(r_ohm));
+        start.extend(ln(tau_s));
+    }
+    let mut space = space(settings, &layout, &start);
+    let prior = Prior::about(grid, &layout, &start, &settings.deviations);
+    let curve = CurvePriorRows::new(known, &layout)?;
+    let log_label = libm::log(known.capacity_ah);
+    start.push(log_label);
+    space.low.push(log_label - libm::log(CAPACITY_FACTOR));
+    space.high.push(log_label + libm::log(CAPACITY_FACTOR));
+    for record in records {
+        start.push(record.beginning.0);
+        space.low.push(BEGINNING.0);
+        space.high.push(BEGINNING.1);
+    }
+    let placed = |theta: &[f64], k: usize| place(&records[k].record, settings, theta[beginning(k)], theta[log_capacity]);
+    let evaluate = |theta: &[f64]| {
+        let tables = ParameterTables::new(&layout, theta);
+        let of_record = |k: usize| {
+            let mut normal = NormalEquations::new(theta.len());
+            let free =
+                FreeScale { grid, log_capacity, beginning: beginning(k), beginning_soc: theta[beginning(k)] };
+            accumulate(&placed(theta, k), records[k].scale, &layout, &tables, Some(&free), &mut normal);
+            normal
+        };
+        // Added in the order of the records: the sum does not depend on the threads.
+        let sums: Vec<NormalEquations> = (0..records.len()).into_par_iter().map(of_record).collect();
+        let mut normal = NormalEquations::new(theta.len());
+        sums.iter().for_each(|sum| normal.add_all(sum));
+        prior.accumulate(theta, &mut normal);
+        curve.accumulate(theta, &mut normal);
+        let mut near = |at: usize, mean: f64, std: f64| {
+            let residual = (theta[at] - mean) / std;
+            normal.cost += 0.5 * residual * residual;
+            normal.add(&[at], &[1.0 / std], residual, 1.0);
+        };
+        near(log_capacity, log_label, known.capacity_std);
+        for (k, record) in records.iter().enumerate() {
+            near(beginning(k), record.beginning.0, record.beginning.1);
+        }
+        normal
+    };
+    if !evaluate(&space.inside(&start)).cost.is_finite() {
+        return Err("the data or the starting values are not finite".to_owned());
+    }
+    let solution = minimise(&space, &start, evaluate, progress);
+    let theta = &solution.theta;
+    let n = theta.len();
+    let covariance = DMatrix::from_vec(n, n, evaluate(theta).symmetric()).cholesky().map(|factor| factor.inverse());
+    let std = |at: usize| covariance.as_ref().map_or(f64::INFINITY, |covariance| covariance[(at, at)].sqrt());
+    let tables = ParameterTables::new(&layout, theta);
+    let records: Vec<Record> = (0..records.len()).map(|k| placed(theta, k)).collect();
+    let all: Vec<&Record> = records.iter().collect();
+    let capacity_ah = libm::exp(theta[log_capacity]);
+    Ok(UnanchoredFit {
+        capacity_ah,
+        capacity_std_ah: capacity_ah * std(log_capacity),
+        ocv_std_v: (0..layout.nodes).map(std).collect(),
+        fitted: FittedTables {
+            grid: grid.clone(),
+            total: judge(&records, &tables),
+            visits_s: visits(&all, layout.nodes),
+            tables,
+            passes: solution.passes,
+            converged: solution.converged,
+        },
+        records,
+    })
+}
+
+/// The record with SOC = beginning - charge / capacity, placed in the tables.
+fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, log_capacity: f64) -> Record {
+    let grid = &settings.grid;
+    let per_ah = libm::exp(-log_capacity);
+    let mut placed = record.clone();
+    for row in &mut placed.rows {
+        row.soc = beginning_soc + row.soc * per_ah;
+        let place = grid.place(row.soc, row.temperature_c);
+        (row.ocv, row.resistance, row.tau) =
+            (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
+    }
+    placed
+}
