@@ -73,7 +73,7 @@ impl Chemistry {
     /// How far the open-circuit voltage of a full cell is below the highest voltage, least and most, V: a charge ends with some
     /// current, and on a steep end the voltage falls much as the cell relaxes.
     fn full_below_v(self) -> [f64; 2] {
-        if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.0, 0.03] }
+        if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.005, 0.035] }
     }
 
     /// Hysteresis of the open-circuit voltage between charge and discharge, half of the difference, V: Dreyer et al., Nature
@@ -120,10 +120,11 @@ struct UsualResistance {
 const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 
 /// Geometric means over models fitted to Panasonic 18650PF, LG HG2, LG M50 (simulated), EVE LF280 and a Leaf cell.
-const RESISTANCE: [UsualResistance; 3] = [
+const RESISTANCE: [UsualResistance; 4] = [
     UsualResistance { ohm_ah: 0.073, tau_s: 0.0, shape: [1.6, 1.4, 1.25, 1.08, 1.0] },
     UsualResistance { ohm_ah: 0.031, tau_s: 10.0, shape: [3.5, 2.5, 1.8, 1.2, 1.1] },
-    UsualResistance { ohm_ah: 0.059, tau_s: 150.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
+    UsualResistance { ohm_ah: 0.050, tau_s: 100.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
+    UsualResistance { ohm_ah: 0.030, tau_s: 1000.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
 ];
 
 /// Deviation of ln(resistance) between cells, found on the same five. The temperature's law adds to it away from 25 degrees C.

@@ -34,6 +34,10 @@ const HOLE_S: f64 = 120.0;
 const LEAST_ROWS: usize = 20;
 /// Least standard deviation of the SOC at which a stretch begins.
 const BEGINNING_STD: f64 = 0.02;
+/// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
+/// this time, h.
+const HELD_V: f64 = 0.012;
+const FADED_H: f64 = 15.0;
 /// Temperatures of stretches closer than this share a node, K.
 const NODE_GAP_K: f64 = 5.0;
 /// Least error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
@@ -211,7 +215,17 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     };
     let record = Record::prepare(&part, &[], grid, &limits);
     let scale = record::share(&record) * record::weight(&record) / model.rated_capacity_ah;
-    UnanchoredRecord { record, scale, beginning: stretch.beginning }
+    let full_ah = full_ah(&part, model);
+    UnanchoredRecord { record, scale, beginning: stretch.beginning, full_ah }
+}
+
+/// Charge taken out where a charge at the highest voltage has faded: the cell is full. The last such row counts.
+fn full_ah(part: &MeasuredPart, model: &CellModel) -> Option<f64> {
+    let most_a = model.rated_capacity_ah / FADED_H;
+    let is_full = |&k: &usize| {
+        part.voltage_v[k] >= model.voltage_max_v - HELD_V && (-most_a..-0.01 * most_a).contains(&part.current_a[k])
+    };
+    (0..part.len()).rev().find(is_full).map(|k| -part.soc[k])
 }
 
 /// A node per group of temperatures; stretches without a temperature have that of the surroundings.

@@ -22,6 +22,9 @@ const BEGINNING: (f64, f64) = (-0.05, 1.05);
 /// Largest factor between the capacity and the label's.
 const CAPACITY_FACTOR: f64 = 1.6;
 
+/// Standard deviation of the SOC at the end of a full charge.
+const FULL_STD: f64 = 0.01;
+
 /// What is known before the fit.
 #[derive(Debug, Clone)]
 pub struct Known {
@@ -46,6 +49,8 @@ pub struct UnanchoredRecord {
     pub scale: f64,
     /// SOC at the first row, as far as it is known, with its standard deviation.
     pub beginning: (f64, f64),
+    /// Charge taken out, Ah, at the moment at which a charge ended with a full cell: SOC 1.
+    pub full_ah: Option<f64>,
 }
 
 /// A fit of tables, capacity and beginnings.
@@ -153,6 +158,12 @@ pub fn fit(
         near(log_capacity, log_label, known.capacity_std);
         for (k, record) in records.iter().enumerate() {
             near(beginning(k), record.beginning.0, record.beginning.1);
+        }
+        for (k, full_ah) in records.iter().enumerate().filter_map(|(k, record)| Some((k, record.full_ah?))) {
+            let taken = full_ah * libm::exp(-theta[log_capacity]);
+            let residual = (theta[beginning(k)] - taken - 1.0) / FULL_STD;
+            normal.cost += 0.5 * residual * residual;
+            normal.add(&[log_capacity, beginning(k)], &[taken / FULL_STD, 1.0 / FULL_STD], residual, 1.0);
         }
         normal
     };
