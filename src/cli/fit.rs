@@ -13,8 +13,8 @@ use super::numbers::{above_0, finite, share};
 use super::output::{failure, progress_bar, unless_closed};
 use super::replay::{InputArgs, log_options};
 use crate::cell::MAX_BRANCHES;
-use crate::lab;
 use crate::config;
+use crate::lab;
 use crate::lab::fit::logs::LogRequest;
 use crate::lab::fit::{self, FitProgress, FitRequest};
 

@@ -68,7 +68,8 @@ fn of_label(keys: &str) -> Result<Config, ConfigFaults> {
         if *name != BUILT_IN[0].0 {
             return Ok(bytes.to_vec());
         }
-        let with_label = |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { format!("{line}\n") };
+        let with_label =
+            |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { format!("{line}\n") };
         Ok(String::from_utf8_lossy(bytes).lines().map(with_label).collect::<String>().into_bytes())
     };
     config::load_with(&ConfigFiles::alone(Path::new(BUILT_IN[0].0)), &read)

@@ -26,6 +26,7 @@
 //! | another end-to-end profile | `can/e2e.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
+//! | a chemistry on the label | `cell/chemistry.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |
 //! | how a model of another cell is found | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |

@@ -26,6 +26,7 @@ mod e2e_peer;
 #[cfg(feature = "lab")]
 mod export_cli;
 mod fit_cli;
+mod fit_logs;
 #[cfg(feature = "lab")]
 mod gp_measured;
 #[cfg(feature = "lab")]

@@ -100,9 +100,8 @@ pub struct Label {
 }
 
 /// SOC breakpoints of a model from a label.
-const SOC: [f64; 21] = [
-    0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0,
-];
+const SOC: [f64; 21] =
+    [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0];
 
 /// Temperature breakpoints, degrees C: Arrhenius' law holds between them.
 const TEMPERATURE_C: [f64; 4] = [-30.0, 0.0, 25.0, 60.0];
@@ -171,7 +170,8 @@ impl Label {
             .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, self.rated_ah, &rows));
         aged_ocv.add_spread(&modes_v);
         let table = |resistance: &UsualResistance| {
-            let at = |soc: f64| resistance.ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, &resistance.shape, soc);
+            let at =
+                |soc: f64| resistance.ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, &resistance.shape, soc);
             let row = |t: &f64| SOC.iter().map(|&soc| at(soc) * arrhenius(*t)).collect();
             Table { values: TEMPERATURE_C.iter().map(row).collect() }
         };

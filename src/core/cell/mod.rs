@@ -24,6 +24,7 @@ pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use loss_modes::LossModes;
 pub use model::{
-    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal, arrhenius,
+    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,
+    arrhenius,
 };
 pub use model_check::{ModelCheck, ModelEvidence};

@@ -2,8 +2,8 @@
 
 use super::alarm::{self, RatedCell};
 use super::document::{Faults, TablePlace};
-use super::label;
 use super::keys::{CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput};
+use super::label;
 use super::tables::RawTables;
 use crate::cell::{CapacityState, CellModel};
 

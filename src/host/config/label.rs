@@ -11,7 +11,11 @@ use crate::cell::{CellModel, Label};
 pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
     let pack = raw.pack.as_ref()?;
     let Some(chemistry) = pack.chemistry else {
-        pack.place.fault(faults, "cell_model", "must be a cell model file; or chemistry and rated_capacity_ah must be given");
+        pack.place.fault(
+            faults,
+            "cell_model",
+            "must be a cell model file; or chemistry and rated_capacity_ah must be given",
+        );
         return None;
     };
     let Some(rated_ah) = pack.rated_capacity_ah else {

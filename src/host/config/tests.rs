@@ -12,6 +12,7 @@ mod cell_model;
 mod diagnostic;
 mod drop_ins;
 mod j1939;
+mod label;
 mod plausible;
 mod protect;
 

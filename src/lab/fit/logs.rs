@@ -45,8 +45,8 @@ const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
 /// SOC breakpoints of the fitted tables.
 const SOC: [f64; 25] = [
-    0.0, 0.02, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9,
-    0.93, 0.96, 0.98, 1.0,
+    0.0, 0.02, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
+    0.9, 0.93, 0.96, 0.98, 1.0,
 ];
 
 /// Logs of a pack, and how they are read.
@@ -131,7 +131,8 @@ impl MeanCell {
 /// Logs that cannot be read, and data that do not support a fit: one line each.
 pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     let numbered: Vec<(usize, &PathBuf)> = request.logs.iter().enumerate().collect();
-    let read: Result<Vec<_>, LabError> = numbered.par_iter().map(|(log, path)| stretches(request, *log, path)).collect();
+    let read: Result<Vec<_>, LabError> =
+        numbered.par_iter().map(|(log, path)| stretches(request, *log, path)).collect();
     let stretches: Vec<Stretch> = read?.into_iter().flatten().filter(|s| s.part.len() >= LEAST_ROWS).collect();
     progress(FitProgress::Read(request.logs.len(), request.logs.len()));
     if stretches.is_empty() {
@@ -244,7 +245,11 @@ fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
 /// What the configured model says before the fit.
 fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
     let per_node = |value: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
-        grid.temperature_c.iter().flat_map(|&t| grid.soc.iter().map(move |&soc| (soc, t))).map(|(soc, t)| value(soc, t)).collect()
+        grid.temperature_c
+            .iter()
+            .flat_map(|&t| grid.soc.iter().map(move |&soc| (soc, t)))
+            .map(|(soc, t)| value(soc, t))
+            .collect()
     };
     let at = |soc: f64, t: f64| model.grid_position(soc, t);
     let branches = 0..model.branches.len();

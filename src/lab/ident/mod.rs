@@ -3,6 +3,7 @@
 //! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, places in
 //! the tables, weights) -> [`pass`] (residuals and the exact Jacobian by sensitivity recursion) with [`prior`]
 //! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (the whole, residuals per file, nodes without data).
+//! Records that begin anywhere have no known SOC: [`unanchored`] finds it with the tables.
 //! [`error_table`] estimates the model's error, [`thermal`] fits heat capacity and thermal resistance afterwards.
 
 pub mod ageing;

@@ -178,8 +178,8 @@ impl FreeScale<'_> {
             tables.ocv_v[first + 1] - tables.ocv_v[first]
         };
         let upper_v = if place.along_t == 0.0 { 0.0 } else { place.along_t * rise_v(place.t + 1) };
-        let slope_v = ((1.0 - place.along_t) * rise_v(place.t) + upper_v)
-            / (self.grid.soc[place.s + 1] - self.grid.soc[place.s]);
+        let slope_v =
+            ((1.0 - place.along_t) * rise_v(place.t) + upper_v) / (self.grid.soc[place.s + 1] - self.grid.soc[place.s]);
         index.extend([self.log_capacity, self.beginning]);
         j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v]);
     }

@@ -134,13 +134,13 @@ pub fn fit(
         space.low.push(BEGINNING.0);
         space.high.push(BEGINNING.1);
     }
-    let placed = |theta: &[f64], k: usize| place(&records[k].record, settings, theta[beginning(k)], theta[log_capacity]);
+    let placed =
+        |theta: &[f64], k: usize| place(&records[k].record, settings, theta[beginning(k)], theta[log_capacity]);
     let evaluate = |theta: &[f64]| {
         let tables = ParameterTables::new(&layout, theta);
         let of_record = |k: usize| {
             let mut normal = NormalEquations::new(theta.len());
-            let free =
-                FreeScale { grid, log_capacity, beginning: beginning(k), beginning_soc: theta[beginning(k)] };
+            let free = FreeScale { grid, log_capacity, beginning: beginning(k), beginning_soc: theta[beginning(k)] };
             accumulate(&placed(theta, k), records[k].scale, &layout, &tables, Some(&free), &mut normal);
             normal
         };

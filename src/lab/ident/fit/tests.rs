@@ -127,7 +127,7 @@ fn the_gradient_is_that_of_finite_differences() {
     let prior = Prior::new(&grid, &layout, &start, true, &PriorDeviations::SLOW_TEST);
     let evaluate = |theta: &[f64]| {
         let mut normal = NormalEquations::new(layout.len());
-        accumulate(&record, 0.7, &layout, &ParameterTables::new(&layout, theta), &mut normal);
+        accumulate(&record, 0.7, &layout, &ParameterTables::new(&layout, theta), None, &mut normal);
         prior.accumulate(theta, &mut normal);
         normal
     };
