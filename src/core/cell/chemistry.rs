@@ -1,4 +1,4 @@
-//! The cell nobody measured: a cell model from what is on the label, with the spread of cells of that chemistry.
+//! A cell that was never measured: a cell model from what is on the label, with the spread of cells of that chemistry.
 //!
 //! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`] whose [`ModelSpread`] and curve modes say how
 //! far a cell may be from it. No measured cell is needed, and none of those that judge it has been used for its curve.

@@ -7,7 +7,7 @@
 //! their mean voltage is fitted, as one cell. A hole in the record begins a new stretch, whose SOC is another unknown.
 
 use std::cell::RefCell;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use nalgebra::DMatrix;
@@ -188,12 +188,12 @@ pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> R
 }
 
 /// The stretches of one log.
-fn stretches(request: &LogRequest<'_>, log: usize, path: &PathBuf) -> Result<Vec<Stretch>, LabError> {
+fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
     let watch = move |out: &Outputs| out.estimates.iter().for_each(|estimate| watched.borrow_mut().take(estimate));
     let sinks = Sinks { watch: Some(Box::new(watch)), ..Sinks::default() };
-    let mut source = LogSource::new([path.clone()], (request.options)());
+    let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
     let monitor = Monitor::new(request.monitor.clone());
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ()).map_err(|error| LabError(error.to_string()))?;

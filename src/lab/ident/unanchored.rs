@@ -5,7 +5,7 @@
 //!
 //! SOC = s_k - q / C: the beginning s_k of record k and ln C are parameters beside those of the tables, and all are found
 //! together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
-//! as in the prior. The rows are placed in the tables anew in every pass.
+//! as in the prior. Every pass places the rows in the tables again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
