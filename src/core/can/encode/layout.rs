@@ -31,7 +31,7 @@ pub const ALARM_DELAY_MS: u32 = 10;
 pub const REPLY_DELAY_MS: u32 = 100;
 
 /// Cycle time of a sent message without one in the settings or the base, ms.
-pub(super) const DEFAULT_PERIOD_MS: u32 = 1000;
+pub const DEFAULT_PERIOD_MS: u32 = 1000;
 
 /// The DBC that ships with the program.
 ///

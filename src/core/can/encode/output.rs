@@ -251,6 +251,25 @@ impl OutputPlan {
         self.messages().map(|message| message.id).collect()
     }
 
+    /// Advances the counter of a message as if so many of its frames were sent.
+    pub fn skip(&self, message: LayoutMessage, frames: u64, counters: &mut SendCounters) {
+        let Some(protection) = self.messages().find(|sent| sent.message == message).and_then(|sent| sent.protection)
+        else {
+            return;
+        };
+        let counter = match message {
+            LayoutMessage::Status => &mut counters.status,
+            LayoutMessage::Health => &mut counters.health,
+            LayoutMessage::Alarm => &mut counters.alarm,
+            LayoutMessage::Digest => &mut counters.digest,
+            LayoutMessage::Reply => &mut counters.reply,
+            LayoutMessage::Command => return,
+        };
+        let codes = u64::from(protection.profile.max_counter()) + 1;
+        let skipped = (u64::from(*counter) + frames % codes) % codes;
+        *counter = u8::try_from(skipped).unwrap_or(0);
+    }
+
     /// Whether replies are sent.
     pub fn has_reply(&self) -> bool {
         self.reply.is_some()

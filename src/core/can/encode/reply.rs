@@ -162,12 +162,9 @@ mod tests {
 
     #[test]
     fn a_frame_that_was_not_executed_has_its_reason_and_no_counts() {
-        for (status, reason) in [
-            (Status::Initial, 1),
-            (Status::WrongCrc, 2),
-            (Status::Repeated, 3),
-            (Status::WrongSequence, 4),
-        ] {
+        for (status, reason) in
+            [(Status::Initial, 1), (Status::WrongCrc, 2), (Status::Repeated, 3), (Status::WrongSequence, 4)]
+        {
             let refusal = CommandRefusal::of(status).unwrap();
             assert_eq!(codes(&fields(Err(refusal), Command::Clear)), [2, reason, 2, 9, 0, 5, 255, 63, 15]);
         }
