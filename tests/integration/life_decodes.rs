@@ -108,7 +108,10 @@ fn protected_pack() -> String {
             "[output.status]\nid = 0x18FF5001\nextended = true\nfd = true\ne2e = \"5\"\ndata_id = 0x101\nperiod_ms = 500",
         ),
         ("[output.health]", "[output.health]\nfd = true\nbrs = true\ne2e = \"1C\"\ndata_id = 0x102"),
-        ("[output.alarm]", "[output.digest]\ne2e = \"1C\"\ndata_id = 0x104\n[output.alarm]\ne2e = \"1A\"\ndata_id = 0x103"),
+        (
+            "[output.alarm]",
+            "[output.digest]\ne2e = \"1C\"\ndata_id = 0x104\n[output.alarm]\ne2e = \"1A\"\ndata_id = 0x103",
+        ),
     ] {
         assert!(text.contains(from), "{from}");
         text = text.replace(from, to);

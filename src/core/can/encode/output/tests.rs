@@ -339,7 +339,10 @@ fn a_value_that_could_be_read_as_another_s_is_refused() {
         ]
     );
     let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
-    assert_eq!(unreachable, 15, "of health three signals are on page 2, three on page 3, six on page 4; of the digest three on page 2");
+    assert_eq!(
+        unreachable, 15,
+        "of health three signals are on page 2, three on page 3, six on page 4; of the digest three on page 2"
+    );
 }
 
 #[test]
