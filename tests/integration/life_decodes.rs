@@ -70,7 +70,7 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     );
     // Not one frame is left out.
     let sent = fs::read_to_string(folder.join("out.log")).unwrap().lines().count();
-    let frames = ["Status", "Health", "Alarm"].map(|name| found["frames"][name].as_u64().unwrap());
+    let frames = ["Status", "Health", "Alarm", "Digest"].map(|name| found["frames"][name].as_u64().unwrap());
     assert_eq!(frames.iter().sum::<u64>(), u64::try_from(sent).unwrap());
     assert!(found["restated"].as_u64().unwrap() < frames[1] / 100, "only at changes of mode: {}", found["restated"]);
     found

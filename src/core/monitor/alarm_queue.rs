@@ -213,6 +213,13 @@ impl AlarmQueue {
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
+    /// Nothing waits longer than it would after a frame at `now`, whatever a stored state says.
+    pub(super) fn limit(&mut self, now: Timestamp, period_s: f64) {
+        self.free = self.free.min(now.plus_nanos(DELAY_NS));
+        self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));
+        self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now.plus_nanos(REPETITION_NS)));
+    }
+
     /// Moves stored times onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.free = self.free.plus_nanos(by_nanos);

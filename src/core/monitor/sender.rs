@@ -201,6 +201,7 @@ impl Sender {
         };
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
         let unknown = u64::from(engine.unknown().1 > 0) * periods(*alarm, config.alarm_period_s);
+        alarms.limit(now, config.alarm_period_s);
         for (message, frames) in [
             (LayoutMessage::Status, periods(*status, config.status_period_s)),
             (

@@ -244,7 +244,6 @@ impl Stages {
         self.alarming.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(state);
         self.sender.skip_counters(time, &self.alarming.engine);
-        self.sender.schedule.alarms.restart(time);
         for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());

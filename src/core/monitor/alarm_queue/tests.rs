@@ -154,6 +154,17 @@ fn frames_until_a_time_are_those_that_are_sent_until_then() {
 }
 
 #[test]
+fn a_stored_state_with_times_far_ahead_stops_nothing() {
+    let (mut queue, mut engine) = (AlarmQueue::default(), engine());
+    raise(&mut engine, 2);
+    sent(&mut queue, &engine, 0, 2_000);
+    queue.note_change(Timestamp::from_secs(2.0), cell_key(1));
+    queue.rebase(i64::MAX / 2);
+    queue.limit(Timestamp::from_secs(2.0), PERIOD_S);
+    assert!(sent(&mut queue, &engine, 2_000, 1_500).len() >= 5);
+}
+
+#[test]
 fn a_clock_that_is_set_back_stops_nothing() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     raise(&mut engine, 2);
