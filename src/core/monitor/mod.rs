@@ -20,6 +20,7 @@ mod batch;
 mod buses;
 mod clock;
 mod config;
+mod digest;
 mod estimation;
 mod event;
 mod input;

@@ -6,13 +6,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::alarm_queue::{AlarmKey, AlarmQueue};
+use super::digest;
 use super::j1939::J1939;
 use super::{Event, EventKind, MonitorConfig, Outputs, SupplyConfig, Transmit};
-use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, RuleSummary, Severity};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule};
 use crate::can::Frame;
 use crate::can::encode::{
-    AlarmFields, DigestFields, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields, RuleState,
-    SendCounters, StatusFields, TableChecksum, ThresholdFields,
+    AlarmFields, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields, SendCounters, StatusFields,
 };
 use crate::can::poll::{PollOutputs, Poller};
 use crate::quantity::{BusIndex, Fault, Timestamp};
@@ -334,7 +334,7 @@ impl Sender {
         }
         let turn = self.schedule.threshold_turn;
         self.schedule.threshold_turn = turn.wrapping_add(1);
-        let fields = digest_fields(engine, period_s, turn);
+        let fields = digest::fields(engine, period_s, turn);
         for page in 0..pages {
             self.send_if(now, out, |plan, counters| plan.digest(page, &fields, counters));
         }
@@ -483,35 +483,5 @@ impl Sender {
         if let Some(j1939) = &mut self.j1939 {
             j1939.update_trouble_codes(now, engine, self.test.is_some());
         }
-    }
-}
-
-/// Contents of the digest; `turn` selects the threshold.
-fn digest_fields(engine: &AlarmEngine, alarm_period_s: f64, turn: usize) -> DigestFields {
-    let mut checksum = TableChecksum::default();
-    for alarm in engine.raised() {
-        let (rule, severity) = (alarm.rule as u8, alarm.severity as u8);
-        checksum.add(rule, severity, alarm.cell, alarm.state.wire_code(), alarm.is_acknowledged);
-    }
-    let state = |rule: Rule| match engine.rule_summary(rule) {
-        None => RuleState::NotWatched,
-        Some(RuleSummary { worst: Some(Severity::Info), .. }) => RuleState::Info,
-        Some(RuleSummary { worst: Some(Severity::Warning), .. }) => RuleState::Warning,
-        Some(RuleSummary { worst: Some(Severity::Severe), .. }) => RuleState::Severe,
-        Some(RuleSummary { worst: None, is_known: true }) => RuleState::None,
-        Some(RuleSummary { worst: None, is_known: false }) => RuleState::Unknown,
-    };
-    let threshold = |(rule, severity, threshold): (Rule, Severity, f64)| ThresholdFields {
-        rule: rule as u8,
-        severity: severity as u8,
-        threshold,
-    };
-    DigestFields {
-        raised: engine.count(),
-        worst: engine.highest_severity().map_or(0, |severity| severity as u8),
-        checksum,
-        pass_time_s: AlarmQueue::pass_time_s(engine, alarm_period_s),
-        rules: Rule::ALL.map(state),
-        threshold: engine.threshold(turn).map(threshold),
     }
 }

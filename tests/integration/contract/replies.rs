@@ -159,3 +159,24 @@ fn counters_after_a_kill_are_those_of_a_daemon_that_never_stopped() {
         assert!(pages % 3 == 1, "{unstored_deci} {away_deci}: whole periods of three pages: {pages}");
     }
 }
+
+#[test]
+fn a_state_of_an_earlier_program_is_restored_and_its_alarms_are_sent() {
+    let mut rig = Rig::new(HOT);
+    rig.heat(60.0, 3);
+    let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
+    let schedule = stored["schedule"].as_object_mut().unwrap();
+    for key in ["digest", "threshold_turn", "reply", "alarms"] {
+        assert!(schedule.remove(key).is_some(), "{key}");
+    }
+    let counters = schedule["counters"].as_object_mut().unwrap();
+    assert!(counters.remove("digest").is_some() && counters.remove("reply").is_some());
+    rig.monitor = Monitor::new(rig.config.clone());
+    rig.monitor.restore(serde_json::from_value(stored).unwrap(), Downtime::Seconds(1.0)).unwrap();
+    rig.deci += 10;
+    rig.frames.clear();
+    rig.seconds(4);
+    assert_eq!(rig.last_wire(Rule::TemperatureHigh).state, 1);
+    assert!(rig.wire().len() >= 6, "twice a second: {}", rig.wire().len());
+    assert_eq!(rig.digest(0, 20, 12), 1);
+}
