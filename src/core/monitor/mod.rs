@@ -11,7 +11,7 @@
 //! * `intake`: flood limit, end-to-end check, commands, interfaces; `sampling`: signals, pack identity;
 //! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
 //! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
-//! * `sender`, `j1939`: cyclic frames, alarm frames, trouble codes;
+//! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
 //! * `stages` wires all of these; `clock`, `snapshot`, `reconfigure`, `statistics`, `view` go with the whole.
 
 mod alarm_queue;
