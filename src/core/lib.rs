@@ -23,7 +23,7 @@
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
 //! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
 //! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
-| which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
+//! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
