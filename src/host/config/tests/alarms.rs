@@ -91,11 +91,11 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[output.digest]\nid = 0x6B2\n",
-            "pack.toml:17: output.digest.id = 0x6B2, digest and alarm frame would both be 6B2, must differ",
+            "pack.toml:16: output.digest.id = 0x6B2, digest and alarm frame would both be 6B2, must differ",
         ),
         (
             "[output.reply]\nperiod_ms = 100\n",
-            "pack.toml:17: output.reply.period_ms = 100, must not be given: a reply is sent on a command only",
+            "pack.toml:16: output.reply.period_ms = 100, must not be given: a reply is sent on a command only",
         ),
         (
             "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
