@@ -40,6 +40,7 @@
 //! | debounce, hysteresis, latch of an alarm | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
 //! | a new event | `core/monitor/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
+//! | which alarm is sent when, how often it is repeated | `core/monitor/alarm_queue.rs`; the promise to receivers: `/docs/src/ecu/contract.md` |
 //! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
 //! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/diagnostic.rs`; `core/can/poll.rs` |
 //! | when the buses sleep | `core/monitor/sleep.rs` |

@@ -142,7 +142,7 @@ fn sent(output: &OutputUse) -> Vec<String> {
         output.frame.to_owned(),
         output.id.clone(),
         output.interfaces.join(" "),
-        format!("every {} ms", output.period_ms),
+        output.period_ms.map_or("on a command".to_owned(), |period_ms| format!("every {period_ms} ms")),
         output.kind.to_owned(),
         match output.protection.as_str() {
             "none" => "no end-to-end protection".to_owned(),

@@ -11,7 +11,7 @@
 //! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
 //! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
-//! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
+//! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
 //!
 //! # Where a change belongs
 //! | change | file |
@@ -22,7 +22,8 @@
 //! | a new field of the live view | `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
 //! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
-//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value) |
+//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
+//! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |

@@ -70,7 +70,7 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     );
     // Not one frame is left out.
     let sent = fs::read_to_string(folder.join("out.log")).unwrap().lines().count();
-    let frames = ["Status", "Health", "Alarm"].map(|name| found["frames"][name].as_u64().unwrap());
+    let frames = ["Status", "Health", "Alarm", "Digest"].map(|name| found["frames"][name].as_u64().unwrap());
     assert_eq!(frames.iter().sum::<u64>(), u64::try_from(sent).unwrap());
     assert!(found["restated"].as_u64().unwrap() < frames[1] / 100, "only at changes of mode: {}", found["restated"]);
     found
@@ -108,7 +108,10 @@ fn protected_pack() -> String {
             "[output.status]\nid = 0x18FF5001\nextended = true\nfd = true\ne2e = \"5\"\ndata_id = 0x101\nperiod_ms = 500",
         ),
         ("[output.health]", "[output.health]\nfd = true\nbrs = true\ne2e = \"1C\"\ndata_id = 0x102"),
-        ("[output.alarm]", "[output.alarm]\ne2e = \"1A\"\ndata_id = 0x103"),
+        (
+            "[output.alarm]",
+            "[output.digest]\ne2e = \"1C\"\ndata_id = 0x104\n[output.alarm]\ne2e = \"1A\"\ndata_id = 0x103",
+        ),
     ] {
         assert!(text.contains(from), "{from}");
         text = text.replace(from, to);
@@ -144,8 +147,8 @@ fn every_protected_frame_of_a_pack_of_eight_cells_says_what_the_replay_reports()
 /// Verifies checksum and counter of every frame of a log; how many there were.
 fn check_headers(log: &Path, config: &Path) -> usize {
     let plan = packwatch::config::load(config).unwrap().monitor.output.unwrap().plan;
-    let messages: Vec<_> = plan.ids().into_iter().zip(plan.protections()).collect();
-    let mut next = [None; 3];
+    let messages: Vec<_> = plan.messages().map(|sent| (sent.id, sent.protection)).collect();
+    let mut next = vec![None; messages.len()];
     let text = fs::read_to_string(log).unwrap();
     for line in text.lines() {
         let frame = line.split(' ').next_back().unwrap();

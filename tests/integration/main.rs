@@ -17,6 +17,7 @@ mod can_data;
 mod capacity_peers;
 mod check_cli;
 mod contactor;
+mod contract;
 mod dbc_vectors;
 mod diagnostic;
 #[cfg(feature = "lab")]

@@ -34,8 +34,11 @@ fn alarms_and_health_announce_and_the_status_does_not() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.temperatures_c[0] = Some(60.0);
     rig.seconds(12);
-    let [status, health, alarm] = [0x6B0, 0x6B1, 0x6B2].map(|id| CanId::standard(id).unwrap());
-    assert_eq!(rig.sent.iter().copied().collect::<Vec<_>>(), [(status, false), (health, true), (alarm, true)]);
+    let [status, health, alarm, digest] = [0x6B0, 0x6B1, 0x6B2, 0x6B4].map(|id| CanId::standard(id).unwrap());
+    assert_eq!(
+        rig.sent.iter().copied().collect::<Vec<_>>(),
+        [(status, false), (health, true), (alarm, true), (digest, true)]
+    );
 }
 
 #[test]

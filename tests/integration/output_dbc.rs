@@ -83,6 +83,8 @@ impl Case {
             health: self.message(2),
             alarm: self.message(3),
             command: Some(self.message(4)),
+            digest: self.message(5),
+            reply: self.message(6),
         };
         layout(LayoutBase::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
     }
@@ -308,7 +310,7 @@ fn a_consumer_reads_the_configuration_from_the_dbc() {
     for case in Case::all() {
         std::fs::write(&path, case.layout().to_dbc_bytes()).unwrap();
         let profile = case.profile.map_or("-", |profile| profile.name());
-        let wanted = (1..).zip(["Status", "Health", "Alarm", "Command"]).map(|(number, name)| {
+        let wanted = (1..).zip(["Status", "Health", "Alarm", "Command", "Digest", "Reply"]).map(|(number, name)| {
             let id = case.message(number).id.unwrap().raw();
             let (extended, fd) = (u8::from(case.extended), u8::from(case.fd));
             let length = if case.profile == Some(Profile::P05) { 12 } else { 8 };

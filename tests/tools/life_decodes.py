@@ -20,6 +20,7 @@ MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
 MAX_TOLD = 20
+WAIT_NS = 2 * 10**9  # longest wait of a first frame for the budget
 LOSS_SIGNALS = ("Lli", "LliStd", "LamNe", "LamNeStd", "LamPe", "LamPeStd")
 
 
@@ -70,6 +71,7 @@ class Life:
         self.pack = None
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
+        self.changed = {}  # the same key: the last event, raised or not
         self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
         self.recharge = None  # the last reported
         self.normalised = None
@@ -128,6 +130,7 @@ class Life:
             self.pack, self.mode = None, "unknown"
         elif kind == "alarm":
             key = event["rule"], event["cell"], event["severity"]
+            self.changed[key] = event
             if event["active"]:
                 self.alarms[key] = event
             else:
@@ -264,6 +267,8 @@ def compare(reader, life, estimates, events, frame_list):
                         result.restated += 1
                         continue
                     result.value(time, message, signal, values[signal], wanted)
+        elif message == "Digest":
+            compare_digest(result, life, time, values)
         else:
             compare_alarm(result, life, time, values, told)
     for time, left in told.items():
@@ -272,20 +277,31 @@ def compare(reader, life, estimates, events, frame_list):
     return result
 
 
+def compare_digest(result, life, time, values):
+    """The digest's count and worst severity are those of the events."""
+    if "Raised" in values:
+        result.value(time, "Digest", "Raised", values["Raised"], len(life.alarms))
+        result.value(time, "Digest", "Worst", values["Worst"], max((SEVERITIES[of] for _, _, of in life.alarms), default=0))
+
+
 def compare_alarm(result, life, time, values, told):
-    """A frame at an alarm event's own time is that event's, until it has one; the others repeat what is raised or unknown."""
+    """The first frame after an alarm event is that event's; the others repeat what is raised, unknown, or changed before."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
     severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
     name = next(signal for signal in values if signal.startswith("Value_"))
     threshold = name.replace("Value_", "Threshold_")
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
-    at_once = next((e for e in told.get(time, []) if (e["rule"], e["cell"], e["severity"]) == key), None)
+    # More changes than the budget of frames are sent one after the other, each alarm as it is then.
+    waiting = [(at, e) for at in told if time - WAIT_NS <= at <= time for e in told[at] if (e["rule"], e["cell"], e["severity"]) == key]
+    at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)
     event = at_once or life.alarms.get(key)
     if at_once:
-        told[time].remove(at_once)
-        result.value(time, "Alarm", name, values[name], scaled(at_once["value"], factor))
+        for at, past in waiting:
+            told[at].remove(past)
+        if waiting[-1][0] == time:
+            result.value(time, "Alarm", name, values[name], scaled(at_once["value"], factor))
         result.frames["Alarm at once"] += 1
     elif event and rule == "capacity_low" and values["State"] == STATES["active"]:
         result.value(time, "Alarm", name, values[name], life.capacity[cell][0])
@@ -297,6 +313,13 @@ def compare_alarm(result, life, time, values, told):
         # Not raised, and it is unknown whether it should be.
         result.value(time, "Alarm", name, values[name], None)
         result.frames["Alarm unknown"] += 1
+    elif key in life.changed:
+        # A repetition: it is over.
+        result.value(time, "Alarm", "State", values["State"], STATES[life.changed[key]["state"]])
+        result.frames["Alarm repeated"] += 1
+    elif values["State"] == STATES["inactive"]:
+        # It was announced as unknown, and is known again.
+        result.frames["Alarm known again"] += 1
     else:
         result.fault(time, "Alarm", f"{key} is sent and is not raised")
 

@@ -5,6 +5,8 @@
 //! alarms of its own. A value for a rule that is not configured, or for a cell a rule does not watch, concerns no alarm
 //! and is ignored.
 
+pub mod summary;
+
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
@@ -267,48 +269,9 @@ impl AlarmEngine {
             .flat_map(move |(index, rule)| rule.slots().map(move |slot| self.alarm(index, slot)))
     }
 
-    /// Every threshold, in the order of rule and severity.
-    pub fn thresholds(&self) -> impl DoubleEndedIterator<Item = ThresholdState> + '_ {
-        self.rules.iter().map(|rule| {
-            let machines = &self.machines[rule.slots()];
-            ThresholdState {
-                rule: rule.config.rule,
-                severity: rule.config.severity,
-                is_raised: machines.iter().any(|machine| machine.state.is_raised()),
-                occurrences: machines.iter().map(|machine| machine.occurrences).max().unwrap_or(0),
-            }
-        })
-    }
-
-    /// The worst severity of the raised alarms; `None` = none is raised.
-    pub fn highest_severity(&self) -> Option<Severity> {
-        self.raised.iter().map(|&slot| self.rules[self.rule_of(slot)].config.severity).max()
-    }
-
     /// Raised alarms.
     pub fn count(&self) -> usize {
         self.raised.len()
-    }
-
-    /// Thresholds, and those of them with an alarm whose value is not known.
-    pub fn unknown(&self) -> (usize, usize) {
-        (self.rules.len(), self.rules.iter().filter(|rule| rule.unknown > 0).count())
-    }
-
-    /// The thresholds with unknown values: rule, severity, how many of their alarms.
-    pub fn unknown_thresholds(&self) -> impl Iterator<Item = (Rule, Severity, usize)> + '_ {
-        let waiting = self.rules.iter().filter(|rule| rule.unknown > 0);
-        waiting.map(|rule| (rule.config.rule, rule.config.severity, rule.unknown))
-    }
-
-    /// For the `turn`-th of the thresholds with unknown values, counted round and round, one such alarm that is not
-    /// raised; `None` = there is none.
-    pub fn unknown_alarm(&self, turn: usize) -> Option<Alarm> {
-        let (_, count) = self.unknown();
-        let mut waiting = self.rules.iter().enumerate().filter(|(_, rule)| rule.unknown > 0);
-        let (index, rule) = waiting.nth(turn.checked_rem(count)?)?;
-        let is_waiting = |slot: &usize| !self.machines[*slot].is_known && !self.machines[*slot].state.is_raised();
-        rule.slots().find(is_waiting).map(|slot| self.alarm(index, slot))
     }
 
     /// The alarm of a rule and cell as it is now (the worst severity's, when the rule has several thresholds); `None` =

@@ -17,6 +17,7 @@ pub mod machine;
 pub mod rule;
 pub mod selector;
 
+pub use engine::summary::RuleSummary;
 pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmSnapshot, StoredAlarm, ThresholdState};
 pub use input::AlarmInput;
 pub use limit::{Comparison, Observation, RuleConfig};

@@ -58,6 +58,17 @@ pub enum FrameFormat {
     },
 }
 
+/// How a message is repeated after an event; `None` = not stated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Repetition {
+    /// `GenMsgNrOfRepetition`: frames after the first.
+    pub count: Option<u32>,
+    /// `GenMsgCycleTimeFast`: time between them, ms.
+    pub period_ms: Option<u32>,
+    /// `GenMsgDelayTime`: shortest mean time between two frames of the message, ms.
+    pub delay_ms: Option<u32>,
+}
+
 /// One message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
@@ -77,6 +88,8 @@ pub struct Message {
     pub signals: Vec<Signal>,
     /// `GenMsgCycleTime` (or its default), when above 0.
     pub cycle_time_ms: Option<u32>,
+    /// How it is repeated after an event.
+    pub repetition: Repetition,
     /// `CM_ BO_`.
     pub comment: Option<String>,
 }
@@ -335,7 +348,8 @@ fn read_message<'a>(
         format: attributes::format(dbc, message.id),
         e2e: attributes::e2e(dbc, message.id),
         signals: signals?,
-        cycle_time_ms: attributes::cycle_time_ms(dbc, message.id),
+        cycle_time_ms: attributes::positive(dbc, message.id, attributes::CYCLE_TIME),
+        repetition: attributes::repetition(dbc, message.id),
         comment: dbc.message_comment(message.id).map(str::to_owned),
     })
 }

@@ -212,7 +212,8 @@ fn crc8(start: u8, bytes: &[u8]) -> u8 {
     bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 
-fn crc16(start: u16, bytes: &[u8]) -> u16 {
+/// CRC-16 with the polynomial 0x1021, most significant bit first.
+pub(super) fn crc16(start: u16, bytes: &[u8]) -> u16 {
     bytes.iter().fold(start, |crc, byte| CRC16[usize::from(crc >> 8 ^ u16::from(*byte))] ^ crc << 8)
 }
 

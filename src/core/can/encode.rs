@@ -5,16 +5,21 @@
 //! the signal's "not available" code, never as a number.
 
 mod command;
+mod digest;
 mod input;
 mod layout;
 mod message;
 mod output;
 mod protector;
+mod reply;
 
 pub use command::{Command, CommandFault, CommandFields, CommandPlan};
+pub use digest::{DigestFields, RuleState, TableChecksum, ThresholdFields};
 pub use input::InputEncoder;
 pub use layout::{
-    E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, SettingFault, default_database, layout,
+    ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS, DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage,
+    LayoutSettings, MessageSettings, REPLY_DELAY_MS, SettingFault, default_database, layout,
 };
-pub use output::{AlarmFields, HealthFields, OutputPlan, PlanFaults, SendCounters, StatusFields};
+pub use output::{AlarmFields, HealthFields, OutputPlan, PlanFaults, SendCounters, SentMessage, StatusFields};
 pub use protector::InputProtector;
+pub use reply::{CommandRefusal, ReplyFields};

@@ -128,6 +128,13 @@ impl Guards {
         Some(status)
     }
 
+    /// Counter that the next frame of a protected message must have; `None` = it is not protected, or any.
+    pub fn next_counter(&self, bus: BusIndex, id: CanId) -> Option<u8> {
+        let found = self.guards.binary_search_by_key(&(bus, id), |guard| (guard.config.bus, guard.config.id)).ok()?;
+        let guard = &self.guards[found];
+        guard.receiver.next_counter(guard.config.check.protection.profile)
+    }
+
     /// Counts the frames that are missing by now.
     pub fn poll(&mut self, now: Timestamp) {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));

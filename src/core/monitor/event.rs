@@ -6,6 +6,7 @@ use super::input::{BusEvent, Command, Source};
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::decode::Channel;
 use crate::can::diagnostic::MessageLoss;
+use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
@@ -149,8 +150,11 @@ pub enum EventKind {
     BadCommand {
         /// Interface it came on.
         bus: BusIndex,
-        /// Its protection was in order, but its content has no meaning; otherwise it failed its check.
+        /// Its checksum was right.
         intact: bool,
+        /// Why it was rejected; `None` in events of earlier programs.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        reason: Option<CommandRefusal>,
     },
     /// A test of a rule's alarm frame began or ended.
     Test {

@@ -12,7 +12,8 @@ use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
 use crate::can::diagnostic::{self, Controller, ControllerCounts, Listener};
-use crate::can::encode::{self, CommandFields, CommandPlan};
+use crate::can::e2e::Status;
+use crate::can::encode::{self, CommandFields, CommandPlan, CommandRefusal};
 use crate::can::flood::{FloodCount, FloodGate};
 use crate::can::guard::{GuardCounts, Guards};
 use crate::quantity::{BusIndex, Fault, Timestamp};
@@ -44,6 +45,18 @@ pub(super) struct Intake {
     pub(super) moments: Vec<Option<Moment>>,
     /// When a rejected command frame was last reported.
     pub(super) bad_command_at: Option<Timestamp>,
+}
+
+/// Result of an admitted frame's end-to-end check; `None` = its message is not protected.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Admission(Option<Status>);
+
+impl Admission {
+    /// Whether the frame's readings may be used.
+    #[inline]
+    pub(super) fn readings(self) -> Result<(), Fault> {
+        if self.0.is_none_or(Status::is_usable) { Ok(()) } else { Err(Fault::EndToEnd) }
+    }
 }
 
 /// Counts that are kept over a restart.
@@ -91,7 +104,7 @@ impl Intake {
         // The answers are the same (checked): messages under way stay.
     }
 
-    /// Judges a frame: `None` = it is dropped; otherwise whether its readings may be used.
+    /// Judges a frame: `None` = it is dropped; otherwise the result of its end-to-end check.
     #[inline]
     pub(super) fn admit(
         &mut self,
@@ -99,31 +112,44 @@ impl Intake {
         bus: BusIndex,
         frame: &Frame,
         out: &mut Outputs,
-    ) -> Option<Result<(), Fault>> {
+    ) -> Option<Admission> {
         self.buses.handle_frame(bus);
         let admitted = self.gate.admit(now, bus, frame.id());
         let status = if admitted { self.guards.check(now, bus, frame) } else { None };
         self.report(now, out);
-        let usable = status.is_none_or(crate::can::e2e::Status::is_usable);
-        admitted.then_some(if usable { Ok(()) } else { Err(Fault::EndToEnd) })
+        admitted.then_some(Admission(status))
     }
 
-    /// The command of a frame. One that is not intact, or that has no meaning, is reported at most once a second.
+    /// The command of a frame, and its fields as far as they could be read. A rejected one is reported at most once a second.
+    ///
+    /// # Errors
+    /// Why it is not executed.
     pub(super) fn command(
         &mut self,
         now: Timestamp,
         config: &CommandConfig,
         frame: &Frame,
-        is_intact: bool,
+        admission: Admission,
         out: &mut Outputs,
-    ) -> Option<Command> {
-        let fields = config.plan.decode(frame).ok();
-        let command = fields.and_then(|fields| command_of(&fields)).filter(|_| is_intact);
-        if command.is_none() && self.bad_command_at.is_none_or(|before| now.since(before) >= BAD_COMMAND_S) {
+    ) -> (Option<CommandFields>, Result<Command, CommandRefusal>) {
+        let refusal = admission.0.and_then(CommandRefusal::of);
+        let is_intact = refusal.is_none_or(CommandRefusal::is_intact);
+        let fields = config.plan.decode(frame).ok().filter(|_| is_intact);
+        let command = fields.as_ref().and_then(command_of).ok_or(CommandRefusal::NoMeaning);
+        let result = refusal.map_or(command, Err);
+        if let Err(reason) = result
+            && self.bad_command_at.is_none_or(|before| now.since(before) >= BAD_COMMAND_S)
+        {
             self.bad_command_at = Some(now);
-            out.events.push(Event { time: now, kind: EventKind::BadCommand { bus: config.bus, intact: is_intact } });
+            let kind = EventKind::BadCommand { bus: config.bus, intact: is_intact, reason: Some(reason) };
+            out.events.push(Event { time: now, kind });
         }
-        command
+        (fields, result)
+    }
+
+    /// Counter that the next command must have; `None` = any.
+    pub(super) fn next_command_counter(&self, config: &CommandConfig) -> Option<u8> {
+        self.guards.next_counter(config.bus, config.plan.id())
     }
 
     /// Takes an event of an interface.

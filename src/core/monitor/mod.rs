@@ -11,14 +11,16 @@
 //! * `intake`: flood limit, end-to-end check, commands, interfaces; `sampling`: signals, pack identity;
 //! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
 //! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
-//! * `sender`, `j1939`: cyclic frames, alarm frames, trouble codes;
+//! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
 //! * `stages` wires all of these; `clock`, `snapshot`, `reconfigure`, `statistics`, `view` go with the whole.
 
+mod alarm_queue;
 mod alarming;
 mod batch;
 mod buses;
 mod clock;
 mod config;
+mod digest;
 mod estimation;
 mod event;
 mod input;
@@ -44,8 +46,10 @@ use sleep::Silence;
 use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
 
+use crate::alarm::CommandOutcome;
 use crate::can::Frame;
 use crate::can::diagnostic::Heard;
+use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
 
@@ -102,6 +106,9 @@ impl Monitor {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
+                if self.stages.sender.take_rescheduled() {
+                    self.find_due();
+                }
                 if self.stages.sender.poller.is_some() {
                     self.stages.poll_after_frame(self.clock.now, bus, frame, out);
                     self.find_due();
@@ -133,15 +140,20 @@ impl Monitor {
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
         let now = clock.now;
-        let Some(intact) = intake.admit(now, bus, frame, out) else { return };
+        let Some(admission) = intake.admit(now, bus, frame, out) else { return };
         let is_command = |commands: &&CommandConfig| commands.bus == bus && commands.plan.id() == frame.id();
         if let Some(commands) = config.commands.as_ref().filter(is_command) {
-            match intake.command(now, commands, frame, intact.is_ok(), out) {
-                Some(command) => stages.handle_command(now, Source::Bus(bus), command, out),
-                None => stages.statistics.bad_commands += 1,
-            }
+            let (command, result) = intake.command(now, commands, frame, admission, out);
+            let outcome = result.map(|command| {
+                let CommandOutcome { changed, refused } = stages.handle_command(now, Source::Bus(bus), command, out);
+                (changed, refused)
+            });
+            stages.statistics.bad_commands += u64::from(outcome.is_err());
+            let counter_expected = intake.next_command_counter(commands);
+            stages.sender.send_reply(now, bus, &ReplyFields { outcome, command, counter_expected }, out);
             return;
         }
+        let intact = admission.readings();
         if stages.sleep.since.is_some() {
             let mut wakes = false;
             config.input.decode(bus, frame, |reading| wakes |= Stages::wakes(reading.channel));
@@ -210,7 +222,9 @@ impl Monitor {
                 }
                 stages.send_due(now, out);
             }
-            Input::Command { command, .. } => stages.handle_command(now, Source::Local, command, out),
+            Input::Command { command, .. } => {
+                stages.handle_command(now, Source::Local, command, out);
+            }
             Input::Store { works, .. } => {
                 if stages.alarming.store.handle_report(now, works) {
                     out.events.push(Event { time: now, kind: EventKind::Store { works } });

@@ -3,6 +3,7 @@
 //! A stage publishes an event or the value of a rule; what changes in an alarm by it follows at once, as an event, as the
 //! alarm's frame and as J1939 trouble codes.
 
+use super::alarm_queue::AlarmKey;
 use super::alarming::Alarming;
 use super::sender::Sender;
 use super::{Event, EventKind, Outputs};
@@ -46,9 +47,11 @@ impl Publisher<'_> {
         let mut changes = std::mem::take(&mut self.alarming.changes);
         for change in changes.drain(..) {
             self.event(alarm_event(&change));
-            self.sender.send_alarm(self.now, &change.alarm, self.out);
+            let Alarm { rule, severity, cell, .. } = change.alarm;
+            self.sender.note_change(self.now, AlarmKey::new(rule, severity, cell));
         }
         self.alarming.changes = changes;
+        self.sender.send_changed_alarms(self.now, &self.alarming.engine, self.out);
         self.update_trouble_codes();
         self.sender.poll_j1939(self.now, self.out);
     }

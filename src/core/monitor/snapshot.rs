@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::alarm_queue::AlarmKey;
 use super::batch::CellBatch;
 use super::buses::Buses;
 use super::estimation::Consumed;
@@ -241,13 +242,16 @@ impl Stages {
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, out: &mut Outputs) {
         self.alarming.knows_all_valid = false;
-        for orphan in self.alarming.engine.restore(state) {
+        let orphans = self.alarming.engine.restore(state);
+        self.sender.skip_counters(time, &self.alarming.engine);
+        for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
             let kind = EventKind::AlarmDropped { rule, severity, cell, active, occurrences };
             out.events.push(Event { time, kind });
-            self.sender.send_alarm_end(time, &orphan, out);
+            self.sender.note_change(time, AlarmKey::new(rule, severity, cell));
         }
+        self.sender.send_changed_alarms(time, &self.alarming.engine, out);
     }
 }
 

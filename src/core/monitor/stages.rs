@@ -216,7 +216,13 @@ impl Stages {
     }
 
     /// Executes a command.
-    pub(super) fn handle_command(&mut self, now: Timestamp, source: Source, command: Command, out: &mut Outputs) {
+    pub(super) fn handle_command(
+        &mut self,
+        now: Timestamp,
+        source: Source,
+        command: Command,
+        out: &mut Outputs,
+    ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         let CommandOutcome { changed, refused } = match command {
             Command::Acknowledge(which) => self.publisher(now, out).apply(AlarmInput::Acknowledge(which)),
@@ -242,6 +248,7 @@ impl Stages {
         let mut publisher = self.publisher(now, out);
         publisher.event(EventKind::Command { source, command, changed, refused });
         publisher.publish_alarms();
+        CommandOutcome { changed, refused }
     }
 
     /// Records what was learned of the old pack, and forgets it.
@@ -328,7 +335,9 @@ impl Stages {
             poller.set_state(now, state);
             poller.poll(now, out);
         });
-        let Some([is_status_due, is_health_due, is_alarm_due]) = self.sender.take_frames_due(now) else { return };
+        let Some([is_status_due, is_health_due, is_alarm_due, is_digest_due]) = self.sender.take_frames_due(now) else {
+            return;
+        };
         if is_status_due {
             let fields = self.status_fields();
             self.sender.send_status(now, &fields, out);
@@ -338,7 +347,11 @@ impl Stages {
             self.sender.send_health(now, &fields, out);
         }
         if is_alarm_due {
-            self.sender.send_next_alarm(now, &self.alarming.engine, out);
+            self.sender.send_unknown_alarm(now, &self.alarming.engine, out);
+        }
+        self.sender.send_due_alarms(now, &self.alarming.engine, out);
+        if is_digest_due {
+            self.sender.send_digest(now, &self.alarming.engine, out);
         }
         self.sender.continue_test(now, &self.alarming.engine, out);
     }

@@ -36,7 +36,7 @@ pub(super) fn commands(
         keys.place.fault(checks.faults, "id", &format!("must not be that of a frame that is sent, {id}"));
     }
     check_no_input(&keys.place, id, &[bus], checks);
-    if output.plan.protections().iter().flatten().any(|other| other.data_id == protection.data_id) {
+    if output.plan.messages().filter_map(|sent| sent.protection).any(|other| other.data_id == protection.data_id) {
         keys.place.fault(checks.faults, "data_id", "must differ from those of the frames that are sent");
     }
     let is_fd = database.messages.iter().any(|m| m.id == plan.id() && m.format != FrameFormat::Classic);

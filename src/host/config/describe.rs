@@ -103,14 +103,14 @@ pub struct SignalUse {
 /// A frame that is sent.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct OutputUse {
-    /// `status`, `health`, `alarm`.
+    /// `status`, `health`, `alarm`, `digest`, `reply`.
     pub frame: &'static str,
     /// Identifier as candump writes it.
     pub id: String,
     /// Interfaces.
     pub interfaces: Vec<String>,
-    /// Period, ms.
-    pub period_ms: f64,
+    /// Period, ms; `None` = sent on an event only.
+    pub period_ms: Option<f64>,
     /// `classic`, `FD`, `FD with bit rate switch`.
     pub kind: &'static str,
     /// End-to-end protection: `profile 1A, data id 0x123`, or `none`.

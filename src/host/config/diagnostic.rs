@@ -210,6 +210,7 @@ fn definition(keys: &DiagnosticInput, faults: &mut Faults) -> Option<AnswerDefin
         e2e: None,
         signals,
         cycle_time_ms: None,
+        repetition: Default::default(),
         comment: None,
     };
     (faults.len() == before).then(|| AnswerDefinition {

@@ -29,7 +29,9 @@ pub(crate) use input::{
     TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
-pub(crate) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Poll};
+pub(crate) use traffic::{
+    Commands, FrameKeys, J1939, Output, OutputAlarm, OutputDigest, OutputHealth, OutputReply, OutputStatus, Poll,
+};
 
 /// Coldest and hottest temperature that may be configured, degrees C.
 const TEMPERATURE_C: ValueRange = Between(-100.0, 200.0);

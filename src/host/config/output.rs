@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::describe::OutputUse;
 use super::document::Faults;
-use super::keys::{Commands, E2eKey, FrameKeys, Output};
+use super::keys::{E2eKey, FrameKeys, Output};
 use super::resolve::{Checks, check_no_input, read_dbc};
 use super::tables::RawTables;
 use super::{ReadFile, beside};
@@ -12,13 +12,17 @@ use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
-use crate::can::encode::{E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, layout};
+use crate::can::encode::{
+    DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, SentMessage,
+    layout,
+};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
 
-/// Names of the frames, in the order of the plan.
-const FRAMES: [&str; 3] = ["status", "health", "alarm"];
+/// The messages that are sent.
+const SENT: [LayoutMessage; 5] =
+    [LayoutMessage::Status, LayoutMessage::Health, LayoutMessage::Alarm, LayoutMessage::Digest, LayoutMessage::Reply];
 
 /// The sent frames and their layout; `None` = none (not configured, or faults noted).
 pub(super) fn output(
@@ -34,14 +38,22 @@ pub(super) fn output(
         raw.output_status.as_ref()?.config(),
         raw.output_health.as_ref()?.config(),
         raw.output_alarm.as_ref()?.config(),
+        raw.output_digest.as_ref()?.config(),
+        raw.output_reply.as_ref()?.config(),
     ];
-    let [status, health, alarm] = frames.map(|frame| message_settings(&frame, checks.faults));
+    let [status, health, alarm, digest, reply] = frames.map(|frame| message_settings(&frame, checks.faults));
     let command_settings = match command {
         Some(keys) => Some(message_settings(&keys.config(), checks.faults)?),
         None => None,
     };
-    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: command_settings };
-    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::config)).collect();
+    if frames[4].period_ms.is_some() {
+        frames[4].place.fault(checks.faults, "period_ms", "must not be given: a reply is sent on a command only");
+    }
+    let (status, health, alarm, digest, reply) = (status?, health?, alarm?, digest?, reply?);
+    let settings = LayoutSettings { status, health, alarm, command: command_settings, digest, reply };
+    let frames: Vec<_> = SENT.into_iter().zip(frames).collect();
+    let laid_out: Vec<_> =
+        frames.iter().copied().chain(command.map(|keys| (LayoutMessage::Command, keys.config()))).collect();
     let own = match &keys.dbc {
         Some(name) => Some(read_dbc(&beside(config, name), read, checks.faults)?),
         None => None,
@@ -56,11 +68,24 @@ pub(super) fn output(
     let buses = buses(raw, keys);
     check_ids(&frames, &plan, &buses, checks);
     check_data_ids(&frames, &plan, checks.faults);
-    for (_, frame) in plan.formats().iter().zip(&frames).filter(|(format, _)| **format != FrameFormat::Classic) {
-        raw.check_fd(frame.place, &buses, checks.faults);
+    for sent in plan.messages().filter(|sent| sent.format != FrameFormat::Classic) {
+        if let Some(frame) = keys_of(&frames, sent.message) {
+            raw.check_fd(frame.place, &buses, checks.faults);
+        }
     }
-    let [status_period_s, health_period_s, alarm_period_s] = plan.cycle_times_ms().map(|ms| f64::from(ms) / 1000.0);
-    Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
+    let period_s = |wanted| {
+        let sent = plan.messages().find(|sent| sent.message == wanted);
+        f64::from(sent.and_then(|sent| sent.cycle_time_ms).unwrap_or(DEFAULT_PERIOD_MS)) / 1000.0
+    };
+    let output = OutputConfig {
+        status_period_s: period_s(LayoutMessage::Status),
+        health_period_s: period_s(LayoutMessage::Health),
+        alarm_period_s: period_s(LayoutMessage::Alarm),
+        digest_period_s: period_s(LayoutMessage::Digest),
+        plan,
+        buses,
+    };
+    Some((output, database))
 }
 
 /// The settings of a frame's message; `None` = faults noted.
@@ -107,7 +132,7 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
 fn database(
     base: LayoutBase<'_>,
     settings: &LayoutSettings,
-    frames: &[FrameKeys<'_>],
+    frames: &[(LayoutMessage, FrameKeys<'_>)],
     faults: &mut Faults,
 ) -> Option<Database> {
     let refused = match layout(base, settings) {
@@ -115,35 +140,47 @@ fn database(
         Err(refused) => refused,
     };
     for fault in refused {
-        let frame = LayoutMessage::ALL.iter().zip(frames).find(|(which, _)| **which == fault.message);
-        if let Some((_, frame)) = frame {
+        if let Some(frame) = keys_of(frames, fault.message) {
             frame.place.fault(faults, fault.key, &fault.what);
         }
     }
     None
 }
 
+/// The keys of a message's table.
+fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: LayoutMessage) -> Option<&'k FrameKeys<'a>> {
+    frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
+}
+
 /// Notes an identifier that is used twice or that an input has on the same interface.
-fn check_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, buses: &[BusIndex], checks: &mut Checks<'_>) {
-    let ids = plan.ids();
-    for (index, (id, frame)) in ids.iter().zip(frames).enumerate() {
-        if let Some(other) = ids[..index].iter().position(|other| other == id) {
-            let what = format!("{} and {} frame would both be {id}, must differ", FRAMES[index], FRAMES[other]);
-            frame.place.fault(checks.faults, "id", &what);
+fn check_ids(
+    frames: &[(LayoutMessage, FrameKeys<'_>)],
+    plan: &OutputPlan,
+    buses: &[BusIndex],
+    checks: &mut Checks<'_>,
+) {
+    let sent: Vec<_> = plan.messages().collect();
+    for (index, message) in sent.iter().enumerate() {
+        let Some(keys) = keys_of(frames, message.message) else { continue };
+        let id = message.id;
+        if let Some(other) = sent[..index].iter().find(|other| other.id == id) {
+            let (one, other) = (message.message.name(), other.message.name());
+            keys.place.fault(checks.faults, "id", &format!("{one} and {other} frame would both be {id}, must differ"));
         }
-        check_no_input(frame.place, *id, buses, checks);
+        check_no_input(keys.place, id, buses, checks);
     }
 }
 
 /// Notes a data id that is used twice: one frame could be accepted as another.
-fn check_data_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, faults: &mut Faults) {
-    let data_ids = plan.protections().map(|protection| protection.map(|protection| protection.data_id));
-    for (index, (data_id, frame)) in data_ids.iter().zip(frames).enumerate() {
-        let Some(data_id) = data_id else { continue };
-        if let Some(other) = data_ids[..index].iter().position(|other| other.as_ref() == Some(data_id)) {
-            let what =
-                format!("{} and {} frame would both have {data_id:#X}, must differ", FRAMES[index], FRAMES[other]);
-            frame.place.fault(faults, "data_id", &what);
+fn check_data_ids(frames: &[(LayoutMessage, FrameKeys<'_>)], plan: &OutputPlan, faults: &mut Faults) {
+    let sent: Vec<_> = plan.messages().collect();
+    let data_id = |message: &SentMessage| message.protection.map(|protection| protection.data_id);
+    for (index, message) in sent.iter().enumerate() {
+        let (Some(keys), Some(found)) = (keys_of(frames, message.message), data_id(message)) else { continue };
+        if let Some(other) = sent[..index].iter().find(|other| data_id(other) == Some(found)) {
+            let (one, other) = (message.message.name(), other.message.name());
+            let what = format!("{one} and {other} frame would both have {found:#X}, must differ");
+            keys.place.fault(faults, "data_id", &what);
         }
     }
 }
@@ -160,20 +197,17 @@ pub(super) fn uses(raw: &RawTables, output: Option<&OutputConfig>) -> Vec<Output
     let Some(output) = output else { return Vec::new() };
     let names = output.buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
     let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();
-    let periods_s = [output.status_period_s, output.health_period_s, output.alarm_period_s];
-    let plan = &output.plan;
-    let frames = FRAMES.into_iter().zip(plan.ids()).zip(periods_s).zip(plan.formats()).zip(plan.protections());
-    let used = frames.map(|((((frame, id), period_s), format), protection)| OutputUse {
-        frame,
-        id: id.to_string(),
+    let used = output.plan.messages().map(|sent| OutputUse {
+        frame: sent.message.name(),
+        id: sent.id.to_string(),
         interfaces: names.clone(),
-        period_ms: 1000.0 * period_s,
-        kind: match format {
+        period_ms: sent.cycle_time_ms.map(f64::from),
+        kind: match sent.format {
             FrameFormat::Classic => "classic",
             FrameFormat::Fd { brs: false } => "FD",
             FrameFormat::Fd { brs: true } => "FD with bit rate switch",
         },
-        protection: protection.map_or("none".to_owned(), |Protection { profile, data_id }| {
+        protection: sent.protection.map_or("none".to_owned(), |Protection { profile, data_id }| {
             format!("profile {}, data id {data_id:#X}", profile.name())
         }),
     });

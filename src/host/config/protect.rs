@@ -8,7 +8,7 @@ use super::schema::did_you_mean;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Channel};
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
@@ -43,7 +43,26 @@ pub(super) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardCo
         }
         guards.push((guard, keys));
     }
-    guards.into_iter().map(|(guard, _)| guard).collect()
+    let guards: Vec<GuardConfig> = guards.into_iter().map(|(guard, _)| guard).collect();
+    check_identity(checks, &guards);
+    guards
+}
+
+/// A new identity of the pack discards everything learned: its message must be protected, unless the configuration accepts
+/// another.
+fn check_identity(checks: &mut Checks<'_>, guards: &[GuardConfig]) {
+    let Some(keys) = checks.raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
+    let is_protected =
+        |input: &ResolvedSignal<'_>| guards.iter().any(|guard| (guard.bus, guard.id) == (input.bus, input.message.id));
+    let open = checks.found.iter().find(|input| input.channel == Channel::PackIdentity && !is_protected(input));
+    if let Some(input) = open {
+        let what = format!(
+            "must be a signal of a message in [[input.protected]], or have accept_unprotected = true beside it: forged \
+             frames of {} would discard everything learned",
+            input.message.name
+        );
+        keys.place.fault(checks.faults, "signal", &what);
+    }
 }
 
 fn guard(keys: &ProtectedInput, input: &ResolvedSignal<'_>, bus: BusIndex) -> GuardConfig {

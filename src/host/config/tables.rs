@@ -3,10 +3,10 @@
 use super::document::{Faults, TablePlace};
 use super::keys::{
     Alarm, AnswerSignalKeys, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
-    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputHealth, OutputStatus, Pack,
-    PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput,
-    SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle,
-    VoltageLimits,
+    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest, OutputHealth, OutputReply,
+    OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput,
+    ReportedSohInput, SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable,
+    Vehicle, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -44,6 +44,8 @@ tables! {
         output_status: one OutputStatus,
         output_health: one OutputHealth,
         output_alarm: one OutputAlarm,
+        output_digest: one OutputDigest,
+        output_reply: one OutputReply,
         commands: one Commands,
         store: one Store,
     }

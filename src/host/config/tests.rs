@@ -202,7 +202,7 @@ fn nothing_is_sent_unless_configured() {
 #[test]
 fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
     let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
-    assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2, 0x6B4].map(CanId::Standard));
     assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 0.1));
     let text = "[output.status]\nextended = true\nid = 0x18FF_0001\nperiod_ms = 200\n";
     let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
@@ -217,11 +217,14 @@ fn frame_kinds_and_protection_come_from_the_configuration_and_the_layout_says_so
     let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
     let config = good(&format!("{pack}{text}"));
     let plan = config.monitor.output.unwrap().plan;
-    assert_eq!(plan.formats(), [FrameFormat::Fd { brs: true }, FrameFormat::Classic, FrameFormat::Classic]);
+    let formats: Vec<_> = plan.messages().map(|sent| sent.format).collect();
+    let classic = FrameFormat::Classic;
+    assert_eq!(formats, [FrameFormat::Fd { brs: true }, classic, classic, classic]);
     let wanted = |profile, data_id| Some(Protection { profile, data_id });
-    assert_eq!(plan.protections(), [wanted(Profile::P05, 0x1234), None, wanted(Profile::P01C, 7)]);
+    let protections: Vec<_> = plan.messages().map(|sent| sent.protection).collect();
+    assert_eq!(protections, [wanted(Profile::P05, 0x1234), None, wanted(Profile::P01C, 7), None]);
     let layout = config.output_layout.unwrap();
-    assert_eq!(layout.messages.len(), 3, "no command is taken");
+    assert_eq!(layout.messages.len(), 4, "no command is taken");
     assert_eq!(OutputPlan::new(&Database::parse(&layout.to_dbc()).unwrap()).unwrap(), plan);
 }
 

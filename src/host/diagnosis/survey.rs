@@ -11,6 +11,7 @@ use std::path::Path;
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::diagnostic::Answer;
+use crate::can::encode::SentMessage;
 use crate::cell::CellModel;
 use crate::config::{
     Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
@@ -190,8 +191,9 @@ fn limits(config: &Config) -> [(f64, f64); 3] {
 
 fn outputs(config: &Config) -> Vec<OutputPlan> {
     let Some(output) = &config.monitor.output else { return Vec::new() };
-    let named = output.plan.ids().into_iter().zip(["status", "health", "alarm"]);
-    named
-        .map(|(id, name)| OutputPlan { buses: output.buses.clone(), id, name, table: format!("output.{name}") })
-        .collect()
+    let plan = |sent: SentMessage| {
+        let name = sent.message.name();
+        OutputPlan { buses: output.buses.clone(), id: sent.id, name, table: format!("output.{name}") }
+    };
+    output.plan.messages().map(plan).collect()
 }

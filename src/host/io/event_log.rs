@@ -1,15 +1,18 @@
 //! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are logged
 //! once, then as a count: a bus without a partner makes thousands a second. As JSON lines, every event is written.
 
+mod words;
+
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
 use crate::can::diagnostic::MessageLoss;
+use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::poll::PollChange;
 use crate::config::VehicleIdentity;
-use crate::monitor::{BusEvent, Event, EventKind};
+use crate::monitor::{BusEvent, Event, EventKind, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// Repeated faults of one interface are logged as a sum after this long, s; then after twice that, and so on.
@@ -91,8 +94,12 @@ impl EventLog {
             | EventKind::RechargePeriod { .. } => {
                 log_learned(&event.kind);
             }
-            EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
-            EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
+            EventKind::SignalBad { channel, fault } => {
+                tracing::warn!(channel = words::channel(channel), ?fault, "signal bad");
+            }
+            EventKind::SignalGood { channel, bad_readings } => {
+                tracing::info!(channel = words::channel(channel), bad_readings, "signal good");
+            }
             EventKind::Protection(change) => self.log_protection(change),
             EventKind::Flood(FloodChange { bus, id, active: true, .. }) => {
                 tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
@@ -117,11 +124,15 @@ impl EventLog {
             EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
             EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
             EventKind::Command { source, command, changed, refused } => {
-                tracing::info!(?source, ?command, changed, refused, "command");
+                let source = match source {
+                    Source::Local => "this computer",
+                    Source::Bus(bus) => self.name(bus),
+                };
+                tracing::info!(source, command = words::command(&command), changed, refused, "command");
             }
-            EventKind::BadCommand { bus, intact } => {
-                let interface = self.interfaces.get(bus.index()).map_or("?", String::as_str);
-                tracing::warn!(interface, intact, "command frame not executed");
+            EventKind::BadCommand { bus, intact, reason } => {
+                let reason = reason.map(CommandRefusal::words);
+                tracing::warn!(interface = self.name(bus), intact, reason, "command frame not executed");
             }
             EventKind::Test { rule, running } => {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
@@ -191,6 +202,11 @@ impl EventLog {
     }
 }
 
+/// Without the digits that binary arithmetic adds: nine significant ones are more than any value has.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.8e}").parse().unwrap_or(value)
+}
+
 /// A cell's number as people count, from 1.
 fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
@@ -212,7 +228,8 @@ fn log_alarm(kind: &EventKind) {
     else {
         return;
     };
-    let cell = cell.map(number);
+    let (cell, value) = (cell.map(number), value.map(rounded));
+    let (probability, threshold) = (probability.map(rounded), rounded(threshold));
     let what = match change {
         Change::Raised => "alarm raised",
         Change::Suppressed => "alarm raised earlier, its value is not known now",
@@ -278,6 +295,16 @@ mod tests {
         assert!((20..=45).contains(&logged.len()), "{} lines", logged.len());
         assert_eq!(logged[0], 2, "the first is logged at once");
         assert_eq!(logged.iter().sum::<u64>() + sum.unreported, 86_400 * 4 * 2);
+    }
+
+    #[test]
+    fn a_number_is_logged_without_the_digits_of_binary_arithmetic() {
+        assert_eq!(format!("{:?}", rounded(0.7 * 2.6)), "1.82");
+        assert_eq!(
+            (rounded(45.0), rounded(-0.1), rounded(1e-12), rounded(123_456.789)),
+            (45.0, -0.1, 1e-12, 123_456.789)
+        );
+        assert!(rounded(f64::NAN).is_nan());
     }
 
     #[test]

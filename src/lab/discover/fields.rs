@@ -386,6 +386,7 @@ fn empty_message(field: &MessageField) -> Message {
         e2e: None,
         signals: field.page.map(|_| page).into_iter().collect(),
         cycle_time_ms: None,
+        repetition: Default::default(),
         comment: None,
     }
 }

@@ -1,15 +1,21 @@
-//! Attributes of a DBC: cycle time, frame format, end-to-end protection.
+//! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection.
 //!
 //! The names and the order of `VFrameFormat`'s words are those of DBC editors; the two about end-to-end protection are
 //! packwatch's own. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 
-use super::FrameFormat;
+use super::{FrameFormat, Repetition};
 use crate::can::e2e::{Profile, Protection};
 
 /// Cycle time, ms.
 pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
+/// Frames after the first one of an event.
+pub(super) const REPETITIONS: &str = "GenMsgNrOfRepetition";
+/// Time between them, ms.
+pub(super) const FAST_CYCLE_TIME: &str = "GenMsgCycleTimeFast";
+/// Shortest mean time between two frames, ms.
+pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
 /// Standard or extended, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
 /// The words of [`FRAME_FORMAT`].
@@ -37,9 +43,15 @@ pub(super) fn profile_index(profile: Profile) -> usize {
     E2E_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
-/// The cycle time, when above 0.
-pub(super) fn cycle_time_ms(dbc: &Dbc, id: MessageId) -> Option<u32> {
-    let whole = match dbc.resolved_message_attribute(id, CYCLE_TIME)? {
+/// How the message is repeated.
+pub(super) fn repetition(dbc: &Dbc, id: MessageId) -> Repetition {
+    let [count, period_ms, delay_ms] = [REPETITIONS, FAST_CYCLE_TIME, DELAY_TIME].map(|name| positive(dbc, id, name));
+    Repetition { count, period_ms, delay_ms }
+}
+
+/// A number, when above 0.
+pub(super) fn positive(dbc: &Dbc, id: MessageId, name: &str) -> Option<u32> {
+    let whole = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
         AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
         // Some editors export every number as a float: 100.0 reads as 100.

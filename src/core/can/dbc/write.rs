@@ -6,8 +6,8 @@
 use std::fmt::Write as _;
 
 use super::attributes::{
-    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FIRST_FD_FORMAT, FRAME_FORMAT, FRAME_FORMATS,
-    NO_YES, profile_index,
+    BIT_RATE_SWITCH, CYCLE_TIME, DELAY_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FAST_CYCLE_TIME, FIRST_FD_FORMAT,
+    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, profile_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
@@ -18,6 +18,8 @@ const NO_NODE: &str = "Vector__XXX";
 
 /// Longest cycle time an editor will accept, ms: an hour.
 const MAX_CYCLE_TIME_MS: u32 = 3_600_000;
+/// Most repetitions an editor will accept.
+const MAX_REPETITIONS: u32 = 999_999;
 
 impl Database {
     /// The text of the DBC. A signal's conditions must name multiplexors of its message, as after reading.
@@ -84,7 +86,12 @@ impl Database {
             FrameFormat::Classic => None,
         };
         let cycle_time = format!("INT 0 {MAX_CYCLE_TIME_MS}");
-        self.attribute(CYCLE_TIME, &cycle_time, "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()), text);
+        let repetitions = format!("INT 0 {MAX_REPETITIONS}");
+        let word = |number: Option<u32>| number.map(|number| number.to_string());
+        self.attribute(CYCLE_TIME, &cycle_time, "0", |m| word(m.cycle_time_ms), text);
+        self.attribute(REPETITIONS, &repetitions, "0", |m| word(m.repetition.count), text);
+        self.attribute(FAST_CYCLE_TIME, &cycle_time, "0", |m| word(m.repetition.period_ms), text);
+        self.attribute(DELAY_TIME, &cycle_time, "0", |m| word(m.repetition.delay_ms), text);
         self.choice(FRAME_FORMAT, &FRAME_FORMATS, format, text);
         self.choice(BIT_RATE_SWITCH, &NO_YES, rate, text);
         self.choice(E2E_PROFILE, &E2E_PROFILES, |m| Some(profile_index(m.e2e?.profile).to_string()), text);

@@ -53,6 +53,7 @@ fn cells(identifier: u16, first: u16, count: u16) -> Answer {
         e2e: None,
         signals: vec![],
         cycle_time_ms: None,
+        repetition: Default::default(),
         comment: None,
     };
     let signals = (0..count).map(|index| AnswerSignal {

@@ -162,6 +162,11 @@ impl Receiver {
         *self = Self::with_counts(self.counts);
     }
 
+    /// Counter of the next frame in sequence; `None` = any.
+    pub fn next_counter(&self, profile: Profile) -> Option<u8> {
+        self.last_valid.map(|last| profile.next_counter(last))
+    }
+
     /// Count of each status.
     pub const fn counts(&self) -> &StatusCounts {
         &self.counts

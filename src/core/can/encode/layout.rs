@@ -1,4 +1,4 @@
-//! The layout of the sent frames and of the command frame: one [`Database`] for encoder and consumers.
+//! The layout of the sent frames, of the command frame and its reply: one [`Database`] for encoder and consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
 //! messages with identifiers, frame formats, cycle times and end-to-end protection as set, the header's signals
@@ -8,7 +8,7 @@
 //! than the free space, moves the signals up by that byte. The user's own DBC is not moved: its signals must leave the
 //! header free. All settings that do not fit are reported together.
 
-use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Signal};
+use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Repetition, Signal};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::frame::is_frame_length;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
@@ -20,8 +20,18 @@ pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataId
 /// Length of a built-in message whose signals were moved for profile 5: the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
+/// Frames of a changed alarm after its first one: of four frames at least one arrives, but for one change in 10,000 where a
+/// tenth of all frames is lost.
+pub const CHANGE_REPETITIONS: u32 = 3;
+/// Time between them, ms: longer than most bursts of errors on a bus.
+pub const CHANGE_REPETITION_MS: u32 = 100;
+/// Mean time between two alarm frames, at least, ms: 100 frames in a second are 2.7 % of a bus of 500 kbit/s.
+pub const ALARM_DELAY_MS: u32 = 10;
+/// Mean time between two replies, at least, ms.
+pub const REPLY_DELAY_MS: u32 = 100;
+
 /// Cycle time of a sent message without one in the settings or the base, ms.
-pub(super) const DEFAULT_PERIOD_MS: u32 = 1000;
+pub const DEFAULT_PERIOD_MS: u32 = 1000;
 
 /// The DBC that ships with the program.
 ///
@@ -42,11 +52,15 @@ pub enum LayoutMessage {
     Alarm,
     /// Command frame, received.
     Command,
+    /// Digest of all alarms.
+    Digest,
+    /// Reply to a command frame.
+    Reply,
 }
 
 impl LayoutMessage {
     /// All of them, in the order of the layout.
-    pub const ALL: [Self; 4] = [Self::Status, Self::Health, Self::Alarm, Self::Command];
+    pub const ALL: [Self; 6] = [Self::Status, Self::Health, Self::Alarm, Self::Command, Self::Digest, Self::Reply];
 
     /// Name of the message in the DBC.
     pub const fn message(self) -> &'static str {
@@ -55,7 +69,41 @@ impl LayoutMessage {
             Self::Health => "PACKWATCH_Health",
             Self::Alarm => "PACKWATCH_Alarm",
             Self::Command => "PACKWATCH_Command",
+            Self::Digest => "PACKWATCH_Digest",
+            Self::Reply => "PACKWATCH_Reply",
         }
+    }
+
+    /// Name of its table in a configuration (`output.status`), and in texts.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Status => "status",
+            Self::Health => "health",
+            Self::Alarm => "alarm",
+            Self::Command => "command",
+            Self::Digest => "digest",
+            Self::Reply => "reply",
+        }
+    }
+
+    /// How it is repeated after an event.
+    const fn repetition(self) -> Repetition {
+        match self {
+            Self::Alarm => Repetition {
+                count: Some(CHANGE_REPETITIONS),
+                period_ms: Some(CHANGE_REPETITION_MS),
+                delay_ms: Some(ALARM_DELAY_MS),
+            },
+            Self::Reply => Repetition { count: None, period_ms: None, delay_ms: Some(REPLY_DELAY_MS) },
+            Self::Status | Self::Health | Self::Command | Self::Digest => {
+                Repetition { count: None, period_ms: None, delay_ms: None }
+            }
+        }
+    }
+
+    /// Whether it is sent periodically.
+    const fn is_cyclic(self) -> bool {
+        matches!(self, Self::Status | Self::Health | Self::Alarm | Self::Digest)
     }
 }
 
@@ -109,6 +157,10 @@ pub struct LayoutSettings {
     pub alarm: MessageSettings,
     /// Command frame; `None` = commands are not accepted.
     pub command: Option<MessageSettings>,
+    /// Digest of all alarms.
+    pub digest: MessageSettings,
+    /// Reply to a command frame; sent only where commands are accepted.
+    pub reply: MessageSettings,
 }
 
 impl LayoutSettings {
@@ -118,6 +170,8 @@ impl LayoutSettings {
             LayoutMessage::Health => Some(&self.health),
             LayoutMessage::Alarm => Some(&self.alarm),
             LayoutMessage::Command => self.command.as_ref(),
+            LayoutMessage::Digest => Some(&self.digest),
+            LayoutMessage::Reply => self.command.as_ref().map(|_| &self.reply),
         }
     }
 }
@@ -158,9 +212,10 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
             }
             let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
             apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
-            if which != LayoutMessage::Command {
+            if which.is_cyclic() {
                 laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(DEFAULT_PERIOD_MS));
             }
+            laid_out.repetition = which.repetition();
             messages.push(laid_out);
         }
     }

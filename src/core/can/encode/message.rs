@@ -83,6 +83,11 @@ impl OutputMessage {
         }
     }
 
+    /// Factor from the program's unit to that of a signal; 1 for one that is not there.
+    pub(super) fn per_inside_unit(&self, name: &str) -> f64 {
+        self.fields.iter().find(|field| field.name == name).map_or(1.0, |field| field.per_inside_unit)
+    }
+
     /// First selector code of every page; a message without pages has the one page 0.
     pub(super) fn page_codes(&self) -> Vec<u64> {
         let mut codes: Vec<_> = self.fields.iter().filter_map(|field| Some(field.pages.first()?.0)).collect();

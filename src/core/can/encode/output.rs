@@ -10,8 +10,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::digest::{DigestFields, DigestPlan};
 use super::layout::LayoutMessage;
 use super::message::OutputMessage;
+use super::reply::{ReplyFields, reply_frame, reply_message};
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::{CanId, Frame};
@@ -165,6 +167,10 @@ pub struct SendCounters {
     status: u8,
     health: u8,
     alarm: u8,
+    #[serde(default)]
+    digest: u8,
+    #[serde(default)]
+    reply: u8,
 }
 
 /// The daemon's frames, ready for encoding.
@@ -175,6 +181,24 @@ pub struct OutputPlan {
     alarm: OutputMessage,
     /// Selector codes of the health frame, ascending.
     pages: Vec<u64>,
+    /// `None` = the layout has none.
+    digest: Option<DigestPlan>,
+    reply: Option<OutputMessage>,
+}
+
+/// What a layout says of one sent message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SentMessage {
+    /// Which message.
+    pub message: LayoutMessage,
+    /// Identifier.
+    pub id: CanId,
+    /// Kind of its frames.
+    pub format: FrameFormat,
+    /// End-to-end protection.
+    pub protection: Option<Protection>,
+    /// Cycle time, ms; `None` = it is sent on an event only.
+    pub cycle_time_ms: Option<u32>,
 }
 
 impl OutputPlan {
@@ -193,37 +217,67 @@ impl OutputPlan {
         if let Some(alarm) = &alarm {
             alarm.check_rules(&RULES, &mut faults);
         }
+        let digest = alarm.as_ref().and_then(|alarm| DigestPlan::new(database, alarm, &mut faults));
+        let reply = reply_message(database, &mut faults);
         match (status, health, alarm) {
             (Some(status), Some(health), Some(alarm)) if faults.is_empty() => {
                 let pages = health.page_codes();
-                Ok(Self { status, health, alarm, pages })
+                Ok(Self { status, health, alarm, pages, digest, reply })
             }
             _ => Err(PlanFaults(faults)),
         }
     }
 
-    fn messages(&self) -> [&OutputMessage; 3] {
-        [&self.status, &self.health, &self.alarm]
+    /// The sent messages: status, health, alarm, then digest and reply where the layout has them.
+    pub fn messages(&self) -> impl Iterator<Item = SentMessage> + '_ {
+        let always = [
+            (LayoutMessage::Status, &self.status),
+            (LayoutMessage::Health, &self.health),
+            (LayoutMessage::Alarm, &self.alarm),
+        ];
+        let digest = self.digest.iter().map(|digest| (LayoutMessage::Digest, &digest.message));
+        let reply = self.reply.iter().map(|reply| (LayoutMessage::Reply, reply));
+        always.into_iter().chain(digest).chain(reply).map(|(message, plan)| SentMessage {
+            message,
+            id: plan.id,
+            format: plan.format,
+            protection: plan.protection,
+            cycle_time_ms: (message != LayoutMessage::Reply).then_some(plan.cycle_time_ms),
+        })
     }
 
-    /// Identifiers of status, health and alarm frame.
-    pub fn ids(&self) -> [CanId; 3] {
-        self.messages().map(|message| message.id)
+    /// Identifiers of the sent messages, in the order of [`messages`](Self::messages).
+    pub fn ids(&self) -> Vec<CanId> {
+        self.messages().map(|message| message.id).collect()
     }
 
-    /// Kinds of status, health and alarm frame.
-    pub fn formats(&self) -> [FrameFormat; 3] {
-        self.messages().map(|message| message.format)
+    /// Advances the counter of a message as if so many of its frames were sent.
+    pub fn skip(&self, message: LayoutMessage, frames: u64, counters: &mut SendCounters) {
+        let Some(protection) = self.messages().find(|sent| sent.message == message).and_then(|sent| sent.protection)
+        else {
+            return;
+        };
+        let counter = match message {
+            LayoutMessage::Status => &mut counters.status,
+            LayoutMessage::Health => &mut counters.health,
+            LayoutMessage::Alarm => &mut counters.alarm,
+            LayoutMessage::Digest => &mut counters.digest,
+            LayoutMessage::Reply => &mut counters.reply,
+            LayoutMessage::Command => return,
+        };
+        let codes = u64::from(protection.profile.max_counter()) + 1;
+        let skipped = (u64::from(*counter) + frames % codes) % codes;
+        *counter = u8::try_from(skipped).unwrap_or(0);
     }
 
-    /// End-to-end protection of status, health and alarm frame.
-    pub fn protections(&self) -> [Option<Protection>; 3] {
-        self.messages().map(|message| message.protection)
+    /// Whether replies are sent.
+    pub fn has_reply(&self) -> bool {
+        self.reply.is_some()
     }
 
-    /// Cycle times of status, health and alarm frame, ms.
-    pub fn cycle_times_ms(&self) -> [u32; 3] {
-        self.messages().map(|message| message.cycle_time_ms)
+    /// Pages of the digest; 0 = the layout has none.
+    pub fn digest_pages(&self) -> usize {
+        self.digest.as_ref().map_or(0, DigestPlan::page_count)
     }
 
     /// Pages the health frame has, at least 1.
@@ -255,6 +309,18 @@ impl OutputPlan {
             name if name.starts_with("Threshold_") => fields.threshold,
             _ => None,
         })
+    }
+}
+
+impl OutputPlan {
+    /// One page of the digest, counted from 0; `None` = the layout has no such page.
+    pub fn digest(&self, page: usize, fields: &DigestFields, counters: &mut SendCounters) -> Option<Frame> {
+        self.digest.as_ref()?.frame(page, fields, &mut counters.digest)
+    }
+
+    /// The reply to a command; `None` = the layout has none.
+    pub fn reply(&self, fields: &ReplyFields, counters: &mut SendCounters) -> Option<Frame> {
+        self.reply.as_ref().map(|message| reply_frame(message, fields, &mut counters.reply))
     }
 }
 

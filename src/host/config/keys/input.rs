@@ -209,5 +209,7 @@ signal_section! {
     PackIdentityInput at "input.pack_identity", "any unit" {
         /// Readings in a row that must show the same new value.
         readings: u32, "", Between(1.0, 10000.0), Default("10") =>;
+        /// Whether a signal without end-to-end protection is accepted. Three forged or damaged frames of one discard everything learned; diagnostic answers have no such protection. Without it the message must be in `[[input.protected]]`.
+        accept_unprotected: bool, "", Any, Default("false") =>;
     }
 }

@@ -48,7 +48,7 @@ section! {
 }
 
 section! {
-    /// Frames that the daemon sends: status, health and alarm. Without this table it only listens; it never sends another identifier. `packwatch dbc` writes the DBC of the frames as they are configured.
+    /// Frames that the daemon sends: status, health, alarm, digest and, with `[commands]`, reply. Without this table it only listens; it never sends another identifier. `packwatch dbc` writes the DBC of the frames as they are configured.
     Output at "output" {
         /// Whether anything is sent.
         enabled: bool, "", Any, Default("true");
@@ -116,8 +116,18 @@ frame_section! {
 }
 
 frame_section! {
-    /// The alarm frame: at once on change, and one of the active alarms in each period.
+    /// The alarm frame: at once on a change, then three times 100 ms apart, and each raised alarm once in a period; at most 100 frames in a second (after a pause 20 at once).
     OutputAlarm at "output.alarm"
+}
+
+frame_section! {
+    /// The digest: number, worst severity and checksum of all raised alarms, the state of every rule, and one threshold; all pages in each period. A DBC of your own without `PACKWATCH_Digest` has none.
+    OutputDigest at "output.digest"
+}
+
+frame_section! {
+    /// The reply to each command frame, sent only with `[commands]`: whether it was executed, why not, and the counter that the next one must have. It has no period. A DBC of your own without `PACKWATCH_Reply` has none.
+    OutputReply at "output.reply"
 }
 
 section! {

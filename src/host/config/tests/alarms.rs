@@ -90,6 +90,14 @@ fn faults_of_alarms_and_commands() {
             "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
         ),
         (
+            "[output.digest]\nid = 0x6B2\n",
+            "pack.toml:16: output.digest.id = 0x6B2, digest and alarm frame would both be 6B2, must differ",
+        ),
+        (
+            "[output.reply]\nperiod_ms = 100\n",
+            "pack.toml:16: output.reply.period_ms = 100, must not be given: a reply is sent on a command only",
+        ),
+        (
             "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
             "pack.toml:18: commands.e2e = \"5\", must have fd = true here and on the interface: the header of profile 5 \
              makes the message 12 bytes long; 1A and 1C fit classic frames",

@@ -196,3 +196,18 @@ fn a_signal_that_is_not_found_does_not_make_its_protected_message_a_fault_too() 
         .replace("signal = \"Status.", "signal = \"Stats.");
     assert!(faults(&pack).iter().all(|fault| !fault.contains("protected")), "{:?}", faults(&pack));
 }
+
+#[test]
+fn an_identity_of_the_pack_must_be_protected_or_accepted() {
+    let identity = "[input.pack_identity]\nsignal = \"Status.Low\"\n";
+    let open = format!("{PACK}{identity}");
+    assert_eq!(
+        faults(&open),
+        [
+            "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be a signal of a message in [[input.protected]], \
+             or have accept_unprotected = true beside it: forged frames of Status would discard everything learned"
+        ]
+    );
+    assert!(read(&format!("{open}accept_unprotected = true\n")).is_ok());
+    assert!(read(&format!("{open}[[input.protected]]\nmessage = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")).is_ok());
+}

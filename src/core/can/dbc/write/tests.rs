@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::can::dbc::Repetition;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
 use crate::can::signal::SignalLayout;
@@ -126,11 +127,14 @@ prop_compose! {
         e2e in prop::option::of((prop_oneof![Just(Profile::P01A), Just(Profile::P01C), Just(Profile::P05)], any::<u16>())),
         parts in prop::collection::vec((signals(), hangings()), 0..8),
         cycle_time_ms in prop::option::of(1..=3_600_000_u32),
+        count in prop::option::of(1..=999_999_u32),
+        times_ms in prop::array::uniform2(prop::option::of(1..=3_600_000_u32)),
         comment in prop::option::of(TEXT),
     ) -> (bool, Message) {
         let e2e = e2e.map(|(profile, data_id)| Protection { profile, data_id });
         let (id, name, signals) = (CanId::Standard(0), String::new(), assemble(parts));
-        (extended, Message { id, name, len_bytes, sender, format, e2e, signals, cycle_time_ms, comment })
+        let repetition = Repetition { count, period_ms: times_ms[0], delay_ms: times_ms[1] };
+        (extended, Message { id, name, len_bytes, sender, format, e2e, signals, cycle_time_ms, repetition, comment })
     }
 }
 

@@ -30,7 +30,8 @@ fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, St
 fn without_settings_the_layout_is_the_shipped_file_but_for_the_command() {
     let shipped = default_database().unwrap();
     let made = built_in(&LayoutSettings::default()).unwrap();
-    assert_eq!(made.messages, shipped.messages[..3]);
+    let sent = |name: &str| !matches!(name, "PACKWATCH_Command" | "PACKWATCH_Reply");
+    assert!(made.messages.iter().eq(shipped.messages.iter().filter(|message| sent(&message.name))));
     let command = Some(MessageSettings::default());
     assert_eq!(built_in(&LayoutSettings { command, ..Default::default() }).unwrap(), shipped);
 }
@@ -42,21 +43,29 @@ fn identifiers_formats_and_periods_are_as_set() {
         status: MessageSettings { id: CanId::extended(5), period_ms: Some(20), ..Default::default() },
         health: fd,
         alarm: MessageSettings { id: CanId::standard(7), fd: Some(true), ..Default::default() },
-        command: None,
+        ..Default::default()
     };
     let plan = OutputPlan::new(&built_in(&settings).unwrap()).unwrap();
-    assert_eq!(plan.ids(), [CanId::Extended(5), CanId::Standard(0x6B1), CanId::Standard(7)]);
-    assert_eq!(plan.cycle_times_ms(), [20, 1000, 1000]);
-    let formats = [FrameFormat::Classic, FrameFormat::Fd { brs: true }, FrameFormat::Fd { brs: false }];
-    assert_eq!(plan.formats(), formats);
+    assert_eq!(plan.ids(), [CanId::Extended(5), CanId::Standard(0x6B1), CanId::Standard(7), CanId::Standard(0x6B4)]);
+    let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
+    assert_eq!(times_ms, [Some(20), Some(1000), Some(1000), Some(1000)]);
+    let (fd, fast) = (FrameFormat::Fd { brs: false }, FrameFormat::Fd { brs: true });
+    let formats: Vec<_> = plan.messages().map(|sent| sent.format).collect();
+    assert_eq!(formats, [FrameFormat::Classic, fast, fd, FrameFormat::Classic]);
 }
 
 #[test]
 fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
     let shipped = default_database().unwrap();
     let settings = |data_id| MessageSettings { fd: Some(true), ..on(Profile::P05, data_id) };
-    let all =
-        LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: Some(settings(4)) };
+    let all = LayoutSettings {
+        status: settings(1),
+        health: settings(2),
+        alarm: settings(3),
+        command: Some(settings(4)),
+        digest: settings(5),
+        reply: settings(6),
+    };
     let made = built_in(&all).unwrap();
     for (message, shipped) in made.messages.iter().zip(&shipped.messages) {
         assert_eq!((message.len_bytes, message.signals.len()), (12, shipped.signals.len() + 2));
@@ -111,6 +120,8 @@ fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
         health: on(Profile::P01C, 2),
         alarm: MessageSettings { id: CanId::extended(9), period_ms: Some(50), ..on(Profile::P01A, 3) },
         command: Some(fd(on(Profile::P05, 4))),
+        digest: on(Profile::P01C, 5),
+        reply: on(Profile::P01A, 6),
     };
     let made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
     let read = Database::parse(&made.to_dbc()).unwrap();
@@ -219,6 +230,18 @@ fn an_own_dbc_keeps_its_steps_and_loses_messages_that_are_not_the_daemons() {
     let text = format!("{TEXT}\nBO_ 5 Other: 8 PACKWATCH\n SG_ X : 0|8@1+ (1,0) [0|0] \"Ah\" PACKWATCH\n");
     let own = Database::parse(&text).unwrap();
     let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
-    assert_eq!(made.messages, own.messages[..3]);
+    let names: Vec<_> = made.messages.iter().map(|message| message.name.as_str()).collect();
+    assert_eq!(names, ["PACKWATCH_Status", "PACKWATCH_Health", "PACKWATCH_Alarm", "PACKWATCH_Digest"]);
+    assert!(made.messages.iter().all(|message| own.message(&message.name) == Some(message)));
     assert_eq!((&made.nodes, &made.comment), (&own.nodes, &own.comment));
+}
+
+#[test]
+fn an_own_dbc_without_digest_and_reply_sends_what_it_has() {
+    let mut own = default_database().unwrap();
+    own.messages.retain(|message| !matches!(message.name.as_str(), "PACKWATCH_Digest" | "PACKWATCH_Reply"));
+    let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
+    let plan = OutputPlan::new(&layout(LayoutBase::Own(&own), &settings).unwrap()).unwrap();
+    assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!((plan.digest_pages(), plan.has_reply()), (0, false));
 }

@@ -64,8 +64,10 @@ fn faults(from: &str, to: &str) -> Vec<String> {
 #[test]
 fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
     let plan = plan().0;
-    assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
-    assert_eq!(plan.cycle_times_ms(), [100, 1000, 1000]);
+    assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5].map(CanId::Standard));
+    let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
+    assert_eq!(times_ms, [Some(100), Some(1000), Some(1000), Some(1000), None]);
+    assert_eq!(plan.digest_pages(), 3);
     assert_eq!(plan.health_pages(), 5);
 }
 
@@ -337,7 +339,10 @@ fn a_value_that_could_be_read_as_another_s_is_refused() {
         ]
     );
     let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
-    assert_eq!(unreachable, 12, "three signals are on page 2, three on page 3, six on page 4");
+    assert_eq!(
+        unreachable, 15,
+        "of health three signals are on page 2, three on page 3, six on page 4; of the digest three on page 2"
+    );
 }
 
 #[test]
@@ -381,10 +386,12 @@ fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
             e2e: E2eSetting::On(Protection { profile, data_id }),
             ..Default::default()
         };
-        let settings = LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: None };
+        let settings =
+            LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), ..Default::default() };
         let database = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
         let plan = OutputPlan::new(&database).unwrap();
-        let [status, health, alarm] = plan.protections().map(Option::unwrap);
+        let protections: Vec<_> = plan.messages().filter_map(|sent| sent.protection).collect();
+        let [status, health, alarm] = protections[..] else { panic!("three are protected") };
         let (mut counters, mut expected) = (SendCounters::default(), 0);
         for round in 0..600_u16 {
             let fields = StatusFields { active_alarms: Some(round % 60), ..Default::default() };
@@ -414,5 +421,11 @@ fn counters_survive_a_restart_and_a_change_of_the_profile() {
     let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
     assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
     let stored = serde_json::to_string(&counters).unwrap();
-    assert_eq!(stored, r#"{"status":1,"health":0,"alarm":3}"#, "unprotected frames count nothing");
+    let wanted = r#"{"status":1,"health":0,"alarm":3,"digest":0,"reply":0}"#;
+    assert_eq!(stored, wanted, "unprotected frames count nothing");
+    plan.skip(LayoutMessage::Status, 16, &mut counters);
+    plan.skip(LayoutMessage::Alarm, 16, &mut counters);
+    let frame = plan.status(&StatusFields::default(), &mut counters);
+    assert_eq!(protection.verified_counter(frame.data()), Some(2), "a turn of 15 and one more");
+    assert_eq!(serde_json::to_value(counters).unwrap()["alarm"], 3, "not protected");
 }

@@ -1,0 +1,145 @@
+//! The digest frame: all raised alarms as a count and a checksum, the state of every rule, and one threshold in full
+//! precision.
+//!
+//! In: alarms as their frames carry them. Out: values for the signals of `PACKWATCH_Digest`. A receiver that has lost
+//! alarm frames, or started late, finds with the checksum whether its table of raised alarms is complete.
+
+use super::layout::LayoutMessage;
+use super::message::OutputMessage;
+use super::output::RULES;
+use crate::can::Frame;
+use crate::can::dbc::Database;
+use crate::can::e2e::crc16;
+use crate::quantity::CellIndex;
+
+/// The code of "the pack as a whole" in a table entry, as in the alarm frame of the shipped DBC.
+const WHOLE_PACK: u16 = 2047;
+/// Signals on page 0. The rules and the threshold are on pages of their own.
+const REQUIRED: [&str; 5] = ["Page", "Raised", "Worst", "TableChecksum", "PassTime"];
+/// Number of alarm rules.
+const RULE_COUNT: usize = RULES.len();
+
+/// State of a rule; the number is the code of the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum RuleState {
+    /// Judged; no alarm of it is raised.
+    None = 0,
+    /// An alarm of severity info is raised, none is worse.
+    Info = 1,
+    /// Of severity warning.
+    Warning = 2,
+    /// Of severity severe.
+    Severe = 3,
+    /// No alarm of it is raised, and not all of them can be judged.
+    Unknown = 4,
+    /// No threshold is configured.
+    #[default]
+    NotWatched = 5,
+}
+
+/// A threshold as configured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ThresholdFields {
+    /// Number of the rule.
+    pub rule: u8,
+    /// Code of the wire: 1 info, 2 warning, 3 severe.
+    pub severity: u8,
+    /// In the rule's internal unit.
+    pub threshold: f64,
+}
+
+/// Contents of all pages of the digest.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct DigestFields {
+    /// Raised alarms.
+    pub raised: usize,
+    /// Code of the wire: 0 none, 1 info, 2 warning, 3 severe.
+    pub worst: u8,
+    /// Over the raised alarms.
+    pub checksum: TableChecksum,
+    /// Longest time between two frames of one raised alarm, s.
+    pub pass_time_s: f64,
+    /// States of the rules, in the order of their numbers.
+    pub rules: [RuleState; RULE_COUNT],
+    /// The threshold whose turn it is; `None` = none is configured.
+    pub threshold: Option<ThresholdFields>,
+}
+
+/// Checksum over a table of raised alarms: the sum, modulo 65536, of the CRC-16 (polynomial 0x1021, start 0xFFFF) of each
+/// entry. A sum does not depend on the order, so a receiver adds and subtracts entries as they come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TableChecksum(u16);
+
+impl TableChecksum {
+    /// Adds a raised alarm, as its frame carries it: number of the rule, codes of severity and state, cell (`None` = the
+    /// pack), whether it is acknowledged.
+    pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
+        let [low, high] = cell.map_or(WHOLE_PACK, |cell| cell.0).to_le_bytes();
+        let entry = [rule, severity, low, high, state | u8::from(is_acknowledged) << 3];
+        self.0 = self.0.wrapping_add(crc16(0xFFFF, &entry));
+    }
+
+    /// The value that is sent: 65535 means "not available", so a sum of 65535 is sent as 65534.
+    pub fn value(self) -> u16 {
+        self.0.min(u16::MAX - 1)
+    }
+}
+
+/// The digest frame, ready for encoding.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct DigestPlan {
+    pub(super) message: OutputMessage,
+    /// Selector codes of the pages, ascending.
+    pages: Vec<u64>,
+    /// Per rule: the factor from the rule's internal unit to that of its `Threshold_...`.
+    factors: [f64; RULE_COUNT],
+}
+
+impl DigestPlan {
+    /// The plan; `None` = the database has no digest, or faults are noted.
+    pub(super) fn new(database: &Database, alarm: &OutputMessage, faults: &mut Vec<String>) -> Option<Self> {
+        let name = LayoutMessage::Digest.message();
+        database.message(name)?;
+        let rules = RULES.map(|rule| format!("Rule_{rule}"));
+        let required: Vec<&str> = REQUIRED.into_iter().chain(rules.iter().map(String::as_str)).collect();
+        let message = OutputMessage::new(database, name, &required, faults)?;
+        let factors = RULES.map(|rule| alarm.per_inside_unit(&format!("Threshold_{rule}")));
+        Some(Self { pages: message.page_codes(), message, factors })
+    }
+
+    /// One page, counted from 0; `None` = there is no such page.
+    pub(super) fn frame(&self, page: usize, fields: &DigestFields, counter: &mut u8) -> Option<Frame> {
+        let code = *self.pages.get(page)?;
+        Some(self.message.frame(code, counter, |name| self.value(fields, name)))
+    }
+
+    /// Pages of the digest.
+    pub(super) fn page_count(&self) -> usize {
+        self.pages.len()
+    }
+
+    fn value(&self, fields: &DigestFields, name: &str) -> Option<f64> {
+        let threshold = fields.threshold.as_ref();
+        match name {
+            "Raised" => Some(f64::from(u16::try_from(fields.raised).unwrap_or(u16::MAX))),
+            "Worst" => Some(fields.worst.into()),
+            "TableChecksum" => Some(fields.checksum.value().into()),
+            "PassTime" => Some(fields.pass_time_s),
+            "ThresholdRule" => threshold.map(|threshold| threshold.rule.into()),
+            "ThresholdSeverity" => threshold.map(|threshold| threshold.severity.into()),
+            "Threshold" => threshold.map(|of| of.threshold * self.factor(of.rule)),
+            _ => {
+                let rule = RULES.iter().position(|rule| name.strip_prefix("Rule_") == Some(*rule))?;
+                Some(f64::from(fields.rules[rule] as u8))
+            }
+        }
+    }
+
+    fn factor(&self, rule: u8) -> f64 {
+        usize::from(rule).checked_sub(1).and_then(|index| self.factors.get(index)).copied().unwrap_or(1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,82 @@
+//! Digest frames read back with the shipped DBC.
+
+use super::*;
+use crate::can::encode::{OutputPlan, SendCounters, default_database};
+
+/// Physical value of a signal of one page.
+fn read(frames: &[Frame], name: &str) -> f64 {
+    let database = default_database().unwrap();
+    let (_, signal) = database.signal(&format!("PACKWATCH_Digest.{name}")).unwrap();
+    let page = signal.conditions.first().map_or(0, |condition| condition.ranges[0].0);
+    let frame = frames.iter().find(|frame| u64::from(frame.data()[2] & 0x0F) == page).unwrap();
+    signal.layout.plan().unwrap().decode(frame.data()).unwrap()
+}
+
+fn frames(fields: &DigestFields) -> Vec<Frame> {
+    let plan = OutputPlan::new(&default_database().unwrap()).unwrap();
+    let mut counters = SendCounters::default();
+    (0..plan.digest_pages()).map(|page| plan.digest(page, fields, &mut counters).unwrap()).collect()
+}
+
+#[test]
+fn every_page_reads_back() {
+    let mut checksum = TableChecksum::default();
+    checksum.add(9, 2, None, 1, true);
+    let mut rules = [RuleState::NotWatched; RULE_COUNT];
+    (rules[0], rules[8], rules[13]) = (RuleState::Unknown, RuleState::Warning, RuleState::None);
+    let threshold = Some(ThresholdFields { rule: 14, severity: 3, threshold: 1.0 });
+    let made = frames(&DigestFields { raised: 97, worst: 2, checksum, pass_time_s: 1.94, rules, threshold });
+    assert_eq!(made.len(), 3);
+    for (name, wanted) in [
+        ("Raised", 97.0),
+        ("Worst", 2.0),
+        ("TableChecksum", f64::from(checksum.value())),
+        ("PassTime", 1.9),
+        ("Rule_CapacityLow", 4.0),
+        ("Rule_UsableCapacityLow", 5.0),
+        ("Rule_TemperatureHigh", 2.0),
+        ("Rule_BusFault", 0.0),
+        ("ThresholdRule", 14.0),
+        ("ThresholdSeverity", 3.0),
+        ("Threshold", 1.0),
+    ] {
+        assert!((read(&made, name) - wanted).abs() < 0.051, "{name}: {} for {wanted}", read(&made, name));
+    }
+}
+
+#[test]
+fn a_threshold_has_the_unit_of_the_rule_s_own_signal() {
+    let of = |rule, threshold| {
+        let threshold = Some(ThresholdFields { rule, severity: 1, threshold });
+        read(&frames(&DigestFields { threshold, ..DigestFields::default() }), "Threshold")
+    };
+    assert!((of(8, 0.155) - 15.5).abs() < 1e-5, "SOC in %");
+    assert!((of(1, 1.82) - 1.82).abs() < 1e-6, "capacity in Ah");
+}
+
+#[test]
+fn the_checksum_does_not_depend_on_the_order_and_differs_with_every_part_of_an_entry() {
+    let sum = |entries: &[(u8, u8, Option<u16>, u8, bool)]| {
+        let mut checksum = TableChecksum::default();
+        for &(rule, severity, cell, state, is_acknowledged) in entries {
+            checksum.add(rule, severity, cell.map(CellIndex), state, is_acknowledged);
+        }
+        checksum.value()
+    };
+    let (one, other) = ((1, 2, Some(3), 1, false), (9, 3, None, 4, true));
+    assert_eq!(sum(&[one, other]), sum(&[other, one]));
+    assert_eq!(sum(&[]), 0);
+    for changed in [
+        (2, 2, Some(3), 1, false),
+        (1, 3, Some(3), 1, false),
+        (1, 2, Some(259), 1, false),
+        (1, 2, None, 1, false),
+        (1, 2, Some(3), 5, false),
+        (1, 2, Some(3), 1, true),
+    ] {
+        assert_ne!(sum(&[one]), sum(&[changed]), "{changed:?}");
+    }
+    // The example of the manual.
+    assert_eq!(sum(&[(9, 2, None, 1, false)]), 0x12CD);
+    assert_eq!(TableChecksum(u16::MAX).value(), 65534);
+}

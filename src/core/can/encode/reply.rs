@@ -1,0 +1,181 @@
+//! The reply to a command frame.
+//!
+//! In: the outcome of a command, or why it was not executed, and the counter that the next command must have. Out: values
+//! for the signals of `PACKWATCH_Reply`. The content of a frame with a wrong checksum is not repeated.
+
+use serde::{Deserialize, Serialize};
+
+use super::command::{Command, CommandFields};
+use super::layout::LayoutMessage;
+use super::message::OutputMessage;
+use crate::can::Frame;
+use crate::can::dbc::Database;
+use crate::can::e2e::Status;
+
+/// Signals of the reply.
+const REQUIRED: [&str; 9] =
+    ["Result", "Reason", "Command", "Rule", "Severity", "Cell", "CounterExpected", "Changed", "Refused"];
+/// Codes of `Result`.
+const ACCEPTED: u8 = 1;
+const REFUSED: u8 = 2;
+/// Codes of `Reason` beyond those of [`CommandRefusal`].
+const NO_REASON: u8 = 0;
+const NOT_HEALTHY: u8 = 6;
+const NOTHING_TO_DO: u8 = 7;
+
+/// Why a command frame was not executed; the number is the code of `Reason` on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum CommandRefusal {
+    /// The first frame after a start of the receiver: it only shows the counter.
+    FirstFrame = 1,
+    /// Damaged, too short, or of another message.
+    WrongChecksum = 2,
+    /// The counter is that of the last accepted frame.
+    RepeatedCounter = 3,
+    /// The counter skipped further than allowed.
+    WrongCounter = 4,
+    /// A code without a meaning.
+    NoMeaning = 5,
+}
+
+impl CommandRefusal {
+    /// Why a frame with this result of its end-to-end check is not executed; `None` = it may be.
+    pub const fn of(status: Status) -> Option<Self> {
+        match status {
+            Status::Ok | Status::OkSomeLost | Status::Sync => None,
+            Status::Initial => Some(Self::FirstFrame),
+            Status::Repeated => Some(Self::RepeatedCounter),
+            Status::WrongSequence => Some(Self::WrongCounter),
+            Status::WrongCrc | Status::NoNewData => Some(Self::WrongChecksum),
+        }
+    }
+
+    /// Whether the frame's checksum was right.
+    pub const fn is_intact(self) -> bool {
+        !matches!(self, Self::WrongChecksum)
+    }
+
+    /// Words for a log.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::FirstFrame => "first frame after a start",
+            Self::WrongChecksum => "wrong checksum",
+            Self::RepeatedCounter => "repeated counter",
+            Self::WrongCounter => "wrong counter",
+            Self::NoMeaning => "no meaning",
+        }
+    }
+}
+
+/// Contents of the reply.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReplyFields {
+    /// Alarms changed and alarms refused by the command, or why it was not executed.
+    pub outcome: Result<(u32, u32), CommandRefusal>,
+    /// The command; `None` = it could not be read.
+    pub command: Option<CommandFields>,
+    /// Counter that the next command must have; `None` = any.
+    pub counter_expected: Option<u8>,
+}
+
+impl ReplyFields {
+    /// Codes of `Result` and `Reason`.
+    fn result(&self) -> (u8, u8) {
+        let replaces_pack = self.command.is_some_and(|fields| fields.command == Command::PackReplaced);
+        match self.outcome {
+            Err(refusal) => (REFUSED, refusal as u8),
+            Ok((0, 1..)) => (REFUSED, NOT_HEALTHY),
+            Ok((_, 1..)) => (ACCEPTED, NOT_HEALTHY),
+            Ok((0, 0)) if !replaces_pack => (ACCEPTED, NOTHING_TO_DO),
+            Ok(_) => (ACCEPTED, NO_REASON),
+        }
+    }
+
+    fn value(&self, name: &str) -> Option<f64> {
+        let (result, reason) = self.result();
+        let count = |of: fn(&(u32, u32)) -> u32| self.outcome.as_ref().ok().map(|counts| f64::from(of(counts)));
+        match name {
+            "Result" => Some(result.into()),
+            "Reason" => Some(reason.into()),
+            "Command" => self.command.map(|fields| match fields.command {
+                Command::Acknowledge => 1.0,
+                Command::Clear => 2.0,
+                Command::PackReplaced => 3.0,
+            }),
+            "Rule" => self.command?.rule.map(f64::from),
+            "Severity" => self.command?.severity.map(f64::from),
+            "Cell" => self.command?.cell.map(|cell| f64::from(cell.0)),
+            "CounterExpected" => self.counter_expected.map(f64::from),
+            "Changed" => count(|(changed, _)| *changed),
+            "Refused" => count(|(_, refused)| *refused),
+            _ => None,
+        }
+    }
+}
+
+/// The reply's message; `None` = the database has none, or faults are noted.
+pub(super) fn reply_message(database: &Database, faults: &mut Vec<String>) -> Option<OutputMessage> {
+    let name = LayoutMessage::Reply.message();
+    database.message(name)?;
+    OutputMessage::new(database, name, &REQUIRED, faults)
+}
+
+/// The reply.
+pub(super) fn reply_frame(message: &OutputMessage, fields: &ReplyFields, counter: &mut u8) -> Frame {
+    message.frame(0, counter, |name| fields.value(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::can::encode::default_database;
+    use crate::quantity::CellIndex;
+
+    /// Raw codes of the signals, in the order of [`REQUIRED`].
+    fn codes(fields: &ReplyFields) -> [u64; 9] {
+        let database = default_database().unwrap();
+        let plan = reply_message(&database, &mut Vec::new()).unwrap();
+        let frame = reply_frame(&plan, fields, &mut 0);
+        let code = |name: &str| {
+            let (_, signal) = database.signal(&format!("PACKWATCH_Reply.{name}")).unwrap();
+            signal.layout.plan().unwrap().raw(frame.data()).unwrap()
+        };
+        REQUIRED.map(code)
+    }
+
+    fn fields(outcome: Result<(u32, u32), CommandRefusal>, command: Command) -> ReplyFields {
+        let command = CommandFields { command, rule: Some(9), severity: None, cell: Some(CellIndex(5)) };
+        ReplyFields { outcome, command: Some(command), counter_expected: Some(255) }
+    }
+
+    #[test]
+    fn an_outcome_has_a_result_a_reason_and_counts() {
+        assert_eq!(codes(&fields(Ok((2, 0)), Command::Clear)), [1, 0, 2, 9, 0, 5, 255, 2, 0]);
+        assert_eq!(codes(&fields(Ok((2, 3)), Command::Clear)), [1, 6, 2, 9, 0, 5, 255, 2, 3]);
+        assert_eq!(codes(&fields(Ok((0, 3)), Command::Clear)), [2, 6, 2, 9, 0, 5, 255, 0, 3]);
+        assert_eq!(codes(&fields(Ok((0, 0)), Command::Acknowledge)), [1, 7, 1, 9, 0, 5, 255, 0, 0]);
+        assert_eq!(codes(&fields(Ok((0, 0)), Command::PackReplaced))[..2], [1, 0]);
+        assert_eq!(codes(&fields(Ok((4000, 4000)), Command::Clear))[7..], [62, 14], "counts end before not available");
+    }
+
+    #[test]
+    fn a_frame_that_was_not_executed_has_its_reason_and_no_counts() {
+        for (status, reason) in
+            [(Status::Initial, 1), (Status::WrongCrc, 2), (Status::Repeated, 3), (Status::WrongSequence, 4)]
+        {
+            let refusal = CommandRefusal::of(status).unwrap();
+            assert_eq!(codes(&fields(Err(refusal), Command::Clear)), [2, reason, 2, 9, 0, 5, 255, 63, 15]);
+        }
+        let unread = ReplyFields { outcome: Err(CommandRefusal::NoMeaning), command: None, counter_expected: None };
+        assert_eq!(codes(&unread), [2, 5, 15, 31, 0, 2047, 511, 63, 15]);
+    }
+
+    #[test]
+    fn every_usable_status_is_executed() {
+        for status in Status::ALL {
+            assert_eq!(CommandRefusal::of(status).is_none(), status.is_usable(), "{status:?}");
+        }
+    }
+}

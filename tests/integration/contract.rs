@@ -1,0 +1,303 @@
+//! The contract with other ECUs: a listener that loses frames, starts late and sees the daemon killed has the daemon's table of
+//! alarms after two cycles. The listener knows the written DBC and the manual's page `ecu/contract.md`, nothing else.
+//!
+//! `PACKWATCH_CONTRACT_RUNS` says how many runs (200); the whole are 10,000.
+
+mod listener;
+mod replies;
+
+use std::collections::BTreeMap;
+
+use listener::{AlarmTable, Listener};
+use packwatch::alarm::{Rule, Selector};
+use packwatch::can::dbc::Database;
+use packwatch::can::encode::InputEncoder;
+use packwatch::config::Config;
+use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Monitor, Outputs, Snapshot};
+use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::support::config_texts;
+
+/// Cells, and how many of them are on a page of their message.
+const CELLS: u16 = 96;
+const PAGE_CELLS: u16 = 3;
+const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
+/// Part of the frames that the listener loses.
+const LOSS: f64 = 0.1;
+/// Restarts in a run.
+const RESTARTS: u32 = 10;
+/// Step in which the daemon's table is looked at, ms.
+const STEP_MS: i64 = 100;
+/// Longest time until no alarm has changed for two cycles, ms: the share of bad readings moves for a minute.
+const MAX_WAIT_MS: i64 = 600_000;
+const BUS: BusIndex = BusIndex(0);
+
+const PACK: &str = r#"
+[pack]
+cells = 96
+cell_model = "cells/example_nmc_2600.toml"
+[[interface]]
+name = "can0"
+[input]
+dbc = ["pack.dbc"]
+[input.current]
+signal = "Status.Current"
+positive = "discharge"
+[input.cell_voltage]
+signal = "Cells.Voltage{n}"
+[[input.temperature]]
+signal = "Status.Temperature"
+[limits.temperature]
+max_age_s = 2.0
+[[alarm]]
+rule = "input_missing"
+warning = 1.2
+[[alarm]]
+rule = "input_implausible"
+severe = "50 %"
+[[alarm]]
+rule = "temperature_high"
+warning = 50.0
+severe = 60.0
+latched = true
+[[alarm]]
+rule = "bus_fault"
+warning = 1.0
+[[alarm]]
+rule = "store_failed"
+severe = 0.5
+[output]
+"#;
+
+fn load() -> Config {
+    let mut dbc = String::from("VERSION \"\"\nNS_ :\nBS_:\nBU_: A\nBO_ 256 Status: 8 A\n");
+    dbc +=
+        " SG_ Current : 0|16@1- (0.01,0) [-300|300] \"A\" A\n SG_ Temperature : 16|8@1+ (1,-40) [-40|200] \"degC\" A\n";
+    dbc += "BO_ 272 Cells: 8 A\n SG_ Page M : 0|8@1+ (1,0) [0|255] \"\" A\n";
+    for cell in 0..CELLS {
+        let (page, bit) = (cell / PAGE_CELLS, 8 + 16 * (cell % PAGE_CELLS));
+        dbc += &format!(" SG_ Voltage{} m{page} : {bit}|16@1+ (0.0001,0) [0|5] \"V\" A\n", cell + 1);
+    }
+    config_texts::load(PACK, &dbc)
+}
+
+/// The daemon with its bus, its disk, and what its inputs show now.
+struct Daemon<'a> {
+    config: &'a Config,
+    random: ChaCha8Rng,
+    monitor: Monitor,
+    /// What the disk has: stored with every change of an alarm, as the service does.
+    stored: Snapshot,
+    encoder: InputEncoder,
+    out: Outputs,
+    now_ms: i64,
+    listener: Option<Listener>,
+    /// Per page of cells: 0 good, 1 missing, 2 out of range.
+    pages: [u8; PAGES],
+    temperature_c: Option<f64>,
+}
+
+impl<'a> Daemon<'a> {
+    fn new(config: &'a Config, seed: u64) -> Self {
+        let monitor = Monitor::new(config.monitor.clone());
+        Self {
+            config,
+            random: ChaCha8Rng::seed_from_u64(seed),
+            stored: monitor.snapshot(),
+            monitor,
+            encoder: InputEncoder::new(&config.monitor.input),
+            out: Outputs::default(),
+            now_ms: 1_000_000,
+            listener: None,
+            pages: [0; PAGES],
+            temperature_c: Some(25.0),
+        }
+    }
+
+    fn now(&self) -> Timestamp {
+        Timestamp::from_nanos(self.now_ms * 1_000_000)
+    }
+
+    fn give(&mut self, input: Input<'_>) {
+        self.monitor.handle(input, &mut self.out);
+        for sent in &self.out.frames {
+            if let Some(listener) = &mut self.listener
+                && !self.random.random_bool(LOSS)
+            {
+                listener.handle(self.now_ms, &sent.frame);
+            }
+        }
+        let is_change = |kind: &EventKind| matches!(kind, EventKind::Alarm { .. } | EventKind::Command { .. });
+        if self.out.events.iter().any(|event| is_change(&event.kind)) {
+            self.stored = self.monitor.snapshot();
+        }
+        self.out.clear();
+    }
+
+    /// Time passes: frames of the inputs twice a second, ticks when they do something.
+    fn run_for(&mut self, duration_ms: i64) {
+        let end_ms = self.now_ms + duration_ms;
+        while self.now_ms < end_ms {
+            self.now_ms += 10;
+            if self.now_ms % 500 == 0 {
+                self.give_inputs();
+            }
+            let time = self.now();
+            if self.monitor.next_due().is_none_or(|due| due <= time) {
+                self.give(Input::Tick { time });
+            }
+        }
+    }
+
+    fn give_inputs(&mut self) {
+        let mut values =
+            vec![(Channel::Current, Some(0.0)), (Channel::Temperature(SensorIndex(0)), self.temperature_c)];
+        for cell in 0..CELLS {
+            let volts = [Some(3.7), None, Some(6.0)][usize::from(self.pages[usize::from(cell / PAGE_CELLS)])];
+            values.push((Channel::CellVoltage(CellIndex(cell)), volts));
+        }
+        let mut made = Vec::new();
+        self.encoder.encode(&values, &mut made);
+        let time = self.now();
+        for (bus, frame) in &made {
+            self.give(Input::Frame { time, bus: *bus, frame });
+        }
+    }
+
+    /// Something happens to the vehicle, or a command comes.
+    fn act(&mut self) {
+        let time = self.now();
+        match self.random.random_range(0..10) {
+            0..=3 => {
+                let page = self.random.random_range(0..PAGES);
+                self.pages[page] = self.random.random_range(0..3);
+            }
+            4 => self.pages = [self.random.random_range(0..3); PAGES],
+            5 | 6 => self.temperature_c = [None, Some(25.0), Some(55.0), Some(65.0)][self.random.random_range(0..4)],
+            7 => {
+                let event = if self.random.random_bool(0.5) { BusEvent::Up } else { BusEvent::Down };
+                self.give(Input::Bus { time, bus: BUS, event });
+            }
+            8 => {
+                let works = self.random.random_bool(0.5);
+                self.give(Input::Store { time, works });
+            }
+            _ => {
+                let rule = [None, Some(Rule::TemperatureHigh)][self.random.random_range(0..2)];
+                let which = Selector { rule, ..Selector::default() };
+                let is_clear = self.random.random_bool(0.5);
+                let command = if is_clear { Command::Clear(which) } else { Command::Acknowledge(which) };
+                self.give(Input::Command { time, command });
+            }
+        }
+    }
+
+    /// The process is killed, and starts from the disk.
+    fn restart(&mut self) {
+        let away_ms = self.random.random_range(5..300) * 10;
+        let age_ms = away_ms + self.now_ms - self.stored.time.nanos() / 1_000_000;
+        self.now_ms += away_ms;
+        self.monitor = Monitor::new(self.config.monitor.clone());
+        self.monitor.restore(self.stored.clone(), Downtime::Seconds(age_ms as f64 / 1000.0)).unwrap();
+    }
+
+    /// The raised alarms as their frames carry them.
+    fn table(&self) -> AlarmTable {
+        let raised = self.monitor.alarms().raised();
+        raised
+            .map(|alarm| {
+                let cell = alarm.cell.map_or(2047, |cell| u64::from(cell.0));
+                let key = (alarm.rule as u64, alarm.severity as u64, cell);
+                (key, (u64::from(alarm.state.wire_code()), alarm.is_acknowledged))
+            })
+            .collect()
+    }
+
+    /// Code of each rule in the digest.
+    fn rules(&self) -> BTreeMap<u64, u64> {
+        let code = |rule: Rule| match self.monitor.alarms().rule_summary(rule) {
+            None => 5,
+            Some(summary) => summary.worst.map_or(if summary.is_known { 0 } else { 4 }, |severity| severity as u64),
+        };
+        Rule::ALL.into_iter().map(|rule| (rule as u64, code(rule))).collect()
+    }
+}
+
+/// One run. Returns the largest number of raised alarms, and two cycles, ms.
+fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
+    let mut daemon = Daemon::new(config, seed);
+    let joins = daemon.random.random_range(0..=RESTARTS);
+    let mut most = 0;
+    for segment in 0..=RESTARTS {
+        if segment == joins {
+            daemon.listener = Some(Listener::new(database));
+        }
+        for _ in 0..daemon.random.random_range(1..5) {
+            let wait_ms = daemon.random.random_range(1..100) * 10;
+            daemon.run_for(wait_ms);
+            daemon.act();
+            most = most.max(daemon.table().len());
+        }
+        if segment < RESTARTS {
+            daemon.restart();
+        }
+    }
+    let (began_ms, mut state, mut since_ms) = (daemon.now_ms, (daemon.table(), daemon.rules()), daemon.now_ms);
+    let mut two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().cycle_ms();
+    while daemon.now_ms < since_ms + two_cycles_ms {
+        daemon.run_for(STEP_MS);
+        let now = (daemon.table(), daemon.rules());
+        if now != state {
+            (state, since_ms) = (now, daemon.now_ms);
+        }
+        // The listener's own idea of a cycle may be as late as its last digest.
+        two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().cycle_ms();
+        assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms change for ever");
+    }
+    let (truth, rules) = (daemon.table(), daemon.rules());
+    let now_ms = daemon.now_ms;
+    let listener = daemon.listener.as_mut().unwrap();
+    assert_eq!(listener.table(now_ms), truth, "seed {seed}");
+    assert!(listener.is_confirmed(now_ms), "seed {seed}: the table is right, and the listener must know it");
+    assert_eq!(listener.rules(), &rules, "seed {seed}");
+    (most.max(truth.len()), two_cycles_ms)
+}
+
+#[test]
+fn a_listener_that_loses_a_tenth_of_the_frames_has_the_table_after_two_cycles() {
+    let runs: u64 = std::env::var("PACKWATCH_CONTRACT_RUNS").map_or(200, |runs| runs.parse().unwrap());
+    let config = load();
+    let database = config.output_layout.clone().unwrap();
+    let (mut most, mut longest_ms, mut sum) = (0, 0, 0);
+    for seed in 0..runs {
+        let (raised, two_cycles_ms) = run(&config, &database, seed);
+        (most, longest_ms, sum) = (most.max(raised), longest_ms.max(two_cycles_ms), sum + raised);
+    }
+    let mean = sum as f64 / runs as f64;
+    eprintln!(
+        "{runs} runs, {mean:.1} alarms at once ({most} at most), two cycles of up to {longest_ms} ms: 0 differences"
+    );
+    assert!(most > 97 && sum > 3 * usize::try_from(runs).unwrap(), "the runs raise alarms");
+}
+
+#[test]
+fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
+    let config = load();
+    let database = config.output_layout.clone().unwrap();
+    let mut daemon = Daemon::new(&config, 1);
+    daemon.listener = Some(Listener::new(&database));
+    daemon.temperature_c = Some(55.0);
+    daemon.run_for(3_000);
+    let raised = daemon.listener.as_mut().unwrap().table(daemon.now_ms);
+    assert!(raised.contains_key(&(9, 2, 2047)), "{raised:?}");
+    // The daemon is killed and forgets: nothing announces the end, and the digest shows it.
+    daemon.monitor = Monitor::new(config.monitor.clone());
+    daemon.temperature_c = Some(25.0);
+    daemon.run_for(3_000);
+    let now_ms = daemon.now_ms;
+    let listener = daemon.listener.as_mut().unwrap();
+    assert!(!listener.table(now_ms).contains_key(&(9, 2, 2047)));
+    assert!(listener.is_confirmed(now_ms));
+}
