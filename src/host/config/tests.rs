@@ -284,6 +284,12 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
         ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
         ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
+        // The shortest time that the estimator counts is 1 ms.
+        (
+            "[input]",
+            "[estimator]\nmax_information_s = 0.0005\n[input]",
+            "pack.toml:7: estimator.max_information_s = 0.0005, must be 0.001 to 1000000",
+        ),
         ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: duplicate key"),
         (
             "cells = 4",

@@ -73,7 +73,7 @@ section! {
         /// Time constant with which that error decays after the load (slow diffusion).
         load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
         /// Longest time that one voltage reading may represent: readings further apart carry no more information.
-        max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
+        max_information_s: f64, "s", Between(0.001, 1e6), Default("100.0");
         /// A voltage further from its prediction than this many standard deviations changes no estimate.
         gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
         /// Standard deviation of the cell model's error in a single reading, for the gate and the consistency monitor.
