@@ -61,6 +61,7 @@
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
 //! | what an OBDb signal set becomes | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |
+//! | what a BPX file becomes | `lab/import/bpx/curve.rs` (open-circuit voltage), `lab/import/bpx/circuit.rs` (resistances) |
 //! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
 //! | a finding of the doctor | `core/doctor/judge` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |

@@ -1,4 +1,4 @@
-//! `packwatch import`: descriptions of a car's signals from elsewhere, converted to parts of a configuration.
+//! `packwatch import`: descriptions of a car's signals or of a cell from elsewhere, converted to parts of a configuration.
 //!
 //! Standard error gets a count per reason of what was left out; the written file lists each with its place. Exit code 1:
 //! the file cannot be read, is of another kind, or nothing in it can be converted.
@@ -11,6 +11,7 @@ use super::output::{failure, unless_closed};
 use crate::can::dbc::Database;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::import::ImportResult;
+use crate::lab::import::bpx::{self, BpxSettings};
 use crate::lab::import::dbc;
 use crate::lab::import::obdb::{self, ObdbSettings};
 
@@ -30,6 +31,32 @@ enum ImportCommand {
     Obdb(ObdbArgs),
     /// Write the likely battery signals of a DBC as the [input] part of a configuration, by name, unit and range
     Dbc(DbcArgs),
+    /// Derive a cell model from the physical parameters of a BPX file (JSON)
+    Bpx(BpxArgs),
+}
+
+/// Arguments of `import bpx`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+The open-circuit voltage follows from the two potentials, resistances from the parameters for small currents; nothing is fitted, and \
+[provenance] states what was derived how. SOC is 1 at the upper voltage cut-off and 0 at the lower one. A fit to measured data is better.")]
+struct BpxArgs {
+    /// BPX file of version 0.x or 1.x; model SPM, SPMe or DFN
+    #[arg(value_name = "FILE.json")]
+    file: PathBuf,
+    /// Name of the cell [default: the title of the file]
+    #[arg(long)]
+    name: Option<String>,
+    /// Cell model to write instead of standard output; an existing file is replaced
+    #[arg(
+        short,
+        long,
+        visible_alias = "output",
+        value_name = "MODEL.toml",
+        default_value = "-",
+        hide_default_value = true
+    )]
+    write: PathBuf,
 }
 
 /// Arguments of `import dbc`.
@@ -76,6 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         ImportCommand::Obdb(args) => import_obdb(args),
         ImportCommand::Dbc(args) => import_dbc(args),
+        ImportCommand::Bpx(args) => import_bpx(args),
     }
 }
 
@@ -105,6 +133,19 @@ fn import_obdb(args: &ObdbArgs) -> Result<(), Failure> {
     let result = obdb::import(&text, &settings).map_err(failure)?;
     report(&source, &result);
     write(&args.output.output, &result.text)
+}
+
+fn import_bpx(args: &BpxArgs) -> Result<(), Failure> {
+    check_place(&args.write, std::iter::once(&args.file)).map_err(Failure::new)?;
+    let text = read(&args.file)?;
+    let source = args.file.display().to_string();
+    let settings = BpxSettings { source: source.clone(), name: args.name.clone() };
+    let result = bpx::import(&text, &settings).map_err(failure)?;
+    for note in &result.notes {
+        eprintln!("{source}: note: {note}");
+    }
+    eprintln!("{source}: {:.3} Ah between the cut-offs, {} Ah nominal", result.capacity_ah, result.nominal_ah);
+    write(&args.write, &result.text)
 }
 
 /// The text of a file of reasonable size.

@@ -20,6 +20,7 @@ use rayon::prelude::*;
 pub use picture::write as write_plot;
 pub use range::MeasuredRange;
 pub use toml::text;
+pub(crate) use toml::{quoted, table as toml_table};
 
 use super::measured::MeasuredFile;
 use crate::cell::{AgedOcv, Thermal};

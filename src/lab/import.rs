@@ -1,8 +1,9 @@
-//! Foreign descriptions of a car's signals, converted to parts of a packwatch configuration.
+//! Foreign descriptions of a car's signals or of a cell, converted to parts of a packwatch configuration.
 //!
 //! In: the text of a file. Out: TOML a person can read and edit, and a list of everything that was left out, with place and
 //! reason. Pure: nothing is read or written here.
 
+pub mod bpx;
 pub mod dbc;
 mod diagnostic;
 pub mod obdb;

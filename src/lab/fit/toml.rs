@@ -29,7 +29,7 @@ fn line(out: &mut String, text: &str) {
     out.push('\n');
 }
 
-fn quoted(text: &str) -> String {
+pub(crate) fn quoted(text: &str) -> String {
     toml::Value::String(text.to_owned()).to_string()
 }
 
@@ -132,7 +132,7 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
 }
 
 /// `key = [[..], [..]]` with at least `digits` decimals; smaller numbers keep five figures.
-fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
+pub(crate) fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
     line(out, &format!("{key} = ["));
     for row in rows {
         let mut text = String::new();

@@ -1,0 +1,116 @@
+//! Resistances and branches of a BPX cell by the closed forms of its equations for small currents.
+//!
+//! | part | resistance | time constant | source |
+//! | --- | --- | --- | --- |
+//! | charge transfer, each electrode | `R T / (F j0 S)`, `j0 = F k sqrt(x (1 - x))` | none: part of R0 | Butler-Volmer with equal coefficients |
+//! | electrolyte | `(L_n / 3 k_n + L_s / k_s + L_p / 3 k_p) / A` | none: part of R0 | SPMe, Marquis et al., J. Electrochem. Soc. 166 (2019) A3693, eq. 40 |
+//! | solid | `(L_n / s_n + L_p / s_p) / 3 A` | none: part of R0 | the same |
+//! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | the same; slowest mode of a layer without exchange at its ends |
+//! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
+//!
+//! `S` is the surface of all particles, `A` the area of all electrode pairs, `k`, `D` of a layer are the electrolyte's times the layer's
+//! transport efficiency. Each property follows Arrhenius' law of its activation energy; one without follows that of
+//! [`USUAL_J_PER_MOL`]. Deviation: BPX has no double layer, so charge transfer has no time constant. Effect: none after some 0.1 s.
+
+use super::curve::Curve;
+use super::document::{BpxCell, Electrode, Layer, Transport};
+use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
+use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
+
+/// Distance over which the slope of a potential is taken, lithium content: a table's noise must not be read as slope.
+const SLOPE_STEP: f64 = 0.005;
+
+/// Least resistance, ohm, and least time constant, s: a flat potential gives none, a model must have one.
+const LEAST: f64 = 1e-7;
+
+/// Product `x (1 - x)` below which charge transfer is not extrapolated: at either end the exchange current vanishes.
+const LEAST_CONTENT: f64 = 1e-3;
+
+/// Resistances and time constants at one SOC and temperature.
+#[derive(Debug, Clone)]
+pub(super) struct Resistances {
+    pub(super) r0_ohm: f64,
+    /// Resistance, ohm, and time constant, s.
+    pub(super) branches: Vec<(f64, f64)>,
+}
+
+impl Resistances {
+    /// All resistances together, ohm.
+    pub(super) fn settled_ohm(&self) -> f64 {
+        self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
+    }
+}
+
+/// Resistances at a SOC and a temperature, K: the electrolyte's branch where the file has one, then the electrodes'.
+pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperature_k: f64) -> Resistances {
+    let (x, y) = curve.contents(soc);
+    let at = |energy: Option<f64>| arrhenius(energy, cell.reference_k, temperature_k);
+    let sides = [(&cell.negative, x), (&cell.positive, y)];
+    let transfer = sides.map(|(electrode, content)| {
+        let rate = electrode.reaction_rate * at(electrode.reaction_j_per_mol);
+        charge_transfer_ohm(electrode, cell.area_m2, content, rate, temperature_k)
+    });
+    let particles = sides.map(|(electrode, content)| {
+        let diffusivity = electrode.diffusivity.at(content) * at(electrode.diffusivity_j_per_mol);
+        particle(electrode, cell.area_m2, content, diffusivity)
+    });
+    let mut r0_ohm = transfer[0] + transfer[1];
+    let mut branches = Vec::new();
+    if let Some(transport) = &cell.transport {
+        let conductivity = transport.conductivity * at(transport.conductivity_j_per_mol);
+        let diffusivity = transport.diffusivity * at(transport.diffusivity_j_per_mol);
+        r0_ohm += conduction_ohm(transport, cell.area_m2, conductivity);
+        branches.push(concentration(transport, cell.area_m2, diffusivity, temperature_k));
+    }
+    branches.extend(particles);
+    let branches = branches.into_iter().map(|(r_ohm, tau_s)| (r_ohm.max(LEAST), tau_s.max(LEAST)));
+    Resistances { r0_ohm: r0_ohm.max(LEAST), branches: branches.collect() }
+}
+
+/// A property at a temperature, relative to that at the reference.
+fn arrhenius(j_per_mol: Option<f64>, reference_k: f64, temperature_k: f64) -> f64 {
+    let energy = j_per_mol.unwrap_or(USUAL_J_PER_MOL);
+    libm::exp(energy / GAS_J_PER_MOL_K * (1.0 / reference_k - 1.0 / temperature_k))
+}
+
+/// Surface of all particles of an electrode, m2.
+fn surface_m2(electrode: &Electrode, area_m2: f64) -> f64 {
+    electrode.surface_per_m * electrode.thickness_m * area_m2
+}
+
+fn charge_transfer_ohm(electrode: &Electrode, area_m2: f64, content: f64, rate: f64, temperature_k: f64) -> f64 {
+    let exchange_a_per_m2 = FARADAY_C_PER_MOL * rate * (content * (1.0 - content)).max(LEAST_CONTENT).sqrt();
+    GAS_J_PER_MOL_K * temperature_k / (FARADAY_C_PER_MOL * exchange_a_per_m2 * surface_m2(electrode, area_m2))
+}
+
+fn particle(electrode: &Electrode, area_m2: f64, content: f64, diffusivity: f64) -> (f64, f64) {
+    let radius_m = electrode.radius_m;
+    let content = content.clamp(SLOPE_STEP, 1.0 - SLOPE_STEP);
+    let slope_v = electrode.ocp_v.slope(content, SLOPE_STEP).abs();
+    let mol_per_s = 5.0 * diffusivity * electrode.concentration_max * surface_m2(electrode, area_m2) / radius_m;
+    (slope_v / (FARADAY_C_PER_MOL * mol_per_s), radius_m * radius_m / (35.0 * diffusivity))
+}
+
+/// Sum over the layers of thickness over a property times the transport efficiency; electrodes count a third.
+fn path(layers: &[Layer; 3], property: f64) -> f64 {
+    let of = |layer: &Layer| layer.thickness_m / (property * layer.transport_efficiency);
+    of(&layers[0]) / 3.0 + of(&layers[1]) + of(&layers[2]) / 3.0
+}
+
+fn conduction_ohm(transport: &Transport, area_m2: f64, conductivity: f64) -> f64 {
+    let [negative, _, positive] = &transport.layers;
+    let [s_n, s_p] = transport.solid_s_per_m;
+    let solid = (negative.thickness_m / s_n + positive.thickness_m / s_p) / 3.0;
+    (path(&transport.layers, conductivity) + solid) / area_m2
+}
+
+fn concentration(transport: &Transport, area_m2: f64, diffusivity: f64, temperature_k: f64) -> (f64, f64) {
+    let layers = &transport.layers;
+    let thermal_v = GAS_J_PER_MOL_K * temperature_k / FARADAY_C_PER_MOL;
+    let anions = 1.0 - transport.transference;
+    let charge = FARADAY_C_PER_MOL * area_m2 * transport.concentration;
+    let r_ohm = 2.0 * thermal_v * anions * anions * path(layers, diffusivity) / charge;
+    let length: f64 = layers.iter().map(|layer| layer.thickness_m / (diffusivity * layer.transport_efficiency)).sum();
+    let store: f64 = layers.iter().map(|layer| layer.thickness_m * layer.porosity).sum();
+    (r_ohm, length * store / std::f64::consts::PI.powi(2))
+}
