@@ -68,7 +68,7 @@ fn a_configuration_that_says_nothing_of_a_bus_is_refused() {
     broken.config = "[pack]\ncells = 3\n".to_owned();
     let (status, page, faults) = doctor(&broken, &[]);
     assert_eq!((status, page.as_str()), (78, ""));
-    assert!(faults.contains("pack.cell_model is missing"), "{faults}");
+    assert!(faults.contains("pack.cell_model is not set"), "{faults}");
 }
 
 #[test]
