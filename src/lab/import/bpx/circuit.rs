@@ -63,8 +63,13 @@ pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperatu
         branches.push(concentration(transport, cell.area_m2, diffusivity, temperature_k));
     }
     branches.extend(particles);
-    let branches = branches.into_iter().map(|(r_ohm, tau_s)| (r_ohm.max(LEAST), tau_s.max(LEAST)));
-    Resistances { r0_ohm: r0_ohm.max(LEAST), branches: branches.collect() }
+    let branches = branches.into_iter().map(|(r_ohm, tau_s)| (at_least(r_ohm), at_least(tau_s)));
+    Resistances { r0_ohm: at_least(r0_ohm), branches: branches.collect() }
+}
+
+/// At least [`LEAST`]; what is negative or no number stays unknown.
+fn at_least(value: f64) -> f64 {
+    if value >= 0.0 { value.max(LEAST) } else { f64::NAN }
 }
 
 /// A property at a temperature, relative to that at the reference.

@@ -16,7 +16,7 @@ const INTERPOLATION_V: f64 = 0.001;
 const MAX_NODES: usize = 80;
 
 /// Closest SOC breakpoints.
-const CLOSEST_NODES: f64 = 1e-3;
+const CLOSEST_NODES: f64 = 1e-4;
 
 /// Least rise of the open-circuit voltage from one breakpoint to the next, V; one that falls is raised.
 const LEAST_RISE_V: f64 = 2e-5;
@@ -77,7 +77,8 @@ impl<'a> Curve<'a> {
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
             let x = bisect((low, high), HALVINGS, |x| voltage_v(x) < cut_off_v).1;
             let reached_v = voltage_v(x);
-            if !((reached_v - cut_off_v).abs() < 1e-3) {
+            let is_reached = (reached_v - cut_off_v).abs() < 1e-3;
+            if !is_reached {
                 faults.push(format!(
                     "Parameterisation.Cell.{key} voltage cut-off [V]: {cut_off_v}, must be reached by the open-circuit voltage, \
                      which comes to {reached_v:.3} V there"

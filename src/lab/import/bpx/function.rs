@@ -7,6 +7,9 @@ use super::expression::Expression;
 /// Most points of a table; measured potentials have some thousand.
 const MAX_POINTS: usize = 100_000;
 
+/// Path below a JSON value (empty, or with a point in front), and found and allowed.
+type Fault = (String, String);
+
 /// A function of stoichiometry or concentration.
 #[derive(Debug, Clone)]
 pub(super) enum Function {
@@ -21,7 +24,7 @@ impl Function {
     ///
     /// # Errors
     /// Path below the value (empty, or with a point in front), and found and allowed, one each fault.
-    pub(super) fn read(value: &Value) -> Result<Self, Vec<(String, String)>> {
+    pub(super) fn read(value: &Value) -> Result<Self, Vec<Fault>> {
         let fault = |text: String| vec![(String::new(), text)];
         match value {
             Value::Number(number) => {
@@ -63,7 +66,7 @@ pub(super) fn found(value: &Value) -> String {
     }
 }
 
-fn table(value: &Value) -> Result<Vec<(f64, f64)>, Vec<(String, String)>> {
+fn table(value: &Value) -> Result<Vec<(f64, f64)>, Vec<Fault>> {
     let (x, y) = match (numbers(value, "x"), numbers(value, "y")) {
         (Ok(x), Ok(y)) => (x, y),
         (x, y) => return Err([x.err(), y.err()].into_iter().flatten().collect()),
@@ -82,7 +85,7 @@ fn table(value: &Value) -> Result<Vec<(f64, f64)>, Vec<(String, String)>> {
     }
 }
 
-fn numbers(table: &Value, key: &str) -> Result<Vec<f64>, (String, String)> {
+fn numbers(table: &Value, key: &str) -> Result<Vec<f64>, Fault> {
     let list = table.get(key).and_then(Value::as_array);
     let list = list.ok_or_else(|| (format!(".{key}"), "missing, must be a list of numbers".to_owned()))?;
     let number = |(k, value): (usize, &Value)| {
