@@ -6,21 +6,10 @@ use std::path::{Path, PathBuf};
 use assert_cmd::Command;
 use serde_json::Value;
 
+use crate::support::measured;
+
 fn packwatch() -> Command {
     Command::cargo_bin("packwatch").unwrap()
-}
-
-/// The measured file, or `None` where it is not.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
-fn measured(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("PACKWATCH_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let path = root.join(name);
-    if !path.is_file() {
-        println!("SKIPPED: no measured data {}", path.display());
-        return None;
-    }
-    Some(path)
 }
 
 /// Pulses of 2 A for 60 s every 120 s from a full 1 Ah cell of 50 mohm, one row a second.
@@ -95,7 +84,7 @@ fn unusable_data_are_refused_with_the_reason() {
 
 #[test]
 fn the_papers_pulse_test_is_met_within_ten_millivolts() {
-    let Some(file) = measured("nasa_randomized/RW9_pulsed_discharge_1hz.csv.gz") else { return };
+    let Some(file) = measured::file("nasa_randomized/RW9_pulsed_discharge_1hz.csv.gz") else { return };
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("rw9.toml");
     let output = packwatch().args(["fit", "--json", "--name", "RW9", "-o"]).arg(&model).arg(file).output().unwrap();
@@ -108,7 +97,7 @@ fn the_papers_pulse_test_is_met_within_ten_millivolts() {
 
 #[test]
 fn an_ageing_cells_first_cycles_give_a_model_of_discharge_and_charge() {
-    let Some(file) = measured("nasa_pcoe_aging/B0005.csv.gz") else { return };
+    let Some(file) = measured::file("nasa_pcoe_aging/B0005.csv.gz") else { return };
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("b0005.toml");
     let limits = ["--voltage-min", "2.7", "--voltage-max", "4.2", "--first-cycles", "10"];

@@ -8,6 +8,8 @@ use packwatch::cell::circuit::{self, BranchAt};
 use packwatch::cell::{CellModel, Chemistry, Discretisation, Label};
 use serde_json::Value;
 
+use crate::support::measured;
+
 /// Capacity of the simulated cell, Ah; its label says 3.
 const TRUE_AH: f64 = 2.7;
 /// Its resistances relative to the prior's.
@@ -125,22 +127,11 @@ fn what_a_fit_to_logs_needs_is_named() {
     );
 }
 
-/// The measured file, or `None` where it is not.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
-fn measured(name: &str) -> Option<String> {
-    let root = std::env::var_os("PACKWATCH_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let path = root.join(name);
-    if !path.is_file() {
-        println!("SKIPPED: no measured data {}", path.display());
-        return None;
-    }
-    Some(path.to_str().unwrap().to_owned())
-}
-
 #[test]
 fn a_measured_cell_is_known_after_two_drives() {
-    let file = |name: &str| measured(&format!("panasonic_18650pf/25C/{name}.csv.gz"));
+    let file = |name: &str| {
+        measured::file(&format!("panasonic_18650pf/25C/{name}.csv.gz")).map(|path| path.to_str().unwrap().to_owned())
+    };
     let (Some(a), Some(b), Some(c)) = (file("Cycle_1"), file("Cycle_2"), file("NN")) else { return };
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("model.toml");

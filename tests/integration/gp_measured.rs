@@ -8,8 +8,7 @@ use packwatch::regress::{Form, GprSettings, Model, TrainingRows, assign, fit, sc
 
 /// The rows, or `None` where they are not.
 fn file() -> Option<PathBuf> {
-    let root = std::env::var_os("PACKWATCH_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let root = crate::support::measured::root();
     let file = root.join("nasa_randomized/RW9_random_walk_sampled_0p4pct.csv.gz");
     if !file.is_file() {
         println!("SKIPPED: no measured data in {}", root.display());

@@ -10,8 +10,7 @@ use serde_json::Value;
 /// The measured data, or `None` where it is not.
 #[expect(clippy::print_stdout, reason = "a skipped test says so")]
 fn data() -> Option<PathBuf> {
-    let root = std::env::var_os("PACKWATCH_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let root = crate::support::measured::root();
     if root.join("panasonic_18650pf/25C/HWFTa.csv.gz").is_file() && root.join("lg_18650hg2/25C").is_dir() {
         return Some(root);
     }

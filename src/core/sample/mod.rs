@@ -4,14 +4,17 @@
 //! voltage reading, and [`SignalChange`]s when a signal turns bad or good. A bad reading changes no sample.
 //! * [`signal`] checks one signal: range, rate, stuck, stale;
 //! * [`charge`] counts charge and the time without a current measurement;
+//! * [`cell_sample`] is what a cell's estimator gets;
 //! * [`sampler`] holds one signal per channel and combines samples.
 
+pub mod cell_sample;
 pub mod charge;
 pub mod config;
 pub mod counts;
 pub mod sampler;
 pub mod signal;
 
+pub use cell_sample::{CellSample, Moment};
 pub use config::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
-pub use sampler::{CellSample, Moment, Sampler, SamplerState, SignalChange};
+pub use sampler::{Sampler, SamplerState, SignalChange};

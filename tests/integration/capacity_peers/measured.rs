@@ -19,8 +19,7 @@ use crate::support::window::{By, windowed};
 
 /// The measured data, or `None` where it is not.
 fn data() -> Option<PathBuf> {
-    let root = std::env::var_os("PACKWATCH_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let root = crate::support::measured::root();
     let folder = root.join("nasa_pcoe_aging");
     if folder.join("B0005.csv.gz").is_file() {
         return Some(folder);

@@ -1,3 +1,5 @@
+//! Diagnostic answers: which frames belong together, refusals, counts, and what is lost.
+
 #![allow(clippy::unwrap_used, clippy::panic, reason = "in a test a panic is the message")]
 
 use super::*;

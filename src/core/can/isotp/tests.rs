@@ -1,3 +1,5 @@
+//! ISO-TP: segmented messages put together, every damage named, any frames without a panic.
+
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
 use proptest::prelude::*;

@@ -1,3 +1,5 @@
+//! Polling: which request is due when, answers with a current before them, standby and silence.
+
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
 use proptest::prelude::*;

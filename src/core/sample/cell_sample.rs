@@ -1,0 +1,62 @@
+//! A cell's sample: what the sampler hands to the cell's estimator, and the moment at which voltages were measured together.
+//!
+//! In: a voltage (V) with the fresh current (A) and temperature (degrees C) and the charge counted so far (As). Stored samples
+//! are checked ([`CellSample::check`]).
+
+use serde::{Deserialize, Serialize};
+
+use crate::quantity::{CellIndex, InvalidState, Timestamp};
+
+/// Inputs of a cell's update, at the time of its voltage.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellSample {
+    /// Time of the voltage reading.
+    pub time: Timestamp,
+    /// Which cell.
+    pub cell: CellIndex,
+    /// Cell voltage, V.
+    pub voltage_v: f64,
+    /// Cell current, A, positive = discharge; `None` = the last good one is too old.
+    pub current_a: Option<f64>,
+    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it for
+    /// the current between its last reading and `time`.
+    pub charge_as: f64,
+    /// Time so far in which the current's reading was other than exactly zero, s.
+    #[serde(default)]
+    pub offset_s: f64,
+    /// Time so far without a usable current, s: the charge of that time is unknown.
+    pub unmeasured_s: f64,
+    /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
+    pub temperature_c: Option<f64>,
+}
+
+impl CellSample {
+    /// Checks the numbers of a stored sample.
+    ///
+    /// # Errors
+    /// The first impossible number.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        let known = [self.current_a, self.temperature_c].into_iter().flatten();
+        let numbers = [self.voltage_v, self.charge_as, self.offset_s, self.unmeasured_s].into_iter().chain(known);
+        InvalidState::unless_numbers("a sample that waits for its step", numbers)
+    }
+
+    /// The same voltage, measured at this moment.
+    #[must_use]
+    pub fn measured_at(self, moment: &Moment) -> Self {
+        let Moment { time, current_a, charge_as, offset_s, unmeasured_s } = *moment;
+        Self { time, current_a, charge_as, offset_s, unmeasured_s, ..self }
+    }
+}
+
+/// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
+/// answer to a diagnostic request does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    pub(super) time: Timestamp,
+    pub(super) current_a: Option<f64>,
+    pub(super) charge_as: f64,
+    pub(super) offset_s: f64,
+    pub(super) unmeasured_s: f64,
+}
