@@ -9,8 +9,10 @@
 
 pub mod curve;
 
-use super::aged_ocv::AgedOcv;
-use super::electrodes::{NegativeMaterial as Negative, PositiveMaterial as Positive};
+use serde::{Deserialize, Serialize};
+
+use super::aged_ocv::{AgedOcv, MIXES};
+use super::electrodes::{Electrodes, NegativeMaterial as Negative, PositiveMaterial as Positive};
 use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
@@ -100,11 +102,13 @@ pub struct Label {
 }
 
 /// SOC breakpoints of a model from a label.
-const SOC: [f64; 21] =
+pub(super) const SOC: [f64; 21] =
     [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0];
 
 /// Temperature breakpoints, degrees C: Arrhenius' law holds between them.
-const TEMPERATURE_C: [f64; 4] = [-30.0, 0.0, 25.0, 60.0];
+pub(super) const TEMPERATURE_C: [f64; TEMPERATURE_NODES] = [-30.0, 0.0, 25.0, 60.0];
+/// Their number.
+pub const TEMPERATURE_NODES: usize = 4;
 
 /// One resistance of a usual cell at 25 degrees C.
 struct UsualResistance {
@@ -118,8 +122,47 @@ struct UsualResistance {
 
 const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 
+/// Number of resistances: in series, and one per branch.
+pub const RESISTANCES: usize = 4;
+
+/// Time constants of the branches, s.
+pub const TAU_S: [f64; RESISTANCES - 1] = [RESISTANCE[1].tau_s, RESISTANCE[2].tau_s, RESISTANCE[3].tau_s];
+
+/// SOC nodes of [`ResistanceFactors`].
+pub const FACTOR_SOC: [f64; 5] = [0.0, 0.1, 0.3, 0.7, 1.0];
+
+/// Resistances of a cell relative to those of its label.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ResistanceFactors {
+    /// ln of each resistance's ratio at 25 degrees C, at [`FACTOR_SOC`].
+    pub ln: [[f64; FACTOR_SOC.len()]; RESISTANCES],
+    /// Deviation of each from the usual law of temperature: part of its activation energy.
+    pub by_temperature: [f64; RESISTANCES],
+}
+
+impl ResistanceFactors {
+    /// Ratio of resistance `j` to that of the label.
+    fn ratio(&self, j: usize, soc: f64, arrhenius: f64) -> f64 {
+        libm::exp(curve::interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
+    }
+}
+
+/// An open-circuit curve with what is not known of it, at the SOC breakpoints of a model from a label.
+#[derive(Debug, Clone)]
+pub struct CurveOfCells {
+    /// Mean, V, rising.
+    pub mean_v: Vec<f64>,
+    /// Largest modes of its spread, V per standard deviation.
+    pub modes_v: [Vec<f64>; MIXES],
+    /// Standard deviation of the rest, V.
+    pub rest_v: Vec<f64>,
+    /// Electrodes of a cell like it; `None` when they are blends.
+    pub electrodes: Option<Electrodes>,
+}
+
 /// Geometric means over models fitted to Panasonic 18650PF, LG HG2, LG M50 (simulated), EVE LF280 and a Leaf cell.
-const RESISTANCE: [UsualResistance; 4] = [
+const RESISTANCE: [UsualResistance; RESISTANCES] = [
     UsualResistance { ohm_ah: 0.073, tau_s: 0.0, shape: [1.6, 1.4, 1.25, 1.08, 1.0] },
     UsualResistance { ohm_ah: 0.031, tau_s: 10.0, shape: [3.5, 2.5, 1.8, 1.2, 1.1] },
     UsualResistance { ohm_ah: 0.050, tau_s: 100.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
@@ -162,26 +205,60 @@ impl Label {
     /// The model of such a cell; `None` when no cell of this chemistry has these cut-offs.
     pub fn model(&self) -> Option<CellModel> {
         let curve = self.curve()?;
-        let rows = vec![curve.mean_v.clone(); TEMPERATURE_C.len()];
         let (modes_v, rest_v) = curve.modes_v();
+        let spread = ModelSpread {
+            curve_v: curve::median(&rest_v),
+            log_resistance: LOG_RESISTANCE_STD,
+            slow_branch: SLOW_BRANCH_STD,
+            capacity: CAPACITY_STD,
+            drop_sqrt_s: DROP_SQRT_S,
+        };
+        let curve = CurveOfCells { mean_v: curve.mean_v, modes_v, rest_v, electrodes: curve.electrodes };
+        Some(self.model_of(&curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
+    }
+
+    /// The model of a cell with this curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
+    /// temperature of the tables, counted in the model's error at a usual load.
+    pub fn model_of(
+        &self,
+        curve: &CurveOfCells,
+        factors: &ResistanceFactors,
+        drop_std: &[f64; TEMPERATURE_NODES],
+        spread: ModelSpread,
+    ) -> CellModel {
+        let rows = vec![curve.mean_v.clone(); TEMPERATURE_C.len()];
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, self.rated_ah, &rows))
             .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, self.rated_ah, &rows));
-        aged_ocv.add_spread(&modes_v);
-        let table = |resistance: &UsualResistance| {
-            let at =
-                |soc: f64| resistance.ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, &resistance.shape, soc);
-            let row = |t: &f64| SOC.iter().map(|&soc| at(soc) * arrhenius(*t)).collect();
+        aged_ocv.add_spread(&curve.modes_v);
+        let table = |j: usize| {
+            let UsualResistance { ohm_ah, shape, .. } = &RESISTANCE[j];
+            let row = |&t: &f64| {
+                let by_temperature = arrhenius(t);
+                let at = |&soc: &f64| {
+                    let ohm = ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, shape, soc);
+                    ohm * by_temperature * factors.ratio(j, soc, by_temperature)
+                };
+                SOC.iter().map(at).collect()
+            };
             Table { values: TEMPERATURE_C.iter().map(row).collect() }
         };
-        let branch = |resistance: &UsualResistance| {
-            let r_ohm = table(resistance);
-            let farad = |row: &Vec<f64>| row.iter().map(|r| resistance.tau_s / r).collect();
+        let branch = |(i, tau_s): (usize, &f64)| {
+            let r_ohm = table(i + 1);
+            let farad = |row: &Vec<f64>| row.iter().map(|r| tau_s / r).collect();
             Branch { c_farad: Table { values: r_ohm.values.iter().map(farad).collect() }, r_ohm }
         };
-        let [series, branches @ ..] = &RESISTANCE;
-        Some(CellModel {
+        let r0_ohm = table(0);
+        let branches: Vec<Branch> = TAU_S.iter().enumerate().map(branch).collect();
+        let drop_v = |t: usize, s: usize| {
+            let settled_ohm: f64 = branches.iter().fold(r0_ohm.values[t][s], |sum, it| sum + it.r_ohm.values[t][s]);
+            USUAL_LOAD_PER_H * self.rated_ah * settled_ohm
+        };
+        let error_v = |t: usize| {
+            (0..SOC.len()).map(|s| curve.rest_v[s].hypot(drop_std[t] * drop_v(t, s))).collect::<Vec<f64>>()
+        };
+        CellModel {
             name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
             rated_capacity_ah: self.rated_ah,
             capacity_ah: self.rated_ah,
@@ -191,20 +268,17 @@ impl Label {
             temperature_c: TEMPERATURE_C.to_vec(),
             ocv_v: Table { values: rows },
             aged_ocv,
-            r0_ohm: table(series),
-            branches: branches.iter().map(branch).collect(),
-            voltage_error_v: Some(Table { values: vec![rest_v.clone(); TEMPERATURE_C.len()] }),
+            voltage_error_v: Some(Table { values: (0..TEMPERATURE_C.len()).map(error_v).collect() }),
+            r0_ohm,
+            branches,
             thermal: None,
-            spread: Some(ModelSpread {
-                curve_v: curve::median(&rest_v),
-                log_resistance: LOG_RESISTANCE_STD,
-                slow_branch: SLOW_BRANCH_STD,
-                capacity: CAPACITY_STD,
-                drop_sqrt_s: DROP_SQRT_S,
-            }),
-        })
+            spread: Some(spread),
+        }
     }
 }
+
+/// Load at which an error of the resistances counts as one of the model, per rated capacity: C/2.
+const USUAL_LOAD_PER_H: f64 = 0.5;
 
 /// Shift of the curve of an ageing cell whose electrodes are not in the library.
 const AGEING_SHIFT: f64 = 0.5;

@@ -13,6 +13,8 @@ pub mod estimator;
 pub mod loss_modes;
 pub mod model;
 pub mod model_check;
+pub mod notebook;
+pub mod own_model;
 
 pub use aged_ocv::AgedOcv;
 pub use chemistry::{Chemistry, Label};
@@ -28,3 +30,5 @@ pub use model::{
     arrhenius,
 };
 pub use model_check::{ModelCheck, ModelEvidence};
+pub use notebook::{Notebook, NotebookConfig};
+pub use own_model::OwnModel;

@@ -1,0 +1,325 @@
+//! What a vehicle notes of its cells between two rests: the rows from which a model is fitted on board.
+//!
+//! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the mean cell.
+//!
+//! A row is the mean over a time in which the SOC hardly moves. Beside the voltage it has all that its prediction needs in linear
+//! form: the charge since the stretch began, the current, and the current through first-order filters with the time constants of
+//! the branches. So rows can be left out and a stretch still hangs together. Steps of the current, which a mean hides, are
+//! summed as a small regression. When the notebook is full the oldest row of the fullest class (SOC, temperature, direction)
+//! goes: what is rarely seen stays.
+
+use serde::{Deserialize, Serialize};
+
+use super::CellStep;
+use crate::quantity::InvalidState;
+
+/// Most rows: with 56 bytes each below 7 kB.
+pub const MAX_ROWS: usize = 120;
+/// Most stretches: each has an SOC of its own to be found.
+const MAX_STRETCHES: usize = 16;
+/// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K.
+const ROW_SOC: f64 = 0.02;
+const ROW_S: f64 = 300.0;
+const ROW_K: f64 = 4.0;
+/// Shortest row at the end of a stretch, s.
+const LEAST_ROW_S: f64 = 20.0;
+/// Shortest time between two readings of the mean cell, s.
+const INTERVAL_S: f64 = 1.0;
+/// Longest time between two readings whose difference counts as a step of the current, s.
+const STEP_S: f64 = 3.0;
+/// Time without a measured current that ends a stretch, s.
+const HOLE_S: f64 = 10.0;
+/// Classes of SOC and temperature.
+const CLASS_SOC: f64 = 0.1;
+const CLASS_K: f64 = 10.0;
+/// Currents below this part of the rated capacity per hour are rest.
+const REST_PER_H: f64 = 0.02;
+
+/// Filters of the current, as many as a model from a label has branches.
+pub const FILTERS: usize = 3;
+
+/// The mean cell over a short time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Row {
+    /// Which stretch it is of.
+    pub stretch: u32,
+    /// SOC as estimated then, for its class alone.
+    soc: f32,
+    /// Duration, s.
+    pub seconds: f32,
+    /// Charge taken out since the stretch began, Ah.
+    pub charge_ah: f32,
+    /// Voltage, V.
+    pub voltage_v: f32,
+    /// Current, A.
+    pub current_a: f32,
+    /// Current through a first-order filter per branch, A.
+    pub filtered_a: [f32; FILTERS],
+    /// Temperature, degrees C.
+    pub temperature_c: f32,
+    /// Steps within it.
+    pub steps: CurrentSteps,
+}
+
+/// Sums over differences between neighbouring readings: of the current (i), A, the fastest filter's current (x), A, and the
+/// voltage (v), V.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CurrentSteps {
+    /// Sum of i i.
+    pub ii: f32,
+    /// Sum of i x.
+    pub ix: f32,
+    /// Sum of x x.
+    pub xx: f32,
+    /// Sum of i v.
+    pub iv: f32,
+    /// Sum of x v.
+    pub xv: f32,
+}
+
+/// Readings of all cells that are not yet one of the mean cell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+struct Readings {
+    count: u32,
+    temperatures: u32,
+    measured_s: f64,
+    unmeasured_s: f64,
+    charge_as: f64,
+    current_a: f64,
+    voltage_v: f64,
+    temperature_c: f64,
+}
+
+/// Sums over time of a row that is not complete.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+struct RowSums {
+    seconds: f64,
+    charge_ah: f64,
+    voltage_v: f64,
+    current_a: f64,
+    filtered_a: [f64; FILTERS],
+    temperature_c: f64,
+    steps: [f64; 5],
+    /// Charge and temperature at its beginning.
+    first: Option<(f64, f64)>,
+}
+
+/// The present stretch: a time with a measured current throughout.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Stretch {
+    charge_ah: f64,
+    filtered_a: [f64; FILTERS],
+    /// Current, fastest filter and voltage of the reading before.
+    last: [f64; 3],
+    row: RowSums,
+}
+
+/// The notebook of a pack.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Notebook {
+    rows: Vec<Row>,
+    /// Number of the present stretch.
+    number: u32,
+    /// Rows since [`Self::mark_read`].
+    unread: u32,
+    readings: Readings,
+    present: Option<Stretch>,
+}
+
+/// How readings become rows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NotebookConfig {
+    /// Cells that report.
+    pub cells: u32,
+    /// Rated capacity of a cell, Ah.
+    pub rated_ah: f64,
+    /// Time constants of the filters, s, rising.
+    pub tau_s: [f64; FILTERS],
+}
+
+impl Notebook {
+    /// The rows, those of a stretch together and in their order.
+    pub fn rows(&self) -> &[Row] {
+        &self.rows
+    }
+
+    /// Rows that came after the last [`Self::mark_read`].
+    pub fn unread(&self) -> usize {
+        self.unread as usize
+    }
+
+    /// All present rows have been used.
+    pub fn mark_read(&mut self) {
+        self.unread = 0;
+    }
+
+    /// Charge taken out in the present stretch, Ah, with its number.
+    pub fn present(&self) -> Option<(u32, f64)> {
+        self.present.as_ref().map(|stretch| (self.number, stretch.charge_ah))
+    }
+
+    /// Takes a reading; whether a row is complete: [`Self::close_row`] then ends it.
+    #[inline]
+    pub fn add(&mut self, config: &NotebookConfig, step: &CellStep) -> bool {
+        let readings = &mut self.readings;
+        readings.measured_s += step.measured_s;
+        readings.unmeasured_s += step.unmeasured_s;
+        readings.charge_as += step.charge_as;
+        if let Some(current_a) = step.current_a {
+            readings.count += 1;
+            readings.current_a += current_a;
+            readings.voltage_v += step.voltage_v;
+        }
+        if let Some(temperature_c) = step.temperature_c {
+            readings.temperatures += 1;
+            readings.temperature_c += temperature_c;
+        }
+        let is_due = readings.count >= config.cells && readings.measured_s >= INTERVAL_S * f64::from(config.cells);
+        // The first reading of a stretch has no time before it.
+        let begins = self.present.is_none() && readings.count >= config.cells;
+        (is_due || begins) && self.close_readings(config, step.ambient_c)
+    }
+
+    /// Makes the readings one of the mean cell.
+    fn close_readings(&mut self, config: &NotebookConfig, ambient_c: f64) -> bool {
+        let Readings { count, temperatures, measured_s, unmeasured_s, charge_as, current_a, voltage_v, temperature_c } =
+            std::mem::take(&mut self.readings);
+        let (cells, count) = (f64::from(config.cells), f64::from(count));
+        let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
+        let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
+        if unmeasured_s > HOLE_S * cells {
+            self.end_stretch(config);
+        }
+        let Some(stretch) = &mut self.present else {
+            self.number = self.number.wrapping_add(1);
+            // Under load the branches are taken as settled: the load before is not known.
+            let filtered_a = [current_a; FILTERS];
+            let last = [current_a, current_a, voltage_v];
+            self.present = Some(Stretch { charge_ah: 0.0, filtered_a, last, row: RowSums::default() });
+            return false;
+        };
+        let mean_a = charge_as / measured_s;
+        let before_a = stretch.filtered_a;
+        for (filtered_a, tau_s) in stretch.filtered_a.iter_mut().zip(config.tau_s) {
+            *filtered_a = mean_a + libm::exp(-dt_s / tau_s) * (*filtered_a - mean_a);
+        }
+        let charge_before_ah = stretch.charge_ah;
+        stretch.charge_ah += charge_as / cells / 3600.0;
+        // A single reading is of the end of its interval, several are of its middle.
+        let late = if count > cells { 0.5 } else { 1.0 };
+        let along = |before: f64, after: f64| before + late * (after - before);
+        let filtered_a: [f64; FILTERS] = std::array::from_fn(|i| along(before_a[i], stretch.filtered_a[i]));
+        let charge_ah = along(charge_before_ah, stretch.charge_ah);
+        let [i, x, v] = [current_a, filtered_a[0], voltage_v];
+        let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
+        let row = &mut stretch.row;
+        if dt_s <= STEP_S {
+            let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
+            let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
+            row.steps.iter_mut().zip(products).for_each(|(sum, product)| *sum += product);
+        }
+        let (first_ah, first_c) = *row.first.get_or_insert((charge_ah, temperature_c));
+        row.seconds += dt_s;
+        row.charge_ah += dt_s * charge_ah;
+        row.voltage_v += dt_s * voltage_v;
+        row.current_a += dt_s * current_a;
+        row.temperature_c += dt_s * temperature_c;
+        row.filtered_a.iter_mut().zip(filtered_a).for_each(|(sum, filtered_a)| *sum += dt_s * filtered_a);
+        (charge_ah - first_ah).abs() >= ROW_SOC * config.rated_ah
+            || row.seconds >= ROW_S
+            || (temperature_c - first_c).abs() >= ROW_K
+    }
+
+    /// Ends the present row, at an estimated SOC.
+    pub fn close_row(&mut self, config: &NotebookConfig, soc: f64) {
+        let Some(stretch) = &mut self.present else { return };
+        let sums = std::mem::take(&mut stretch.row);
+        if sums.seconds <= 0.0 {
+            return;
+        }
+        let mean = |sum: f64| (sum / sums.seconds) as f32;
+        let [ii, ix, xx, iv, xv] = sums.steps.map(|sum| sum as f32);
+        let row = Row {
+            stretch: self.number,
+            soc: soc as f32,
+            seconds: sums.seconds as f32,
+            charge_ah: mean(sums.charge_ah),
+            voltage_v: mean(sums.voltage_v),
+            current_a: mean(sums.current_a),
+            filtered_a: sums.filtered_a.map(mean),
+            temperature_c: mean(sums.temperature_c),
+            steps: CurrentSteps { ii, ix, xx, iv, xv },
+        };
+        self.rows.push(row);
+        self.unread = self.unread.saturating_add(1);
+        self.make_room(config);
+    }
+
+    /// Ends the present stretch: what follows does not hang together with it.
+    pub fn end_stretch(&mut self, config: &NotebookConfig) {
+        self.readings = Readings::default();
+        let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
+        if let (Some(stretch), Some(before)) = (&self.present, before)
+            && stretch.row.seconds >= LEAST_ROW_S
+        {
+            let moved_ah = stretch.charge_ah - f64::from(before.charge_ah);
+            self.close_row(config, f64::from(before.soc) - moved_ah / config.rated_ah);
+        }
+        self.present = None;
+    }
+
+    /// Drops rows beyond the bounds.
+    fn make_room(&mut self, config: &NotebookConfig) {
+        let stretches = self.rows.chunk_by(|a, b| a.stretch == b.stretch).count();
+        if stretches > MAX_STRETCHES
+            && let Some(oldest) = self.rows.first().map(|row| row.stretch)
+        {
+            self.rows.retain(|row| row.stretch != oldest);
+        }
+        while self.rows.len() > MAX_ROWS {
+            let class_of = |row: &Row| row.class(config.rated_ah);
+            let classes: Vec<_> = self.rows.iter().map(class_of).collect();
+            let size = |at: usize| classes.iter().filter(|class| **class == classes[at]).count();
+            let fullest = (0..classes.len()).rev().max_by_key(|&at| size(at)).unwrap_or(0);
+            let oldest = classes.iter().position(|class| *class == classes[fullest]).unwrap_or(0);
+            self.rows.remove(oldest);
+        }
+    }
+
+    /// Checks the numbers of a stored notebook.
+    ///
+    /// # Errors
+    /// The first impossible number.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless(self.rows.len() <= MAX_ROWS, "the rows of the notebook", self.rows.len() as f64, "at most 120")?;
+        for row in &self.rows {
+            let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
+            let [a, b, c] = row.filtered_a;
+            let numbers = [row.soc, row.charge_ah, row.voltage_v, row.current_a, row.temperature_c, a, b, c];
+            let all = numbers.into_iter().chain([ii, ix, xx, iv, xv]).map(f64::from);
+            InvalidState::unless_numbers("a number of the notebook", all)?;
+            InvalidState::unless_positive("the duration of a row of the notebook", f64::from(row.seconds))?;
+        }
+        let Some(Stretch { charge_ah, filtered_a, last, row }) = &self.present else { return Ok(()) };
+        let numbers = filtered_a.iter().chain(last).chain(&row.filtered_a).chain(&row.steps).copied();
+        let sums = [*charge_ah, row.charge_ah, row.voltage_v, row.current_a, row.temperature_c, row.seconds];
+        InvalidState::unless_numbers("a number of the notebook", numbers.chain(sums))
+    }
+}
+
+impl Row {
+    /// Class of SOC, temperature and direction.
+    fn class(&self, rated_ah: f64) -> (i32, i32, i32) {
+        let rest_a = REST_PER_H * rated_ah;
+        let current_a = f64::from(self.current_a);
+        let direction = if current_a > rest_a { 1 } else { -i32::from(current_a < -rest_a) };
+        let step = |value: f32, width: f64| (f64::from(value) / width).floor().clamp(-100.0, 100.0) as i32;
+        (step(self.soc, CLASS_SOC), step(self.temperature_c, CLASS_K), direction)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,93 @@
+//! A model of this pack's own cells: that of the label, corrected by what the vehicle has noted.
+//!
+//! In: a [`Label`] and a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`], from which the [`CellModel`] of the
+//! filters is made. Where the notes say nothing it is the label's, with the label's spread.
+
+pub mod fit;
+
+use serde::{Deserialize, Serialize};
+
+use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, ResistanceFactors, TEMPERATURE_NODES};
+use super::model::{CellModel, ModelSpread};
+use crate::filter::ScalarGaussian;
+use crate::quantity::InvalidState;
+
+/// SOC breakpoints of such a model.
+pub const SOC_NODES: usize = 21;
+
+/// Spread of a cell from the pack's model, beside what the fit leaves: cells of one pack are of one kind.
+const CELL_LOG_RESISTANCE: f64 = 0.1;
+const CELL_SLOW_BRANCH: f64 = 0.2;
+/// Error of the voltage drop that no table of resistances removes, over one second: 10 % that repeats itself over 100 s.
+const DROP_SQRT_S: f64 = 1.0;
+
+/// A fitted model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OwnModel {
+    /// Open-circuit curve, V, rising.
+    pub curve_v: [f64; SOC_NODES],
+    /// Modes of its uncertainty, V per standard deviation.
+    pub modes_v: [[f64; SOC_NODES]; 2],
+    /// Standard deviation of the rest, V.
+    pub rest_v: [f64; SOC_NODES],
+    /// Resistances relative to the label's.
+    pub factors: ResistanceFactors,
+    /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
+    pub drop_std: [f64; TEMPERATURE_NODES],
+    /// Capacity, Ah.
+    pub capacity: ScalarGaussian,
+    /// Root mean square of the rows' residuals, V.
+    pub residual_v: f64,
+}
+
+impl OwnModel {
+    /// The model of the filters; `None` when the label has none.
+    pub fn cell_model(&self, label: &Label) -> Option<CellModel> {
+        let curve = CurveOfCells {
+            mean_v: self.curve_v.to_vec(),
+            modes_v: self.modes_v.each_ref().map(|mode_v| mode_v.to_vec()),
+            rest_v: self.rest_v.to_vec(),
+            electrodes: label.curve()?.electrodes,
+        };
+        let mut sorted = self.rest_v;
+        sorted.sort_by(f64::total_cmp);
+        let spread = ModelSpread {
+            curve_v: sorted[SOC_NODES / 2],
+            log_resistance: CELL_LOG_RESISTANCE,
+            slow_branch: CELL_SLOW_BRANCH,
+            capacity: self.capacity.std() / self.capacity.mean,
+            drop_sqrt_s: DROP_SQRT_S,
+        };
+        let mut model = label.model_of(&curve, &self.factors, &self.drop_std, spread);
+        model.name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);
+        Some(model)
+    }
+
+    /// Whether what is left unknown is small: capacity within 3 %.
+    pub fn is_settled(&self) -> bool {
+        self.capacity.std() < 0.03 * self.capacity.mean
+    }
+
+    /// Checks the numbers of a stored model.
+    ///
+    /// # Errors
+    /// The first impossible number.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        let rises = self.curve_v.windows(2).all(|pair| pair[0] < pair[1]);
+        InvalidState::unless(rises, "the curve of a learned model", self.curve_v[0], "rising over SOC")?;
+        let factors = self.factors.ln.iter().flatten().chain(&self.factors.by_temperature);
+        for &factor in factors {
+            InvalidState::unless(factor.abs() <= 5.0, "a resistance of a learned model", factor, "-5 to 5 (ln of a ratio)")?;
+        }
+        let numbers = self.curve_v.iter().chain(self.modes_v.iter().flatten());
+        InvalidState::unless_numbers("the curve of a learned model", numbers.copied())?;
+        let naturals = self.rest_v.iter().chain(&self.drop_std).chain([&self.residual_v]);
+        InvalidState::unless_naturals("an error of a learned model", naturals.copied())?;
+        InvalidState::unless_capacity("the capacity of a learned model", self.capacity.mean)?;
+        InvalidState::unless_positive("the variance of the capacity of a learned model", self.capacity.variance)
+    }
+}
+
+/// SOC nodes of the resistance factors.
+pub const FACTOR_NODES: usize = FACTOR_SOC.len();
