@@ -84,6 +84,12 @@ Report = Callable[[Outcome], None]
 CHILDREN: set[subprocess.Popen] = set()
 
 
+def environment() -> dict[str, str]:
+    """A copy of the environment for a child. Without one the child reads this process's own, which another thread of tests/all may be
+    replacing at that moment: its start then fails with "Bad address"."""
+    return dict(os.environ)
+
+
 def read_head(path: Path) -> VcanTest:
     with open(path) as file:
         head = "".join(line for _, line in zip(range(10), file))
@@ -100,7 +106,8 @@ def in_user_mode_kernel(modules: set[str]) -> bool:
     """Whether with-vcan boots a kernel here; False where the host's own has vcan. Raises when there is no SocketCAN."""
     probe = [HERE / "with-vcan", "--timeout", str(BOOT_S), "--modules", ",".join(sorted(modules)), "--",
              "grep", "-q", "User Mode Linux", "/proc/cpuinfo"]
-    ended = subprocess.run(probe, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    ended = subprocess.run(probe, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                           check=False)
     if ended.returncode not in (0, 1):
         raise RuntimeError(ended.stdout)
     return ended.returncode == 0
@@ -188,7 +195,7 @@ class Run:
 def call(command: list, while_waiting: Callable[[], None] = lambda: None) -> tuple[int, str]:
     """Exit status and output of a command."""
     with tempfile.TemporaryFile("w+", errors="replace") as output:
-        child = subprocess.Popen(list(map(str, command)), stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
+        child = subprocess.Popen(list(map(str, command)), env=environment(), stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
         CHILDREN.add(child)
         while child.poll() is None:
             time.sleep(POLL_S)
