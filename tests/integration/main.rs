@@ -12,6 +12,7 @@
 
 mod alarm_noise;
 mod alarm_tradeoff;
+mod authentication;
 mod bus_sleep;
 mod can_data;
 mod capacity_peers;
@@ -49,6 +50,7 @@ mod monitor_restart;
 mod monitor_scenarios;
 mod monitor_statistics;
 mod other_cell;
+mod pack_memory;
 mod output_dbc;
 mod paper_scenario;
 mod protected_input;
