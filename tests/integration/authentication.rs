@@ -5,6 +5,7 @@ mod ecu;
 
 use packwatch::can::secoc::{Authentication, Profile};
 use packwatch::can::{CanId, Frame};
+use packwatch::io::can_key::CanKey;
 use packwatch::monitor::{Downtime, EventKind, Input, Monitor, Outputs};
 use packwatch::quantity::{BusIndex, Timestamp};
 use rand::{RngExt, SeedableRng};
@@ -166,6 +167,17 @@ fn the_other_profiles_hold_too() {
 }
 
 #[test]
+fn the_example_of_the_manual_is_what_the_key_gives() {
+    let key = CanKey::parse(b"2b7e151628aed2a6abf7158809cf4f3c").unwrap();
+    let mut ecu = Ecu::new(Profile::P1, key);
+    ecu.authentication = Authentication { profile: Profile::P1, data_id: 0x124 };
+    let frame = ecu.made(2, 2047, 28_800_000_000);
+    assert_eq!(format!("{frame:?}"), "Frame(6B3, Classic, [F2, F9, 3F, 00, 00, A2, 9B, 91])");
+    let manual = include_str!("../../docs/src/ecu/commands.md");
+    assert!(manual.contains("`F2F93F0000A29B91`"));
+}
+
+#[test]
 fn every_command_has_a_reply_with_its_reason() {
     let mut daemon = Daemon::new(config("1", ""));
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
@@ -195,7 +207,10 @@ fn every_command_has_a_reply_with_its_reason() {
     daemon.pass(200);
     assert!(daemon.receive(&ecu.command(1, 2047).unwrap()));
     daemon.pass(200);
-    assert!(!daemon.receive(&ecu.command(2, 2047).unwrap()) && !daemon.receive(&ecu.command(3, 2047).unwrap()), "another");
+    assert!(
+        !daemon.receive(&ecu.command(2, 2047).unwrap()) && !daemon.receive(&ecu.command(3, 2047).unwrap()),
+        "another"
+    );
     daemon.pass(200_000);
     daemon.sent.iter().for_each(|frame| ecu.hear(frame));
     assert!(daemon.receive(&ecu.command(2, 2047).unwrap()), "the attack is over");
@@ -264,7 +279,8 @@ fn sent_frames_are_authenticated_and_their_freshness_rises_over_kills() {
                 // As a receiver does: the lowest value above the last one with these low bits.
                 let sent = authentication.sent_freshness(frame.data()).unwrap();
                 let freshness = *last + 1 + (sent.wrapping_sub(*last + 1) & 0xFFFF_FFFF);
-                let freshness = if *last == 0 { sent + (daemon.ms as u64 / 1000 * 256 >> 32 << 32) } else { freshness };
+                let freshness =
+                    if *last == 0 { sent + (daemon.ms as u64 / 1000 * 256) / (1 << 32) * (1 << 32) } else { freshness };
                 let input = authentication.mac_input(frame.data(), freshness).unwrap();
                 assert!(authentication.has_mac(frame.data(), key(0xA0).mac(input.bytes())), "run {run}: {frame:?}");
                 assert!(freshness > *last);

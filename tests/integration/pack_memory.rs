@@ -24,7 +24,10 @@ fn resistances(rig: &Rig) -> Vec<f64> {
 }
 
 fn assert_near(found: &[f64], wanted: &[f64]) {
-    assert!(found.iter().zip(wanted).all(|(found, wanted)| (found - wanted).abs() < 0.01 * wanted), "{found:?} {wanted:?}");
+    assert!(
+        found.iter().zip(wanted).all(|(found, wanted)| (found - wanted).abs() < 0.01 * wanted),
+        "{found:?} {wanted:?}"
+    );
 }
 
 fn connect(rig: &mut Rig, number: f64) {
@@ -115,7 +118,7 @@ fn the_pack_that_was_connected_least_lately_is_forgotten_first() {
     assert!(bytes < 8 * 2 * 4000, "{bytes} bytes for 16 cells");
     connect(&mut rig, 9.0);
     connect(&mut rig, A);
-    assert_eq!(returned(&rig), [], "the ninth took its place");
+    assert!(returned(&rig).is_empty(), "the ninth took its place");
 }
 
 #[test]

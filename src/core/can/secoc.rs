@@ -152,7 +152,8 @@ impl Authentication {
     pub fn has_mac(&self, payload: &[u8], mac: Mac) -> bool {
         let sent_bits = (1 << self.profile.mac_bits()) - 1;
         // One difference of whole words: no byte is compared before another.
-        self.trailer(payload).is_some_and(|trailer| std::hint::black_box(trailer & sent_bits ^ self.first_bits(mac)) == 0)
+        self.trailer(payload)
+            .is_some_and(|trailer| std::hint::black_box(trailer & sent_bits ^ self.first_bits(mac)) == 0)
     }
 
     /// The mask of the freshness' bits that are sent.

@@ -134,7 +134,7 @@ impl Learner {
             capacity: self.capacity.clone(),
             learned: self.learned.clone(),
             drift: self.drift.clone(),
-            offset: self.offset.clone(),
+            offset: self.offset,
             ..Self::default()
         }
     }

@@ -98,6 +98,7 @@ impl PackMemory {
 impl StoredPack {
     fn has_learned(&self) -> bool {
         let mut cells = self.cells.iter().enumerate();
-        cells.any(|(index, cell)| self.learning.learner.has_learned(index) || cell.health.discharge_resistance.is_some())
+        cells
+            .any(|(index, cell)| self.learning.learner.has_learned(index) || cell.health.discharge_resistance.is_some())
     }
 }

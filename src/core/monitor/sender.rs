@@ -12,8 +12,8 @@ use super::{Event, EventKind, MonitorConfig, Outputs, Secured, SupplyConfig, Tra
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule};
 use crate::can::Frame;
 use crate::can::encode::{
-    AlarmFields, FRESHNESS_PERIOD_MS, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields, SendCounters,
-    StatusFields,
+    AlarmFields, FRESHNESS_PERIOD_MS, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields,
+    SendCounters, StatusFields,
 };
 use crate::can::poll::{PollOutputs, Poller};
 use crate::quantity::{BusIndex, Fault, Timestamp};

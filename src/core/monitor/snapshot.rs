@@ -255,7 +255,7 @@ impl Stages {
 
     /// What is learned of the connected pack, under its number.
     pub(super) fn stored_pack(&self) -> StoredPack {
-        let cells = (0..self.estimation.cells());
+        let cells = 0..self.estimation.cells();
         let cells = cells.map(|cell| StoredCell { consumed: None, updated_in_round: false, ..self.stored_cell(cell) });
         StoredPack {
             number: self.sampling.identity.known.unwrap_or(0.0),

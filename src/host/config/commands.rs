@@ -34,13 +34,18 @@ pub(super) fn commands(
     let note = |error: &String, faults: &mut Faults| keys.place.fault(faults, "enabled", error);
     let plan = CommandPlan::new(database).map_err(|all| all.0.iter().for_each(|e| note(e, checks.faults))).ok()?;
     let secoc = plan.authentication();
-    let Some(data_id) = secoc.map(|secoc| secoc.data_id).or(plan.protection().map(|protection| protection.data_id)) else {
+    let Some(data_id) = secoc.map(|secoc| secoc.data_id).or(plan.protection().map(|protection| protection.data_id))
+    else {
         let what = "must be \"1A\", \"1C\" or \"5\", or have secoc beside it: commands are never taken unprotected";
         keys.place.fault(checks.faults, "e2e", what);
         return None;
     };
     if secoc.is_some() && plan.protection().is_some() {
-        keys.place.fault(checks.faults, "e2e", "must not be given with secoc: the authenticator finds all that a checksum finds");
+        keys.place.fault(
+            checks.faults,
+            "e2e",
+            "must not be given with secoc: the authenticator finds all that a checksum finds",
+        );
     }
     if secoc.is_some() && output.plan.freshness().is_none() {
         keys.place.fault(checks.faults, "secoc", "must have the message PACKWATCH_Freshness in output.dbc");

@@ -12,11 +12,11 @@ use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
-use crate::can::secoc::{self, Authentication};
 use crate::can::encode::{
     DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, SentMessage,
     layout,
 };
+use crate::can::secoc::{self, Authentication};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
@@ -49,7 +49,8 @@ pub(super) fn output(
         raw.output_reply.as_ref()?.config(),
         raw.output_freshness.as_ref()?.config(),
     ];
-    let [status, health, alarm, digest, reply, _] = frames.map(|frame| message_settings(&frame, checks.faults));
+    let [status, health, alarm, digest, reply] =
+        [0, 1, 2, 3, 4].map(|place| message_settings(&frames[place], checks.faults));
     let command_settings = match command {
         Some(keys) => Some(message_settings(&keys.config(), checks.faults)?),
         None => None,
@@ -143,7 +144,11 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
 fn authentication(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<Option<Authentication>> {
     let Some(profile) = keys.secoc else { return Some(None) };
     let Some(data_id) = keys.data_id else {
-        keys.place.fault(faults, "data_id", &format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()));
+        keys.place.fault(
+            faults,
+            "data_id",
+            &format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()),
+        );
         return None;
     };
     Some(Some(Authentication { profile, data_id }))

@@ -151,7 +151,7 @@ pub(super) fn command_words(config: &Config) -> String {
         (Some(secoc), Some(key)) => {
             format!("commands of other ECUs are authenticated, {}, key in {key}", authentication_words(secoc))
         }
-        _ => "commands of other ECUs are unauthenticated: whoever can send on the bus can make one".to_owned(),
+        _ => "commands of other ECUs are unauthenticated: every node of the bus can make one".to_owned(),
     }
 }
 

@@ -2,11 +2,11 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, AnswerSignalKeys, Authentication, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
-    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest, OutputFreshness, OutputHealth, OutputReply,
-    OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput,
-    ReportedSohInput, SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable,
-    Vehicle, VoltageLimits,
+    Alarm, AnswerSignalKeys, Authentication, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput,
+    CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest,
+    OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll,
+    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, SupplyVoltageInput,
+    TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};

@@ -70,7 +70,10 @@ impl CanKey {
     pub fn parse(content: &[u8]) -> Result<Self, String> {
         let found = content.len();
         let neither = || format!("{found} bytes, must be {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES);
-        let key = <[u8; KEY_BYTES]>::try_from(content).ok().or_else(|| hex_key(content.trim_ascii_end())).ok_or_else(neither)?;
+        let key = <[u8; KEY_BYTES]>::try_from(content)
+            .ok()
+            .or_else(|| hex_key(content.trim_ascii_end()))
+            .ok_or_else(neither)?;
         if key.iter().all(|byte| *byte == key[0]) {
             return Err("one byte repeated, must be random".to_owned());
         }
@@ -108,7 +111,10 @@ mod tests {
     const MESSAGE: &str = "6bc1bee22e409f96e93d7e117393172aae2d8a571e03ac9c9eb76fac45af8e5130c81c46a35ce411e5fbc1191a0a52eff69f2445df4f9b17ad2b417be66c3710";
 
     fn hex(text: &str) -> Vec<u8> {
-        text.as_bytes().chunks(2).map(|pair| u8::from_str_radix(std::str::from_utf8(pair).unwrap(), 16).unwrap()).collect()
+        text.as_bytes()
+            .chunks(2)
+            .map(|pair| u8::from_str_radix(std::str::from_utf8(pair).unwrap(), 16).unwrap())
+            .collect()
     }
 
     #[test]
@@ -158,6 +164,9 @@ mod tests {
         assert!(error(&source, None).ends_with("can.key: mode 0620, must be 0600 or 0400: no other user may read it"));
         let credential = KeySource::Credential("can.key".to_owned());
         assert!(error(&credential, None).contains("$CREDENTIALS_DIRECTORY is not set"));
-        assert!(CanKey::load(&credential, Some(folder.path().as_os_str().to_owned())).is_ok(), "the manager keeps it private");
+        assert!(
+            CanKey::load(&credential, Some(folder.path().as_os_str().to_owned())).is_ok(),
+            "the manager keeps it private"
+        );
     }
 }

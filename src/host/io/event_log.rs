@@ -146,7 +146,12 @@ impl EventLog {
             }
             EventKind::PackReturned { identity, capacity_ah, capacity_std_ah } => {
                 let (capacity_ah, capacity_std_ah) = (capacity_ah.map(rounded), capacity_std_ah.map(rounded));
-                tracing::info!(identity, capacity_ah, capacity_std_ah, "a known pack is back: its learned values are restored");
+                tracing::info!(
+                    identity,
+                    capacity_ah,
+                    capacity_std_ah,
+                    "a known pack is back: its learned values are restored"
+                );
             }
             EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),
             EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),

@@ -318,7 +318,9 @@ pub struct CommandStatus {
 impl CommandStatus {
     /// In words: `authenticated (SecOC 1)`, `unauthenticated`.
     pub fn words(&self) -> String {
-        self.secoc.as_ref().map_or_else(|| "unauthenticated".to_owned(), |profile| format!("authenticated (SecOC {profile})"))
+        self.secoc
+            .as_ref()
+            .map_or_else(|| "unauthenticated".to_owned(), |profile| format!("authenticated (SecOC {profile})"))
     }
 }
 

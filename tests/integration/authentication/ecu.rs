@@ -5,7 +5,9 @@ use std::cell::RefCell;
 use packwatch::can::secoc::{Authentication, Mac, Profile};
 use packwatch::can::{CanId, Frame};
 use packwatch::io::can_key::CanKey;
-use packwatch::monitor::{Command, CommandCounts, Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{
+    Command, CommandCounts, Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot,
+};
 use packwatch::quantity::{BusIndex, Timestamp};
 
 use crate::support::config_texts;
@@ -28,7 +30,8 @@ pub(crate) fn key(byte: u8) -> CanKey {
 pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     let secoc = format!("secoc = \"{profile}\"\n");
     let fd = if profile == "fd" { "fd = true\n" } else { "" };
-    let pack = PACK.replace("name = \"can0\"\n", "name = \"can0\"\nfd = true\n").replace("e2e = \"1A\"\n", &(secoc + fd));
+    let pack =
+        PACK.replace("name = \"can0\"\n", "name = \"can0\"\nfd = true\n").replace("e2e = \"1A\"\n", &(secoc + fd));
     let tables = "[output.freshness]\ndata_id = 0x0322\n[authentication]\nkey_file = \"can.key\"\n";
     config_texts::load(&format!("{pack}{tables}{more}"), DBC).monitor
 }
@@ -90,6 +93,9 @@ pub(crate) fn frame_of(payload: &[u8]) -> Frame {
     if payload.len() <= 8 { Frame::classic(id, payload) } else { Frame::fd(id, false, false, payload) }.unwrap()
 }
 
+/// A tick, or a frame and the freshness of its right authenticator.
+pub(crate) type JournalLine = Option<(Frame, Option<u64>)>;
+
 /// The daemon on a bus, driven by hand.
 pub(crate) struct Daemon {
     pub(crate) config: MonitorConfig,
@@ -102,7 +108,7 @@ pub(crate) struct Daemon {
     /// Commands executed, ever.
     pub(crate) executed: u64,
     /// Inputs as a journal has them, when wanted.
-    pub(crate) journal: Option<Vec<(i64, Option<(Frame, Option<u64>)>)>>,
+    pub(crate) journal: Option<Vec<(i64, JournalLine)>>,
     pub(crate) macs: RefCell<u64>,
 }
 

@@ -7,7 +7,8 @@ use std::fmt::Write as _;
 
 use super::attributes::{
     BIT_RATE_SWITCH, CYCLE_TIME, DELAY_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FAST_CYCLE_TIME, FIRST_FD_FORMAT,
-    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, SECOC_DATA_ID, SECOC_PROFILE, SECOC_PROFILES, profile_index, secoc_index,
+    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, SECOC_DATA_ID, SECOC_PROFILE, SECOC_PROFILES, profile_index,
+    secoc_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;

@@ -270,7 +270,8 @@ fn apply(
     if is_moved {
         move_up(message);
     }
-    if let Some(authentication) = message.secoc.filter(|secoc| movable && secoc.profile != secoc::Profile::Announcement) {
+    if let Some(authentication) = message.secoc.filter(|secoc| movable && secoc.profile != secoc::Profile::Announcement)
+    {
         message.len_bytes += u16::try_from(authentication.profile.trailer_bytes()).unwrap_or(0);
     }
     set_header(message);
@@ -378,7 +379,9 @@ fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal
         signal.layout.byte_order = ByteOrder::BigEndian;
         signal
     };
-    let covered = format!("AES-128-CMAC over data id {data_id}, the bytes before the freshness, and the whole freshness; big-endian.");
+    let covered = format!(
+        "AES-128-CMAC over data id {data_id}, the bytes before the freshness, and the whole freshness; big-endian."
+    );
     vec![
         signal("SecOCFreshness", first, freshness, "Low bits of the freshness (64 bits)."),
         signal("SecOCMac", first + freshness, mac, &format!("First bits of {covered}")),
@@ -443,13 +446,16 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
     let (name, len, trailer) = (&message.name, usize::from(message.len_bytes), authentication.profile.trailer_bytes());
     let word = authentication.profile.name();
     if len < trailer || !is_frame_length(len) {
-        let what = format!("message {name} has {len} bytes, must have a frame's length of {trailer} or more for profile {word}");
+        let what = format!(
+            "message {name} has {len} bytes, must have a frame's length of {trailer} or more for profile {word}"
+        );
         return fault("secoc", what);
     }
     let is_own = |signal: &&Signal| HEADER_SIGNALS.contains(&signal.name.as_str());
     for signal in message.signals.iter().filter(|signal| !is_own(signal)) {
         if signal.layout.plan().is_ok_and(|plan| plan.bytes_needed() > len - trailer) {
-            let what = format!("signal {name}.{} must leave the last {trailer} bytes free for profile {word}", signal.name);
+            let what =
+                format!("signal {name}.{} must leave the last {trailer} bytes free for profile {word}", signal.name);
             fault("secoc", what);
         }
     }

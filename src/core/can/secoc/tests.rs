@@ -38,10 +38,7 @@ fn the_trailer_is_freshness_and_authenticator_most_significant_bit_first() {
     };
     assert_eq!(written(Profile::P1), [0x11, 0xEF, 0xA1, 0xB2, 0xC3]);
     assert_eq!(written(Profile::P3), [0x11, 0xFA, 0x1B, 0x2C, 0x3D]);
-    assert_eq!(
-        written(Profile::Fd),
-        [0x11, 0x89, 0xAB, 0xCD, 0xEF, 0xA1, 0xB2, 0xC3, 0xD4, 0xE5, 0xF6, 0x07, 0x18]
-    );
+    assert_eq!(written(Profile::Fd), [0x11, 0x89, 0xAB, 0xCD, 0xEF, 0xA1, 0xB2, 0xC3, 0xD4, 0xE5, 0xF6, 0x07, 0x18]);
     assert_eq!(written(Profile::Announcement), [0x11, 0x78, 0x9A, 0xBC, 0xDE, 0xFA, 0x1B, 0x2C, 0x3D]);
 }
 
@@ -88,7 +85,9 @@ fn a_restart_begins_beyond_everything_the_run_before_announced() {
         }
         let mut next = stored;
         next.begin(Timestamp::from_secs(now_s));
-        let is_old = |value: u64| next.check(COMMAND, &sealed(COMMAND, &[1; 4], value)).verify(&sealed(COMMAND, &[1; 4], value), mac);
+        let is_old = |value: u64| {
+            next.check(COMMAND, &sealed(COMMAND, &[1; 4], value)).verify(&sealed(COMMAND, &[1; 4], value), mac)
+        };
         assert!((last - 64..last + 16).all(|value| is_old(value).is_none()), "{stored_s} {now_s}");
     }
 }

@@ -26,9 +26,9 @@ const MAX_FRESHNESS: u64 = 1 << 60;
 #[serde(deny_unknown_fields)]
 pub struct FreshnessWindow {
     /// The last announced value, a multiple of the step.
-    announced: u64,
+    pub(super) announced: u64,
     /// The highest accepted value.
-    accepted: u64,
+    pub(super) accepted: u64,
 }
 
 impl FreshnessWindow {

@@ -151,7 +151,7 @@ section! {
 }
 
 section! {
-    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without authentication or end-to-end protection. With protection alone the commands are unauthenticated: whoever can send on the bus can make one; and, as with every protected message, the first frame after a start only shows the counter and is not executed.
+    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without authentication or end-to-end protection. With protection alone the commands are unauthenticated: every node of the bus can make one; and, as with every protected message, the first frame after a start only shows the counter and is not executed.
     Commands at "commands" gives FrameKeys<'_>, |keys| {
         /// Whether commands from the bus are executed.
         enabled: bool, "", Any, Default("false") =>;
