@@ -8,7 +8,7 @@
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * `intake`: flood limit, end-to-end check, commands, interfaces; `sampling`: signals, pack identity;
+//! * `intake`, `command_gate`: flood limit, end-to-end check, commands and their authentication, interfaces; `sampling`, `pack_memory`: signals, pack identity;
 //! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
 //! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
 //! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
@@ -29,6 +29,7 @@ mod intake;
 mod j1939;
 mod learning;
 mod life;
+mod modelling;
 mod outputs;
 mod pack_memory;
 mod publisher;
@@ -62,6 +63,7 @@ pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
 pub use intake::{CommandConfig, ControllerCount};
 pub use j1939::{AlarmCode, J1939Config};
+pub use modelling::{ModelState, ModelView};
 pub use outputs::{Estimate, MeasuredValues, Outputs, Secured, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use sender::{MAX_TEST_S, OutputConfig};

@@ -8,6 +8,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::learning::LearningState;
+use super::modelling::ModellingState;
 use super::snapshot::StoredCell;
 use crate::quantity::InvalidState;
 
@@ -32,6 +33,9 @@ pub(super) struct PackMemory {
 pub(super) struct StoredPack {
     pub(super) number: f64,
     pub(super) cells: Vec<StoredCell>,
+    /// What is learned of the cells' model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) modelling: Option<ModellingState>,
     pub(super) learning: LearningState,
 }
 
@@ -89,6 +93,7 @@ impl PackMemory {
         for pack in &self.packs {
             InvalidState::unless(pack.number.is_finite(), "the number of a pack", pack.number, "a finite number")?;
             pack.learning.check()?;
+            pack.modelling.iter().try_for_each(ModellingState::check)?;
             pack.cells.iter().try_for_each(StoredCell::check)?;
         }
         Ok(())

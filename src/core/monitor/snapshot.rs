@@ -12,6 +12,7 @@ use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
+use super::modelling::ModellingState;
 use super::pack_memory::{PackMemory, StoredPack};
 use super::sampling::Identity;
 use super::sender::Schedule;
@@ -55,6 +56,8 @@ pub struct Snapshot {
     identity: Identity,
     #[serde(default)]
     statistics: Statistics,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    modelling: Option<ModellingState>,
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
@@ -131,7 +134,8 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
-        let Stages { sampling, estimation, learning, alarming, sender, statistics, sleep, packs } = &self.stages;
+        let Stages { sampling, estimation, modelling, learning, alarming, sender, statistics, sleep, packs } =
+            &self.stages;
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
@@ -148,6 +152,7 @@ impl Monitor {
             buses,
             identity: sampling.identity,
             statistics: statistics.clone(),
+            modelling: modelling.stored(),
             asleep_since: sleep.since,
             packs: packs.clone(),
         }
@@ -221,7 +226,7 @@ impl Stages {
     fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
         let batch = CellBatch::restore(has_reported, snapshot.waiting);
-        self.restore_learned(&snapshot.cells, snapshot.learning, batch);
+        self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
         // Its shape is checked in `Monitor::restore`.
         self.sampling.sampler.restore(snapshot.sampler);
         self.sampling.identity = snapshot.identity;
@@ -236,9 +241,19 @@ impl Stages {
         self.statistics.restores += 1;
     }
 
-    /// Restores filters and learned values of all cells.
-    fn restore_learned(&mut self, cells: &[StoredCell], state: LearningState, batch: CellBatch) {
-        let Self { estimation, learning, .. } = self;
+    /// Restores the cells' model, filters and learned values of all cells.
+    fn restore_learned(
+        &mut self,
+        cells: &[StoredCell],
+        model: Option<ModellingState>,
+        state: LearningState,
+        batch: CellBatch,
+    ) {
+        let Self { estimation, modelling, learning, .. } = self;
+        if let Some(stored) = model {
+            modelling.restore(stored);
+            estimation.use_model(modelling, &state.learner);
+        }
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in cells.iter().enumerate() {
             learning.cells[index] = cell.health;
@@ -260,6 +275,7 @@ impl Stages {
         StoredPack {
             number: self.sampling.identity.known.unwrap_or(0.0),
             cells: cells.collect(),
+            modelling: self.modelling.stored(),
             learning: self.learning.state.learned_only(),
         }
     }
@@ -267,7 +283,8 @@ impl Stages {
     /// Continues with a pack that was connected before, after a time of unknown length.
     pub(super) fn restore_pack(&mut self, now: Timestamp, pack: StoredPack, out: &mut Outputs) {
         let batch = CellBatch::new(pack.cells.len());
-        self.restore_learned(&pack.cells, pack.learning, batch);
+        self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
+        self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
         let capacity = self.learning.weakest_capacity();
         let kind = EventKind::PackReturned {
@@ -321,6 +338,7 @@ impl Snapshot {
             stored.check().map_err(at_cell)?;
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
+        self.modelling.iter().try_for_each(ModellingState::check)?;
         self.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
