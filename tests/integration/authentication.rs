@@ -153,6 +153,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
     );
     assert!(genuine > frames / 2000 && attacker.of_kind.iter().all(|count| *count > frames / 20));
     assert_eq!(daemon.executed, genuine);
+    assert_eq!(daemon.monitor.dropped().count(), 0, "every frame was judged, none dropped by the flood limit");
 }
 
 #[test]
@@ -250,6 +251,21 @@ fn a_journal_gives_the_live_run_byte_for_byte_without_the_key() {
     let executed = out.events.iter().filter(|event| matches!(event.kind, EventKind::Command { .. })).count();
     assert_eq!(executed, 60);
     assert!(!live.contains("a0010203") && !live.contains("0102030405"), "no key in the state");
+}
+
+#[test]
+fn without_announcements_what_was_announced_is_old_after_two_seconds() {
+    for (stalled_ms, is_executed) in [(1_900, true), (2_100, false)] {
+        let mut daemon = Daemon::new(config("1", ""));
+        let mut ecu = Ecu::new(Profile::P1, key(0xA0));
+        daemon.pass(1000);
+        daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+        daemon.pass(20);
+        // No tick: the loop hangs, or the computer sleeps. The announcement was made 20 ms after a whole second.
+        let frame = ecu.command(1, 2047).unwrap();
+        daemon.ms += stalled_ms - 20;
+        assert_eq!(daemon.receive(&frame), is_executed, "{stalled_ms}");
+    }
 }
 
 #[test]

@@ -117,8 +117,8 @@ impl MacInput {
 }
 
 impl Authentication {
-    /// What the authenticator of this payload and freshness covers; `None` = the payload is shorter than the trailer, or longer
-    /// than a frame.
+    /// What the authenticator of this payload and freshness covers; `None` = the payload is shorter than the trailer, or its data
+    /// longer than a frame.
     pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
         let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
         let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };

@@ -10,7 +10,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::can::encode::CommandRefusal;
+use crate::can::encode::{CommandRefusal, FRESHNESS_PERIOD_MS};
 use crate::can::secoc::{Authentication, FreshnessWindow, MacCheck};
 use crate::quantity::{InvalidState, Timestamp};
 
@@ -22,11 +22,16 @@ const FORGED_PERIOD_NS: i64 = 10_000_000_000;
 /// limit admits by default, one of 24 bits and its repetition are right within a day with a probability of 1 in 800.
 const REPEAT_NS: i64 = 1_000_000_000;
 
+/// Without an announcement for this long what was announced is old, ns: two periods, as with announcements.
+const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
+
 /// The gate with its counts; all of it is kept over a restart.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CommandGate {
     window: FreshnessWindow,
+    /// When the freshness was last announced.
+    announced_at: Timestamp,
     /// Until when one right authenticator is not enough.
     attacked_until: Timestamp,
     /// A command that must come again, and until when.
@@ -64,6 +69,7 @@ impl CommandGate {
     /// Begins a run at `now`.
     pub(super) fn begin(&mut self, now: Timestamp) {
         self.window.begin(now);
+        self.announced_at = now;
     }
 
     /// After time without listening, or a step of the clock.
@@ -74,7 +80,8 @@ impl CommandGate {
     }
 
     /// The freshness to announce next.
-    pub(super) fn announce(&mut self) -> u64 {
+    pub(super) fn announce(&mut self, now: Timestamp) -> u64 {
+        self.announced_at = now;
         self.window.announce()
     }
 
@@ -96,7 +103,8 @@ impl CommandGate {
     ) -> Result<(), CommandRefusal> {
         let check = self.mac_check(authentication, payload);
         let is_attacked = self.attacked_until > now;
-        let (count, verdict) = if check.is_empty() {
+        let is_stale = now.nanos().saturating_sub(self.announced_at.nanos()) > STALE_NS;
+        let (count, verdict) = if is_stale || check.is_empty() {
             (&mut self.counts.old, Err(CommandRefusal::OldFreshness))
         } else if let Some(freshness) = verified.filter(|freshness| check.has(*freshness)) {
             self.window.accept(freshness);
@@ -121,6 +129,7 @@ impl CommandGate {
 
     /// Moves the stored times onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
+        self.announced_at = self.announced_at.plus_nanos(by_nanos);
         self.attacked_until = self.attacked_until.plus_nanos(by_nanos);
         if let Some((until, _)) = &mut self.unconfirmed {
             *until = until.plus_nanos(by_nanos);

@@ -232,7 +232,7 @@ impl Monitor {
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
                 if stages.sender.take_freshness_due(now) {
-                    let freshness = intake.gate_of_commands.announce();
+                    let freshness = intake.gate_of_commands.announce(now);
                     stages.sender.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
                 }
                 stages.send_due(now, out);

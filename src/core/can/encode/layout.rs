@@ -326,6 +326,7 @@ fn move_down(message: &mut Message) {
         signal.layout.start_bit = signal.layout.start_bit.saturating_sub(8 * COMMAND_HEADER_BYTES);
     }
     message.len_bytes = COMMAND_DATA_BYTES;
+    message.comment = Some("What packwatch takes from another ECU, authenticated: see PACKWATCH_Freshness.".to_owned());
 }
 
 /// Replaces the signals of header and trailer.

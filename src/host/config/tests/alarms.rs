@@ -92,11 +92,11 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[output.freshness]\ndata_id = 2\n",
-            "pack.toml:0: authentication.credential is not set, must be given, or key_file: secoc needs a key",
+            "pack.toml:1: authentication.credential is not set, must be given, or key_file: secoc needs a key",
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
-            "pack.toml:0: output.freshness.data_id is not set, must be given, 0 to 0xFFF, with commands.secoc",
+            "pack.toml:1: output.freshness.data_id is not set, must be given, 0 to 0xFFF, with commands.secoc",
         ),
         (
             "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
