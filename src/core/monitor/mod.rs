@@ -303,7 +303,7 @@ impl Monitor {
         if beginning == Beginning::New {
             stages.sender.begin_freshness(time);
         } else {
-            stages.restate_known(taken, was_brief, out);
+            stages.restate_known(taken, was_brief, false, out);
         }
         if beginning == Beginning::RestoredAgeless {
             // Claims the address, too.

@@ -293,7 +293,8 @@ impl Stages {
             capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
         };
         out.events.push(Event { time: now, kind });
-        self.restate_known(now, false, out);
+        // The alarms of the pack that was here ended: these values are new to the rules.
+        self.restate_known(now, false, true, out);
         self.publisher(now, out).publish_alarms();
     }
 

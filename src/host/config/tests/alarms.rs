@@ -96,7 +96,7 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
-            "pack.toml:1: output.freshness.data_id is not set, must be given, 0 to 0xFFF, with commands.secoc",
+            "pack.toml:15: output.freshness.data_id is not set, must be given, 0 to 0xFFFF, with commands.secoc",
         ),
         (
             "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
