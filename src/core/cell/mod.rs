@@ -12,11 +12,13 @@ pub mod electrodes;
 pub mod estimator;
 pub mod loss_modes;
 pub mod model;
+pub mod model_bands;
 pub mod model_check;
+pub mod model_comparison;
 pub mod notebook;
 pub mod own_model;
 
-pub use aged_ocv::AgedOcv;
+pub use aged_ocv::{AgedOcv, AgeingLaw};
 pub use chemistry::{Chemistry, Label};
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
@@ -29,6 +31,8 @@ pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,
     arrhenius,
 };
+pub use model_bands::{Advice, Measurement, ModelBands, advise};
 pub use model_check::{ModelCheck, ModelEvidence};
+pub use model_comparison::{Difference, ModelComparison};
 pub use notebook::{Notebook, NotebookConfig};
 pub use own_model::OwnModel;
