@@ -5,10 +5,11 @@
 use super::document::Faults;
 use super::keys::Pack;
 use super::tables::RawTables;
-use crate::cell::{CellModel, Label};
+use super::cell_model::{MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
+use crate::cell::Label;
 
 /// The model by `chemistry`, where no file is named.
-pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
+pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<SourcedModel> {
     let pack = raw.pack.as_ref()?;
     let Some(chemistry) = pack.chemistry else {
         pack.place.fault(
@@ -28,7 +29,7 @@ pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
         voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
         ..usual
     };
-    let model = label.model();
+    let model = of_label(&label);
     if model.is_none() {
         let Label { voltage_min_v, voltage_max_v, .. } = label;
         let (low, high) = (usual.voltage_min_v, usual.voltage_max_v);
@@ -39,6 +40,17 @@ pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
         pack.place.fault(faults, "chemistry", &what);
     }
     model
+}
+
+/// The model of a cell of which only the label is known; `None` = no cell of this chemistry has these voltages.
+pub fn of_label(label: &Label) -> Option<SourcedModel> {
+    let source = ModelSource {
+        origin: ModelOrigin::Prior,
+        chemistry: Some(label.chemistry.name().to_owned()),
+        measured: MeasuredRange::default(),
+        provenance: toml::Table::new(),
+    };
+    label.model().map(|model| SourcedModel { model, source })
 }
 
 /// Notes keys of a label beside a model file, which has them.
