@@ -67,7 +67,10 @@ impl Difference {
     fn of(values: &[AtSoc]) -> Self {
         let squares: f64 = values.iter().map(|at| at.value * at.value).sum();
         let largest = values.iter().copied().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
-        Self { rms: (squares / values.len().max(1) as f64).sqrt(), worst: largest.unwrap_or(AtSoc { soc: 0.0, value: 0.0 }) }
+        Self {
+            rms: (squares / values.len().max(1) as f64).sqrt(),
+            worst: largest.unwrap_or(AtSoc { soc: 0.0, value: 0.0 }),
+        }
     }
 }
 

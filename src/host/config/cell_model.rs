@@ -29,7 +29,7 @@ use crate::cell::{
     AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, ModelSpread, NegativeMaterial, PositiveMaterial, Table,
     Thermal,
 };
-pub use source::{MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
+pub use source::{KnownBy, MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
 pub use write::text;
 
 const INF: f64 = f64::INFINITY;

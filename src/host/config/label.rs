@@ -2,10 +2,10 @@
 //!
 //! In: the keys of `[pack]`. Out: the model of a cell without a file; faults where keys are missing or do not fit together.
 
+use super::cell_model::{MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
 use super::document::Faults;
 use super::keys::Pack;
 use super::tables::RawTables;
-use super::cell_model::{MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
 use crate::cell::Label;
 
 /// The model by `chemistry`, where no file is named.

@@ -238,7 +238,16 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?.config();
-    let config = Config { path: path.to_owned(), interfaces, monitor, model_source: model_source?, output_layout, store, warnings, vehicle };
+    let config = Config {
+        path: path.to_owned(),
+        interfaces,
+        monitor,
+        model_source: model_source?,
+        output_layout,
+        store,
+        warnings,
+        vehicle,
+    };
     let description = describe::describe(files, &raw, &config, &found, outputs);
     Some((config, description))
 }

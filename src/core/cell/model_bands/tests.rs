@@ -63,7 +63,10 @@ fn each_measurement_of_the_advice_leaves_less_than_the_one_before() {
         assert!(!advice.is_empty(), "{name}: a model of a label has much to learn");
         let mut before = points;
         for Advice { left_points, measurement } in advice {
-            assert!(left_points > 0.0 && left_points < before, "{name}: {measurement} leaves {left_points} of {before}");
+            assert!(
+                left_points > 0.0 && left_points < before,
+                "{name}: {measurement} leaves {left_points} of {before}"
+            );
             before = left_points;
         }
     }

@@ -3,6 +3,10 @@
 use toml::{Table, Value};
 
 use crate::cell::CellModel;
+use crate::cell::model_bands::CURVE_C;
+
+/// Most that the end of a measured range is rounded.
+const ROUNDED: f64 = 0.01;
 
 /// What a cell model stands on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -74,4 +78,62 @@ pub struct SourcedModel {
     pub model: CellModel,
     /// Where it comes from.
     pub source: ModelSource,
+}
+
+/// Why a part of a model is as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum KnownBy {
+    /// Within what was measured.
+    Measured,
+    /// Beyond what was measured: continued.
+    Extrapolated,
+    /// The file does not state where it was measured.
+    NotStated,
+    /// What all cells of the chemistry have in common.
+    Prior,
+}
+
+impl KnownBy {
+    /// In words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Measured => "measured",
+            Self::Extrapolated => "extrapolated",
+            Self::NotStated => "not stated",
+            Self::Prior => "prior",
+        }
+    }
+}
+
+impl SourcedModel {
+    /// How the open-circuit curve is known at a SOC.
+    pub fn curve_known_by(&self, soc: f64) -> KnownBy {
+        self.source.by_range(self.source.measured.soc, soc)
+    }
+
+    /// How the resistances are known at a temperature.
+    pub fn resistances_known_by(&self, temperature_c: f64) -> KnownBy {
+        self.source.by_range(self.source.measured.temperature_c, temperature_c)
+    }
+
+    /// Error of the model's voltage, V, as root mean square over SOC at the temperature of its curve; `None` = not stated.
+    pub fn error_v(&self) -> Option<f64> {
+        let errors =
+            self.model.soc.iter().map(|&soc| self.model.voltage_error_v(&self.model.grid_position(soc, CURVE_C)));
+        let squares = errors.map(|error_v| error_v.map(|v| v * v)).collect::<Option<Vec<f64>>>()?;
+        Some((squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
+    }
+}
+
+impl ModelSource {
+    fn by_range(&self, range: Option<[f64; 2]>, value: f64) -> KnownBy {
+        match (self.origin, range) {
+            (ModelOrigin::Prior, _) => KnownBy::Prior,
+            (_, None) => KnownBy::NotStated,
+            // The ends are written with few digits.
+            (_, Some([low, high])) if value >= low - ROUNDED && value <= high + ROUNDED => KnownBy::Measured,
+            (_, Some(_)) => KnownBy::Extrapolated,
+        }
+    }
 }

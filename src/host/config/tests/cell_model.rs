@@ -121,7 +121,10 @@ fn a_written_model_is_read_as_the_same_model() {
         std::fs::write(&path, cell_model::text(sourced, "a test")).expect("written");
         let found = cell_model::load_sourced(&path).expect("a model");
         assert_eq!(found.model, sourced.model);
-        assert_eq!((&found.source.chemistry, &found.source.provenance), (&sourced.source.chemistry, &sourced.source.provenance));
+        assert_eq!(
+            (&found.source.chemistry, &found.source.provenance),
+            (&sourced.source.chemistry, &sourced.source.provenance)
+        );
         assert_eq!(found.source.measured, sourced.source.measured);
     };
     for (chemistry, _) in Chemistry::ALL {
