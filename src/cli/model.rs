@@ -97,14 +97,14 @@ fn show(args: &ShowArgs) -> Result<(), Failure> {
 
 #[cfg(feature = "lab")]
 fn plot(args: &PlotArgs) -> Result<(), Failure> {
-    let (name, sourced) = args.source.load()?;
+    let (_, sourced) = args.source.load()?;
     check_place(&args.out, args.source.files()).map_err(Failure::new)?;
     let format = match args.out.extension().and_then(|extension| extension.to_str()) {
         Some("svg") => chart::Format::Svg,
         Some("png") => chart::Format::Png,
         _ => return Err(Failure::new(format!("{}: must end in .svg or .png", args.out.display()))),
     };
-    let pictures: Vec<_> = lab::model_pictures::all(&name, &sourced).into_iter().map(|(_, picture)| picture).collect();
+    let pictures: Vec<_> = lab::model_pictures::all(&sourced).into_iter().map(|(_, picture)| picture).collect();
     chart::write_stack(&args.out, &pictures, format).map_err(super::output::failure)
 }
 

@@ -1,13 +1,12 @@
 //! Pictures of a cell model: open-circuit curve, its slope, resistances over SOC and over temperature, and the error of the SOC that
 //! follows.
 //!
-//! Bands are 95 % intervals by the bands of the model ([`ModelBands`]); a model that states no error has none, and its description
-//! says so. Lines are dashed where nothing was measured: beyond the measured range, and for a prior.
+//! Bands are 95 % intervals ([`ModelBands`]); a curve whose model states no error has none, and its description says so. Lines are dashed where nothing was measured: beyond the measured range, and for a prior.
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, ModelBands};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Shape};
-use crate::config::cell_model::{KnownBy, ModelOrigin, SourcedModel};
+use crate::config::cell_model::{KnownBy, SourcedModel};
 
 /// Half of a 95 % interval, standard deviations.
 const OF_95: f64 = 1.96;
@@ -18,12 +17,14 @@ const SHOWN_C: (f64, f64) = (-20.0, 50.0);
 /// A cold temperature beside that of the curve, degrees C.
 const COLD_C: f64 = 0.0;
 /// SOC of the picture over temperature.
-const SHOWN_SOC: [(f64, Ink); 2] = [(0.5, Ink::Blue), (0.1, Ink::Orange)];
+const SHOWN_SOC: [(f64, Ink); 2] = [(0.5, Ink::Blue), (0.2, Ink::Orange)];
+/// SOC below which a curve or a resistance may leave its picture: both rise many times there, percent.
+const STEEP_PERCENT: f64 = 12.0;
 
-/// Every picture with the name of its file; `name` is that of the model for people.
-pub fn all(name: &str, sourced: &SourcedModel) -> Vec<(String, Picture)> {
+/// Every picture with the name of its file.
+pub fn all(sourced: &SourcedModel) -> Vec<(String, Picture)> {
     let pictures = [
-        ("model_curve", Some(curve(name, sourced))),
+        ("model_curve", Some(curve(sourced))),
         ("model_slope", Some(slope(sourced))),
         ("model_resistance", Some(resistance_over_soc(sourced))),
         ("model_temperature", resistance_over_temperature(sourced)),
@@ -36,7 +37,18 @@ fn along(low: f64, high: f64) -> impl Iterator<Item = f64> + Clone {
     (0..=POINTS).map(move |k| low + (high - low) * f64::from(k) / f64::from(POINTS))
 }
 
-fn chart(title: String, description: &str, x: Axis, y: &str, layers: Vec<Layer>) -> Picture {
+/// An axis from 0 with room for what the layers have above [`STEEP_PERCENT`].
+fn from_0(label: &str, layers: &[Layer]) -> Axis {
+    let highest = layers.iter().flat_map(|layer| match &layer.shape {
+        Shape::Line(points) | Shape::Dashed(points) => points.clone(),
+        Shape::Band(points) => points.iter().map(|(x, _, high)| (*x, *high)).collect(),
+        _ => Vec::new(),
+    });
+    let highest = highest.filter(|(x, y)| *x >= STEEP_PERCENT && y.is_finite()).map(|(_, y)| y).fold(0.0, f64::max);
+    Axis::number(label).within(0.0, 1.1 * highest)
+}
+
+fn chart(title: String, description: &str, x: Axis, y: impl Into<Axis>, layers: Vec<Layer>) -> Picture {
     Picture::Chart(Chart { description: description.to_owned(), ..Chart::new(title, x, y, layers) })
 }
 
@@ -71,7 +83,7 @@ fn is_known(known_by: KnownBy) -> bool {
     matches!(known_by, KnownBy::Measured | KnownBy::NotStated)
 }
 
-fn curve(name: &str, sourced: &SourcedModel) -> Picture {
+fn curve(sourced: &SourcedModel) -> Picture {
     let bands = ModelBands::new(&sourced.model);
     let band = along(0.0, 1.0).filter_map(|soc| {
         let (v, half_v) = (bands.ocv_v(soc), OF_95 * bands.curve_std_v(soc)?);
@@ -89,12 +101,7 @@ fn curve(name: &str, sourced: &SourcedModel) -> Picture {
         layers.push(Layer::band("95 % interval", Ink::Blue, band));
     }
     layers.extend(line("curve", Ink::Blue, &points, |soc| is_known(sourced.curve_known_by(0.01 * soc))));
-    let origin = match sourced.source.origin {
-        ModelOrigin::File => "",
-        ModelOrigin::Prior => " (prior)",
-        ModelOrigin::Learned => " (learned)",
-    };
-    chart(format!("{name}{origin}: open-circuit voltage at 25 \u{b0}C"), about, soc_axis(), "V", layers)
+    chart(format!("{}: open-circuit voltage at 25 \u{b0}C", sourced.model.name), about, soc_axis(), "V", layers)
 }
 
 fn slope(sourced: &SourcedModel) -> Picture {
@@ -102,7 +109,13 @@ fn slope(sourced: &SourcedModel) -> Picture {
     let points: Vec<_> = along(0.0, 1.0).map(|soc| (100.0 * soc, 10.0 * bands.slope_v(soc))).collect();
     let layers = line("", Ink::Blue, &points, |soc| is_known(sourced.curve_known_by(0.01 * soc)));
     let title = "Slope of the curve: how much of the SOC a voltage shows".to_owned();
-    chart(title, "Slope of the open-circuit voltage, mV per percent of SOC", soc_axis(), "mV per %", layers)
+    chart(
+        title,
+        "Slope of the open-circuit voltage, mV per percent of SOC",
+        soc_axis(),
+        from_0("mV per %", &layers),
+        layers,
+    )
 }
 
 /// Settled resistance in milliohm with its 95 % interval over `x`, whose place in the model is `place`.
@@ -117,17 +130,13 @@ fn resistance_layers(
         let (soc, temperature_c) = place(x);
         1e3 * model.settled_ohm(&model.grid_position(soc, temperature_c))
     };
-    let band = xs.clone().filter_map(|x| {
+    let band = xs.clone().map(|x| {
         let (soc, temperature_c) = place(x);
-        let factor = (OF_95 * bands.resistance(soc, temperature_c)?.std()).exp();
-        Some((x, milliohm(x) / factor, milliohm(x) * factor))
+        let factor = (OF_95 * bands.resistance(soc, temperature_c).std()).exp();
+        (x, milliohm(x) / factor, milliohm(x) * factor)
     });
-    let band: Vec<_> = band.collect();
     let points: Vec<_> = xs.map(|x| (x, milliohm(x))).collect();
-    let mut layers = Vec::new();
-    if !band.is_empty() {
-        layers.push(Layer::band(&format!("{label}, 95 % interval"), ink, band));
-    }
+    let mut layers = vec![Layer::band(&format!("{label}, 95 % interval"), ink, band)];
     layers.extend(line(label, ink, &points, |x| is_known(sourced.resistances_known_by(place(x).1))));
     layers
 }
@@ -137,9 +146,9 @@ fn resistance_over_soc(sourced: &SourcedModel) -> Picture {
     let warm = resistance_layers(sourced, ("25 \u{b0}C", Ink::Blue), soc(), |x| (0.01 * x, CURVE_C));
     let has_cold = ends_c(&sourced.model).is_some_and(|(low, high)| low <= COLD_C && COLD_C <= high);
     let cold = has_cold.then(|| resistance_layers(sourced, ("0 \u{b0}C", Ink::Purple), soc(), |x| (0.01 * x, COLD_C)));
-    let layers = cold.into_iter().flatten().chain(warm).collect();
+    let layers: Vec<Layer> = cold.into_iter().flatten().chain(warm).collect();
     let title = "Resistance once settled, over SOC".to_owned();
-    chart(title, "Settled resistance, milliohm, over SOC", soc_axis(), "m\u{3a9}", layers)
+    chart(title, "Settled resistance, milliohm, over SOC", soc_axis(), from_0("m\u{3a9}", &layers), layers)
 }
 
 /// First and last temperature of tables with several.
@@ -192,7 +201,7 @@ mod tests {
 
     #[test]
     fn every_picture_of_a_label_has_a_band_and_no_number_that_is_none() {
-        let pictures = all("nca-graphite:2.9", &prior());
+        let pictures = all(&prior());
         assert_eq!(pictures.len(), 5);
         for (name, picture) in pictures {
             let (text, height) = picture.draw(Size::WIDE);
@@ -220,11 +229,11 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_states_no_error_has_no_band() {
+    fn a_model_that_states_no_error_has_no_band_of_its_curve() {
         let mut sourced = prior();
         (sourced.model.spread, sourced.model.voltage_error_v) = (None, None);
-        let pictures = all("cell", &sourced);
+        let pictures = all(&sourced);
         assert_eq!(pictures.len(), 4, "no error of the SOC");
-        assert!(pictures.iter().all(|(_, picture)| !picture.draw(Size::WIDE).0.contains("interval")));
+        assert!(!pictures[0].1.draw(Size::WIDE).0.contains("interval"));
     }
 }

@@ -20,13 +20,13 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
     let rows = [
         ("open-circuit voltage at 25 \u{b0}C", difference(&comparison.curve, 1e3, "mV")),
         ("SOC that B reads at rest", difference(&comparison.rest_soc, 100.0, "points")),
-        ("capacity", format!("{:+.1} %", 100.0 * comparison.capacity)),
+        ("capacity", format!("{} %", signed(100.0 * comparison.capacity))),
     ];
     let rows = rows.into_iter().map(|(what, value)| vec![what.to_owned(), value]);
     page.push_str(&output::table::<&str>(&[], rows, 2));
     page.push_str("\nopen-circuit voltage at 25 \u{b0}C\n");
     let points = comparison.curve_v.iter().step_by(CURVE_EVERY);
-    let rows = points.map(|at| vec![format!("{:.0}", 100.0 * at.soc), format!("{:+.1}", 1e3 * at.value + 0.0)]);
+    let rows = points.map(|at| vec![format!("{:.0}", 100.0 * at.soc), signed(1e3 * at.value)]);
     page.push_str(&output::table(&["SOC, %", "mV"], rows, 0));
     if comparison.temperatures.is_empty() {
         page.push_str("\nresistances: the two models have no temperature in common\n");
@@ -35,9 +35,7 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
     page.push_str("\nresistances per rated capacity, and the SOC that B reads under C/2\n");
     let heads = ["\u{b0}C", "series, % rms", "worst", "settled, % rms", "worst", "SOC, points rms", "worst"];
     let row = |at: &AtTemperature| {
-        let pair = |found: &Difference| {
-            [format!("{:.1}", 100.0 * found.rms), format!("{:+.1}", 100.0 * found.worst.value + 0.0)]
-        };
+        let pair = |found: &Difference| [format!("{:.1}", 100.0 * found.rms), signed(100.0 * found.worst.value)];
         let pairs = [&at.series, &at.settled, &at.load_soc].into_iter().flat_map(pair);
         [at.temperature_c.to_string()].into_iter().chain(pairs).collect()
     };
@@ -47,7 +45,13 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
 
 fn difference(found: &Difference, factor: f64, unit: &str) -> String {
     let Difference { rms, worst } = found;
-    format!("{:.1} {unit} rms, at worst {:+.1} at {:.0} %", factor * rms, factor * worst.value + 0.0, 100.0 * worst.soc)
+    let at_worst = signed(factor * worst.value);
+    format!("{:.1} {unit} rms, at worst {at_worst} at {:.0} %", factor * rms, 100.0 * worst.soc)
+}
+
+/// One decimal with a sign; a zero is positive.
+fn signed(value: f64) -> String {
+    format!("{:+.1}", (10.0 * value).round() / 10.0 + 0.0)
 }
 
 /// As JSON.

@@ -23,7 +23,7 @@ pub(super) struct ModelPage {
     chemistry: Option<String>,
     rated_capacity_ah: f64,
     capacity_ah: f64,
-    capacity_std_ah: Option<f64>,
+    capacity_std_ah: f64,
     voltage_min_v: f64,
     voltage_max_v: f64,
     measured: MeasuredRange,
@@ -65,7 +65,7 @@ struct SettledResistance {
     soc: f64,
     ohm: f64,
     /// Standard deviation, fraction.
-    std: Option<f64>,
+    std: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -99,7 +99,7 @@ impl ModelPage {
             chemistry: source.chemistry.clone(),
             rated_capacity_ah: model.rated_capacity_ah,
             capacity_ah: model.capacity_ah,
-            capacity_std_ah: bands.capacity_std().map(|std| std * model.capacity_ah),
+            capacity_std_ah: bands.capacity_std() * model.capacity_ah,
             voltage_min_v: model.voltage_min_v,
             voltage_max_v: model.voltage_max_v,
             measured: source.measured,
@@ -153,11 +153,16 @@ impl ModelPage {
             ModelOrigin::Prior => "label alone (prior): what all cells of this chemistry have in common",
             ModelOrigin::Learned => "learned from the vehicle's own data",
         };
-        let capacity_std = self.capacity_std_ah.map_or(String::new(), |std| format!(" \u{b1} {std:.2}"));
         let mut rows = vec![
             ("from", format!("{}: {origin}", self.source)),
             ("chemistry", stated(&self.chemistry)),
-            ("capacity", format!("{:.4}{capacity_std} Ah, rated {} Ah", self.capacity_ah, self.rated_capacity_ah)),
+            (
+                "capacity",
+                format!(
+                    "{:.3} \u{b1} {:.3} Ah, rated {} Ah",
+                    self.capacity_ah, self.capacity_std_ah, self.rated_capacity_ah
+                ),
+            ),
             ("voltages", format!("{} to {} V", self.voltage_min_v, self.voltage_max_v)),
         ];
         if self.origin == ModelOrigin::File {
@@ -181,10 +186,12 @@ impl ModelPage {
     /// What the model means for the SOC, and what would help.
     fn verdict(&self) -> String {
         let Some(points) = self.soc_error_points else {
-            return "\nSOC error by the model: unknown, the model states no error; `packwatch fit` writes one\n"
+            return "\nexpected error of the SOC in use: unknown, the model states no error; `packwatch fit` writes one\n"
                 .to_owned();
         };
-        let mut text = format!("\nSOC error by the model: about {points:.1} points, by one voltage under load\n");
+        let mut text = format!(
+            "\nexpected error of the SOC in use: about {points:.1} points, before the vehicle has learned its own cells\n"
+        );
         match self.advice.is_empty() {
             true => text.push_str("no single measurement would make it much smaller\n"),
             false => text.push_str("what would help most, and what is then left\n"),
@@ -217,10 +224,7 @@ impl CurveRow {
 
 impl ResistanceRow {
     fn settled_cells(&self) -> Vec<String> {
-        let settled = self.settled.iter().map(|at| {
-            let std = at.std.map_or("unknown".to_owned(), |std| format!("{:.0}", 100.0 * std));
-            format!("{} \u{b1} {std}", milliohm(at.ohm))
-        });
+        let settled = self.settled.iter().map(|at| format!("{} \u{b1} {:.0}", milliohm(at.ohm), 100.0 * at.std));
         let temperature = [self.temperature_c.to_string()].into_iter();
         temperature.chain(settled).chain([self.known_by.words().to_owned()]).collect()
     }
@@ -255,7 +259,7 @@ fn resistance_row(sourced: &SourcedModel, bands: &ModelBands<'_>, temperature_c:
     let settled = RESISTANCE_SOC.map(|soc| SettledResistance {
         soc,
         ohm: model.settled_ohm(&model.grid_position(soc, temperature_c)),
-        std: bands.resistance(soc, temperature_c).map(|band| band.std()),
+        std: bands.resistance(soc, temperature_c).std(),
     });
     let position = model.grid_position(PARTS_SOC, temperature_c);
     let part =

@@ -112,6 +112,14 @@ pub struct ModelSpread {
     pub drop_sqrt_s: f64,
 }
 
+impl ModelSpread {
+    /// Of cells of the model's own type.
+    pub fn usual(branches: usize) -> Self {
+        let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
+        Self { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
+    }
+}
+
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.
 pub const ERROR_WINDOW_S: f64 = 100.0;
 

@@ -3,23 +3,23 @@
 //! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the one that helps most first, each with what is left after it and those
 //! before it.
 //!
-//! The expected error is the mean square error of the SOC by one voltage under a usual load, over SOC and the temperatures of
-//! [`USE_C`], and that of a wrong capacity after half of it has been moved. A measurement is a linear observation of the curve or of
-//! ln(resistance), whose covariances fall with the distance in SOC and temperature; it takes away what it shows of both
-//! (Gaussian conditioning: p - c^2 / (v + r)).
+//! The expected error is the mean square error of the SOC over SOC and the temperatures of [`USE_C`], by one voltage under a usual
+//! load and by counting charge since the last sure voltage, with the capacity as uncertain as it is. A measurement is a linear
+//! observation of the curve, of ln(resistance) or of the capacity; covariances fall with the distance in SOC and temperature, so that
+//! it shows something of its neighbours too (Gaussian conditioning: p - c^2 / (v + r)).
 
 use std::fmt;
 
-use super::{ModelBands, soc_variance, square};
+use super::{ModelBands, ResistanceBand, soc_variance, square};
 
 /// Most measurements named.
 const MOST: usize = 3;
 /// Least gain, points of SOC, and as a part of the error.
 const LEAST_POINTS: f64 = 0.1;
-const LEAST_PART: f64 = 0.03;
+const LEAST_PART: f64 = 0.05;
 
 /// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
-const USE_C: [(f64, f64); 4] = [(-10.0, 0.15), (5.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
+const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
 /// SOC over which errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
 /// SOC of possible rests.
@@ -35,8 +35,14 @@ const COUNTED_SOC: f64 = 0.02;
 const DRIVE_LOG_STD: f64 = 0.1;
 /// Standard deviation of the capacity that a charge from below 20 % to full leaves, fraction.
 const CHARGE_CAPACITY_STD: f64 = 0.02;
-/// Part of the capacity moved between two voltages that say the SOC.
+/// Part of the capacity moved since the last sure voltage, and the error of the SOC counted from there by a right capacity: that of
+/// its beginning and of the current sensor.
 const MOVED: f64 = 0.5;
+const COUNT_STD: f64 = 0.06;
+
+/// Temperature below which a drive is a cold one, and by how much it may be warmer than the grid's, K.
+const COLD_C: f64 = 10.0;
+const COLD_ROOM_K: f64 = 2.0;
 
 /// A measurement that the vehicle makes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,8 +59,9 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
-            Self::Drive(temperature_c) if *temperature_c < 10.0 => {
-                write!(f, "a drive below {:.0} \u{b0}C", temperature_c + 2.0)
+            // A cold drive may be colder.
+            Self::Drive(temperature_c) if *temperature_c < COLD_C => {
+                write!(f, "a drive below {:.0} \u{b0}C", temperature_c + COLD_ROOM_K)
             }
             Self::Drive(temperature_c) => write!(f, "a drive near {temperature_c:.0} \u{b0}C"),
             Self::Charge => f.write_str("one charge from below 20 % to full"),
@@ -121,12 +128,12 @@ impl Belief {
         };
         let all = 0..places.len();
         let temperatures = || USE_C.iter().map(|(temperature_c, _)| *temperature_c);
-        let of_soc = |&soc: &f64| {
-            let of = temperatures().map(|t| Some((t, bands.resistance(soc, t)?))).collect::<Option<Vec<_>>>()?;
-            let covariance = |(t, a): &(f64, super::ResistanceBand), (u, b): &(f64, super::ResistanceBand)| {
+        let of_soc = |&soc: &f64| -> Vec<Vec<f64>> {
+            let of: Vec<(f64, ResistanceBand)> = temperatures().map(|t| (t, bands.resistance(soc, t))).collect();
+            let covariance = |(t, a): &(f64, ResistanceBand), (u, b): &(f64, ResistanceBand)| {
                 a.common * b.common + a.local * b.local * near((t - u) / RESISTANCE_K)
             };
-            Some(of.iter().map(|a| of.iter().map(|b| covariance(a, b)).collect()).collect())
+            of.iter().map(|a| of.iter().map(|b| covariance(a, b)).collect()).collect()
         };
         let drop_v = |t: f64| USE_SOC.iter().map(move |&soc| bands.usual_drop_v(&bands.model.grid_position(soc, t)));
         Some(Self {
@@ -134,20 +141,21 @@ impl Belief {
             rest_slope_v: REST_SOC.iter().map(|&soc| bands.slope_v(soc)).collect(),
             curve: all.clone().map(|i| all.clone().map(|k| covariance(i, k)).collect()).collect(),
             drop_v: temperatures().map(|t| drop_v(t).collect()).collect(),
-            resistance: USE_SOC.iter().map(of_soc).collect::<Option<Vec<_>>>()?,
-            capacity_std: bands.capacity_std().unwrap_or(0.0),
+            resistance: USE_SOC.iter().map(of_soc).collect(),
+            capacity_std: bands.capacity_std(),
         })
     }
 
     /// Expected error of the SOC, points.
     fn points(&self) -> f64 {
+        let counted = square(COUNT_STD) + square(MOVED * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
-            soc_variance((self.curve[s][s] + of_drop).max(f64::MIN_POSITIVE), self.slope_v[s])
+            soc_variance((self.curve[s][s] + of_drop).max(f64::MIN_POSITIVE), self.slope_v[s], counted)
         };
         let mean = |t: usize| (0..USE_SOC.len()).map(|s| at(t, s)).sum::<f64>() / USE_SOC.len() as f64;
-        let by_voltage: f64 = USE_C.iter().enumerate().map(|(t, (_, weight))| weight * mean(t)).sum();
-        100.0 * (by_voltage + square(MOVED * self.capacity_std)).sqrt()
+        let variance: f64 = USE_C.iter().enumerate().map(|(t, (_, weight))| weight * mean(t)).sum();
+        100.0 * variance.sqrt()
     }
 
     /// The belief after a measurement.
