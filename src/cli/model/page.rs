@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 
-use crate::cell::{CellModel, ModelBands, advise};
+use crate::cell::{CellModel, Chemistry, ModelBands, advise};
 use crate::cli::output;
-use crate::config::cell_model::{KnownBy, MeasuredRange, ModelOrigin, SourcedModel};
+use crate::config::cell_model::{KnownBy, LearnedFrom, MeasuredRange, SourcedModel, state_words};
+use crate::monitor::ModelState;
 
 /// Rows of the curve: every 5 % of SOC.
 const CURVE_STEPS: u32 = 20;
@@ -18,7 +19,7 @@ const PARTS_SOC: f64 = 0.5;
 pub(super) struct ModelPage {
     version: u32,
     source: String,
-    origin: ModelOrigin,
+    state: ModelState,
     name: String,
     chemistry: Option<String>,
     rated_capacity_ah: f64,
@@ -29,10 +30,23 @@ pub(super) struct ModelPage {
     measured: MeasuredRange,
     data: Option<String>,
     licence: Option<String>,
+    learned: Option<LearnedRow>,
     curve: Vec<CurveRow>,
     resistances: Vec<ResistanceRow>,
     soc_error_points: Option<f64>,
     advice: Vec<AdviceRow>,
+}
+
+/// What a learned model is learned from.
+#[derive(Debug, Serialize)]
+struct LearnedRow {
+    fits: u32,
+    residual_v: Option<f64>,
+    /// The chemistry that explains the voltages better.
+    chemistry: Option<Chemistry>,
+    soc_share: f64,
+    soc_ranges: Vec<[f64; 2]>,
+    temperature_ranges_c: Vec<[f64; 2]>,
 }
 
 /// The open-circuit curve at one SOC.
@@ -94,7 +108,7 @@ impl ModelPage {
         Self {
             version: 1,
             source: name,
-            origin: source.origin,
+            state: source.state,
             name: model.name.clone(),
             chemistry: source.chemistry.clone(),
             rated_capacity_ah: model.rated_capacity_ah,
@@ -105,6 +119,7 @@ impl ModelPage {
             measured: source.measured,
             data: source.citation().map(str::to_owned),
             licence: source.licence().map(str::to_owned),
+            learned: source.learned.as_ref().map(LearnedRow::new),
             curve: (0..=CURVE_STEPS)
                 .map(|k| curve_row(sourced, &bands, f64::from(k) / f64::from(CURVE_STEPS)))
                 .collect(),
@@ -148,13 +163,8 @@ impl ModelPage {
                 |[low, high]: [f64; 2]| format!("{:.0} to {:.0} {unit}", factor * low + 0.0, factor * high + 0.0);
             range.map_or("not stated".to_owned(), words)
         };
-        let origin = match self.origin {
-            ModelOrigin::File => "cell model file",
-            ModelOrigin::Prior => "label alone (prior): what all cells of this chemistry have in common",
-            ModelOrigin::Learned => "learned from the vehicle's own data",
-        };
         let mut rows = vec![
-            ("from", format!("{}: {origin}", self.source)),
+            ("from", format!("{}: {}", self.source, state_words(self.state))),
             ("chemistry", stated(&self.chemistry)),
             (
                 "capacity",
@@ -165,7 +175,7 @@ impl ModelPage {
             ),
             ("voltages", format!("{} to {} V", self.voltage_min_v, self.voltage_max_v)),
         ];
-        if self.origin == ModelOrigin::File {
+        if self.state == ModelState::Given {
             let MeasuredRange { temperature_c, soc, current_a } = self.measured;
             rows.push((
                 "measured",
@@ -179,6 +189,7 @@ impl ModelPage {
             rows.push(("data", stated(&self.data)));
             rows.push(("licence", stated(&self.licence)));
         }
+        rows.extend(self.learned.iter().flat_map(LearnedRow::rows));
         let rows = rows.into_iter().map(|(key, value)| vec![key.to_owned(), value]);
         format!("{}\n{}", self.name, output::table::<&str>(&[], rows, 2))
     }
@@ -203,6 +214,44 @@ impl ModelPage {
         text.push_str(&output::table::<&str>(&[], rows, 1));
         text
     }
+}
+
+impl LearnedRow {
+    fn new(learned: &LearnedFrom) -> Self {
+        Self {
+            fits: learned.fits,
+            residual_v: learned.residual_v,
+            chemistry: learned.chemistry,
+            soc_share: learned.seen.soc_share(),
+            soc_ranges: learned.seen.soc_ranges(),
+            temperature_ranges_c: learned.seen.temperature_ranges_c(),
+        }
+    }
+
+    /// Rows of the head.
+    fn rows(&self) -> Vec<(&'static str, String)> {
+        let residual =
+            self.residual_v.map_or("nothing fitted yet".to_owned(), |v| format!("residuals {:.1} mV", 1e3 * v));
+        let seen = match self.soc_ranges.is_empty() {
+            true => "nothing yet".to_owned(),
+            false => {
+                format!(
+                    "SOC {}, temperature {}",
+                    ranges(&self.soc_ranges, 100.0, "%"),
+                    ranges(&self.temperature_ranges_c, 1.0, "\u{b0}C")
+                )
+            }
+        };
+        let mut rows = vec![("fits", format!("{}, {residual}", self.fits)), ("seen", seen)];
+        rows.extend(self.chemistry.map(|better| ("fits better", better.name().to_owned())));
+        rows
+    }
+}
+
+/// Ranges in words: "10 to 40, 60 to 100 %".
+fn ranges(ranges: &[[f64; 2]], factor: f64, unit: &str) -> String {
+    let words = ranges.iter().map(|[low, high]| format!("{:.0} to {:.0}", factor * low, factor * high));
+    format!("{} {unit}", words.collect::<Vec<_>>().join(", "))
 }
 
 impl CurveRow {

@@ -8,6 +8,7 @@ pub mod aged_ocv;
 pub mod chemistry;
 pub mod circuit;
 pub mod config;
+pub mod coverage;
 pub mod electrodes;
 pub mod estimator;
 pub mod loss_modes;
@@ -24,8 +25,9 @@ pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
+pub use coverage::Coverage;
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
-pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
+pub use estimator::{AdoptedState, CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,

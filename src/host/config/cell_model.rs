@@ -29,7 +29,8 @@ use crate::cell::{
     AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, ModelSpread, NegativeMaterial, PositiveMaterial, Table,
     Thermal,
 };
-pub use source::{KnownBy, MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
+use crate::monitor::ModelState;
+pub use source::{KnownBy, LearnedFrom, MeasuredRange, ModelSource, SourcedModel, state_words};
 pub use write::text;
 
 const INF: f64 = f64::INFINITY;
@@ -230,10 +231,11 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let head = head?;
     let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), spread.as_ref(), faults);
     let source = ModelSource {
-        origin: ModelOrigin::File,
+        state: ModelState::Given,
         chemistry: head.chemistry.clone(),
         measured: measured.map_or_else(MeasuredRange::default, |keys| keys.range()),
         provenance: provenance(path, read),
+        learned: None,
     };
     let model = CellModel {
         spread: spread.map(|keys| keys.config()),

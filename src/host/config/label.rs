@@ -2,11 +2,23 @@
 //!
 //! In: the keys of `[pack]`. Out: the model of a cell without a file; faults where keys are missing or do not fit together.
 
-use super::cell_model::{MeasuredRange, ModelOrigin, ModelSource, SourcedModel};
+use super::cell_model::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use super::document::Faults;
 use super::keys::Pack;
 use super::tables::RawTables;
-use crate::cell::Label;
+use crate::cell::{Coverage, Label};
+use crate::monitor::{ModelState, ModelView};
+
+/// What is on the label, where no file is named and nothing is missing.
+pub(super) fn label(pack: &Pack) -> Option<Label> {
+    let (chemistry, rated_ah) = (pack.chemistry.filter(|_| pack.cell_model.is_none())?, pack.rated_capacity_ah?);
+    let usual = Label::usual(chemistry, rated_ah);
+    Some(Label {
+        voltage_min_v: pack.voltage_min_v.unwrap_or(usual.voltage_min_v),
+        voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
+        ..usual
+    })
+}
 
 /// The model by `chemistry`, where no file is named.
 pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<SourcedModel> {
@@ -19,16 +31,11 @@ pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<SourcedModel
         );
         return None;
     };
-    let Some(rated_ah) = pack.rated_capacity_ah else {
+    let Some(label) = label(pack) else {
         pack.place.fault(faults, "chemistry", "needs rated_capacity_ah, the capacity on the label of one cell");
         return None;
     };
-    let usual = Label::usual(chemistry, rated_ah);
-    let label = Label {
-        voltage_min_v: pack.voltage_min_v.unwrap_or(usual.voltage_min_v),
-        voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
-        ..usual
-    };
+    let usual = Label::usual(chemistry, label.rated_ah);
     let model = of_label(&label);
     if model.is_none() {
         let Label { voltage_min_v, voltage_max_v, .. } = label;
@@ -45,12 +52,34 @@ pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<SourcedModel
 /// The model of a cell of which only the label is known; `None` = no cell of this chemistry has these voltages.
 pub fn of_label(label: &Label) -> Option<SourcedModel> {
     let source = ModelSource {
-        origin: ModelOrigin::Prior,
+        state: ModelState::Prior,
         chemistry: Some(label.chemistry.name().to_owned()),
         measured: MeasuredRange::default(),
         provenance: toml::Table::new(),
+        learned: None,
     };
     label.model().map(|model| SourcedModel { model, source })
+}
+
+/// The model in force of a pack that learns it; `None` = it is of a model file.
+pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
+    let label = view.label?;
+    let SourcedModel { model: prior, source } = of_label(&label)?;
+    let learned = LearnedFrom {
+        seen: Coverage::of_rows(view.notebook.map_or(&[], |notebook| notebook.rows())),
+        residual_v: view.own.map(|own| own.residual_v),
+        chemistry: view.chemistry,
+        fits: view.fits,
+        prior: Box::new(prior.clone()),
+    };
+    let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));
+    let method = match &own {
+        Some(_) => "learned on board from what the vehicle has noted of its own cells, starting from the label",
+        None => "chemistry prior of the label",
+    };
+    let provenance = toml::Table::from_iter([("method".to_owned(), method.into())]);
+    let source = ModelSource { state: view.state, provenance, learned: Some(learned), ..source };
+    Some(SourcedModel { model: own.unwrap_or(prior), source })
 }
 
 /// Notes keys of a label beside a model file, which has them.

@@ -70,7 +70,7 @@ pub(crate) use diagnostic::answers;
 pub(crate) use document::TablePlace;
 use document::{Document, Faults};
 pub(crate) use keys::SignalSource;
-pub use label::of_label;
+pub use label::{of_label, of_view};
 pub use manual::manual;
 pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;

@@ -2,22 +2,26 @@
 
 use toml::{Table, Value};
 
-use crate::cell::CellModel;
 use crate::cell::model_bands::CURVE_C;
+use crate::cell::{CellModel, Chemistry, Coverage, ModelBands};
+use crate::monitor::ModelState;
 
 /// Most that the end of a measured range is rounded.
 const ROUNDED: f64 = 0.01;
+/// Part of the label's deviation that is left where data say more than the label.
+const LEFT: f64 = 0.5;
+/// SOC at which a temperature's resistances are judged.
+const MIDDLE_SOC: f64 = 0.5;
 
-/// What a cell model stands on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ModelOrigin {
-    /// A cell model file.
-    File,
-    /// Chemistry and label alone.
-    Prior,
-    /// The label, and what the vehicle has noted of its own cells.
-    Learned,
+/// A state of the model in words.
+pub fn state_words(state: ModelState) -> &'static str {
+    match state {
+        ModelState::Given => "cell model file",
+        ModelState::Prior => "label alone (prior): what all cells of this chemistry have in common",
+        ModelState::Learning => "learning from the vehicle's own data",
+        ModelState::Learned => "learned from the vehicle's own data",
+        ModelState::Unfit => "unfit: the voltages contradict the chemistry on the label",
+    }
 }
 
 /// Where a cell was measured, lowest and highest; `None` = not known.
@@ -34,14 +38,31 @@ pub struct MeasuredRange {
 /// Where a cell model comes from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelSource {
-    /// What it stands on.
-    pub origin: ModelOrigin,
+    /// How well it is known.
+    pub state: ModelState,
     /// Chemistry, for people.
     pub chemistry: Option<String>,
     /// Where it was measured.
     pub measured: MeasuredRange,
     /// `[provenance]` of its file; empty without one.
     pub provenance: Table,
+    /// Of a learned model: that of the label, and what the data have seen.
+    pub learned: Option<LearnedFrom>,
+}
+
+/// What a learned model is learned from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LearnedFrom {
+    /// The model of the label.
+    pub prior: Box<CellModel>,
+    /// What the rows in the notebook have seen.
+    pub seen: Coverage,
+    /// Root mean square of the residuals, V; `None` = nothing is learned yet.
+    pub residual_v: Option<f64>,
+    /// The chemistry that explains the voltages better than that on the label.
+    pub chemistry: Option<Chemistry>,
+    /// Fits so far.
+    pub fits: u32,
 }
 
 impl ModelSource {
@@ -67,7 +88,8 @@ impl ModelSource {
             Value::Integer(value) => Some(unit_v * *value as f64),
             _ => None,
         };
-        number("residual_rmse_mv", 1e-3).or(number("residual_rms_v", 1.0))
+        let learned = self.learned.as_ref().and_then(|learned| learned.residual_v);
+        learned.or(number("residual_rmse_mv", 1e-3)).or(number("residual_rms_v", 1.0))
     }
 }
 
@@ -92,6 +114,8 @@ pub enum KnownBy {
     NotStated,
     /// What all cells of the chemistry have in common.
     Prior,
+    /// The vehicle's own data.
+    Data,
 }
 
 impl KnownBy {
@@ -102,6 +126,7 @@ impl KnownBy {
             Self::Extrapolated => "extrapolated",
             Self::NotStated => "not stated",
             Self::Prior => "prior",
+            Self::Data => "data",
         }
     }
 }
@@ -109,12 +134,21 @@ impl KnownBy {
 impl SourcedModel {
     /// How the open-circuit curve is known at a SOC.
     pub fn curve_known_by(&self, soc: f64) -> KnownBy {
-        self.source.by_range(self.source.measured.soc, soc)
+        let std_v = |model: &CellModel| ModelBands::new(model).curve_std_v(soc);
+        self.by_prior(&std_v).unwrap_or_else(|| self.source.by_range(self.source.measured.soc, soc))
     }
 
     /// How the resistances are known at a temperature.
     pub fn resistances_known_by(&self, temperature_c: f64) -> KnownBy {
-        self.source.by_range(self.source.measured.temperature_c, temperature_c)
+        let std = |model: &CellModel| Some(ModelBands::new(model).resistance(MIDDLE_SOC, temperature_c).std());
+        self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
+    }
+
+    /// Of a label: by data where these have made a deviation clearly smaller than that of the label.
+    fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
+        let learned = self.source.learned.as_ref()?;
+        let (left, before) = (std(&self.model)?, std(&learned.prior)?);
+        Some(if left <= LEFT * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
     /// Error of the model's voltage, V, as root mean square over SOC at the temperature of its curve; `None` = not stated.
@@ -128,8 +162,8 @@ impl SourcedModel {
 
 impl ModelSource {
     fn by_range(&self, range: Option<[f64; 2]>, value: f64) -> KnownBy {
-        match (self.origin, range) {
-            (ModelOrigin::Prior, _) => KnownBy::Prior,
+        match (self.state, range) {
+            (ModelState::Prior | ModelState::Unfit, None) => KnownBy::Prior,
             (_, None) => KnownBy::NotStated,
             // The ends are written with few digits.
             (_, Some([low, high])) if value >= low - ROUNDED && value <= high + ROUNDED => KnownBy::Measured,
