@@ -72,6 +72,12 @@ fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedMode
     if path.extension().is_some_and(|extension| extension == "json") {
         return of_snapshot(path, &snapshot_file::read(path).map_err(Failure::new)?, config);
     }
+    if config.is_some() {
+        return Err(Failure::new(format!(
+            "{}: is no state and no snapshot; only with these there may be a -c too",
+            path.display()
+        )));
+    }
     if path.exists() {
         return match is_configuration(path) {
             true => Ok((named(path), of_config(config::load(path)?))),

@@ -78,7 +78,7 @@ fn electrodes_say_how_the_curve_ages() {
     let good = "positive_content = [0.8531, 0.2679]\nnegative_content = [0.0335, 0.9107]";
     let model = with(good).expect("a configuration").0.monitor.model;
     // At SOC 0.5 of a cell that has lost a fifth.
-    let offset_v = |model: &CellModel| {
+    let offset_v = |model: &crate::cell::CellModel| {
         let (aged, new) = (0.8 * model.capacity_ah, model.grid_position(0.5, 25.0));
         model.aged_ocv_v(&new, aged) - model.ocv_v(&new)
     };
