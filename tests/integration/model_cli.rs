@@ -96,7 +96,7 @@ fn show_states_bands_that_are_never_negative_and_what_is_prior() {
         let mut found = Vec::new();
         numbers(&document, &mut found, "");
         let bands: Vec<_> = found.iter().filter(|(path, _)| path.contains("std")).collect();
-        assert!(bands.len() > 20 && bands.iter().all(|(_, value)| *value >= 0.0), "{source}: {bands:?}");
+        assert!(bands.len() > 5 && bands.iter().all(|(_, value)| *value >= 0.0), "{source}: {bands:?}");
         // JSON has no NaN: it would be null, which stands only where the model states no error.
         let is_stated = document["soc_error_points"].is_number();
         assert_eq!(is_stated, !source.contains("nasa"), "{source}");
@@ -121,7 +121,7 @@ fn an_exported_model_is_read_again_and_is_no_different() {
         let document = json(&["model", "compare", "--json", source, &out]);
         assert_eq!(document["ocv_v"]["rms"], 0.0, "{document}");
         assert_eq!(document["capacity"], 0.0);
-        assert!(document["rest_soc"]["worst"].as_f64().unwrap().abs() < 1e-9);
+        assert!(document["rest_soc"]["worst"].as_f64().unwrap().abs() < 1e-12);
         let first = std::fs::read_to_string(&out).unwrap();
         good(&["model", "export", &out, "-o", &again]);
         let second = std::fs::read_to_string(&again).unwrap();
@@ -176,6 +176,70 @@ fn a_source_that_is_none_is_named_with_what_is_allowed() {
     refused(2, &["model", "show"]);
     assert!(refused(78, &["model", "show", "Cargo.toml"]).contains("Cargo.toml:"));
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history there"));
+}
+
+/// A folder with a day of a vehicle of one cell, whose model was learned on board from the label alone.
+fn learned() -> Place {
+    let place = Place::new();
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    for name in ["measured.dbc", "packwatch.dbc"] {
+        std::fs::copy(config.join(name), place.path(name)).unwrap();
+    }
+    let text = std::fs::read_to_string(config.join("paper.toml")).unwrap();
+    let keys = "chemistry = \"nmc-graphite\"\nlearn_model = true";
+    let line = |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { line.to_owned() };
+    std::fs::write(place.path("pack.toml"), text.lines().map(line).collect::<Vec<_>>().join("\n")).unwrap();
+    let log = place.name("day.log.gz");
+    good(&["simulate", "ev-day", "-c", "config/paper.toml", "-o", &log, "--cycles", "1"]);
+    let (pack, snapshot) = (place.name("pack.toml"), place.name("snapshot.json"));
+    good(&["replay", "-c", &pack, &log, "--snapshot", &snapshot, "--state", &place.name("state")]);
+    place
+}
+
+#[test]
+fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
+    let place = learned();
+    let (snapshot, pack) = (place.name("snapshot.json"), place.name("pack.toml"));
+    let document = json(&["model", "show", "--json", &snapshot]);
+    assert!(["learning", "learned"].contains(&document["state"].as_str().unwrap()), "{document}");
+    assert!(document["learned"]["fits"].as_u64().unwrap() >= 1 && document["learned"]["residual_v"].is_number());
+    assert!(document["learned"]["soc_share"].as_f64().unwrap() > 0.2, "{document}");
+    let known: Vec<&str> =
+        document["curve"].as_array().unwrap().iter().map(|row| row["known_by"].as_str().unwrap()).collect();
+    assert!(known.contains(&"data") && known.contains(&"prior"), "{known:?}");
+    let prior = json(&["model", "show", "--json", &pack]);
+    let points = |document: &Value| document["soc_error_points"].as_f64().unwrap();
+    assert!(points(&document) < 0.8 * points(&prior), "{} of {}", points(&document), points(&prior));
+    let same = |of: &Value| (of["curve"].clone(), of["resistances"].clone(), of["advice"].clone());
+    assert_eq!(same(&json(&["model", "show", "--json", "--state", &place.name("state")])), same(&document));
+    let out = place.name("learned.toml");
+    good(&["model", "export", &snapshot, "-o", &out]);
+    let compared = json(&["model", "compare", "--json", &snapshot, &out]);
+    assert_eq!((&compared["ocv_v"]["rms"], &compared["capacity"]), (&Value::from(0.0), &Value::from(0.0)));
+    let exported = json(&["model", "show", "--json", &out]);
+    assert_eq!(exported["capacity_std_ah"], document["capacity_std_ah"]);
+    assert!(exported["data"].as_str().unwrap().contains("learned on board"), "{exported}");
+}
+
+#[cfg(feature = "lab")]
+#[test]
+fn the_report_says_the_same_of_the_model_as_model_show() {
+    let place = learned();
+    let page = place.name("page.html");
+    good(&["report", "-c", &place.name("pack.toml"), &place.name("day.log.gz"), "-o", &page]);
+    let from_log = std::fs::read_to_string(&page).unwrap();
+    good(&["report", "--state", &place.name("state"), "-o", &page]);
+    let from_store = std::fs::read_to_string(&page).unwrap();
+    let document = json(&["model", "show", "--json", &place.name("snapshot.json")]);
+    let advice = document["advice"].as_array().unwrap();
+    assert!(!advice.is_empty());
+    for page in [from_log, from_store] {
+        assert!(page.contains("How well do I know this battery") && page.contains("from the vehicle's own data"));
+        for it in advice {
+            let (measurement, left) = (it["measurement"].as_str().unwrap(), it["left_points"].as_f64().unwrap());
+            assert!(page.contains(&format!("<li>{measurement}: {left:.1} points are then left</li>")), "no {it}");
+        }
+    }
 }
 
 #[cfg(feature = "lab")]

@@ -200,9 +200,7 @@ impl ModelPage {
             return "\nexpected error of the SOC in use: unknown, the model states no error; `packwatch fit` writes one\n"
                 .to_owned();
         };
-        let mut text = format!(
-            "\nexpected error of the SOC in use: about {points:.1} points, before the vehicle has learned its own cells\n"
-        );
+        let mut text = format!("\nexpected error of the SOC in use: about {points:.1} points\n");
         match self.advice.is_empty() {
             true => text.push_str("no single measurement would make it much smaller\n"),
             false => text.push_str("what would help most, and what is then left\n"),

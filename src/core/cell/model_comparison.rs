@@ -9,6 +9,8 @@ use super::model_bands::CURVE_C;
 
 /// Steps of SOC over the curve.
 const CURVE_STEPS: u32 = 100;
+/// Steps of SOC in which a voltage under load is looked up: a multiple of the others.
+const READ_STEPS: u32 = 400;
 /// SOC of compared resistances, steps of 10 %.
 const RESISTANCE_STEPS: std::ops::RangeInclusive<u32> = 1..=9;
 /// Temperatures of compared resistances, degrees C, as far as both models have them.
@@ -128,18 +130,36 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     let drop_v = |model: &CellModel, soc: f64| {
         load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))
     };
+    let terminal_v =
+        |model: &CellModel, soc: f64| model.ocv_v(&model.grid_position(soc, temperature_c)) - drop_v(model, soc);
+    let places: Vec<f64> = (0..=READ_STEPS).map(|k| f64::from(k) / f64::from(READ_STEPS)).collect();
+    let readings_v: Vec<f64> = places.iter().map(|&soc| terminal_v(second, soc)).collect();
     let at = |k: u32| {
         let soc = f64::from(k) / f64::from(CURVE_STEPS);
-        let voltage_v = first.ocv_v(&first.grid_position(soc, temperature_c)) - drop_v(first, soc);
-        let mut read = second.soc_of_ocv(voltage_v, temperature_c);
-        // The drop depends on the SOC that is read: a few rounds settle, for it changes slowly.
-        for _ in 0..8 {
-            read = second.soc_of_ocv(voltage_v + drop_v(second, read), temperature_c);
-        }
-        AtSoc { soc, value: read.clamp(0.0, 1.0) - soc }
+        AtSoc { soc, value: nearest(&places, &readings_v, terminal_v(first, soc), soc) - soc }
     };
     let middle = (0..=CURVE_STEPS).map(at).filter(|at| at.soc >= MIDDLE.0 && at.soc <= MIDDLE.1);
     Difference::of(&middle.collect::<Vec<_>>())
+}
+
+/// SOC nearest to `soc` at which a model reads a voltage; where it reads it nowhere, that of the nearest voltage. Under load a voltage
+/// may be read at several: a resistance that rises with the SOC turns the curve over.
+fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
+    let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
+        let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);
+        match (low == 0.0, high == 0.0) {
+            (true, _) => Some(place[0]),
+            (_, true) => Some(place[1]),
+            _ if low.is_sign_positive() != high.is_sign_positive() => {
+                Some(place[0] + (place[1] - place[0]) * low / (low - high))
+            }
+            _ => None,
+        }
+    });
+    let found = crossings.min_by(|a, b| (a - soc).abs().total_cmp(&(b - soc).abs()));
+    let least =
+        || places.iter().zip(readings_v).min_by(|a, b| (a.1 - voltage_v).abs().total_cmp(&(b.1 - voltage_v).abs()));
+    found.or_else(|| least().map(|(place, _)| *place)).unwrap_or(soc)
 }
 
 #[cfg(test)]
@@ -153,11 +173,11 @@ mod tests {
         for model in [small_model(), Label::usual(Chemistry::LfpGraphite, 100.0).model().expect("a model")] {
             let found = ModelComparison::new(&model, &model);
             assert_eq!((found.curve.rms, found.capacity), (0.0, 0.0));
-            assert!(found.rest_soc.worst.value.abs() < 1e-9, "{:?}", found.rest_soc);
+            assert!(found.rest_soc.worst.value.abs() < 1e-12, "{:?}", found.rest_soc);
             assert!(!found.temperatures.is_empty());
             for at in found.temperatures {
                 assert_eq!((at.series.rms, at.settled.worst.value), (0.0, 0.0));
-                assert!(at.load_soc.worst.value.abs() < 1e-6, "{at:?}");
+                assert!(at.load_soc.worst.value.abs() < 1e-12, "{at:?}");
             }
         }
     }
@@ -169,9 +189,9 @@ mod tests {
         second.ocv_v.values.iter_mut().flatten().for_each(|v| *v += 0.012);
         let found = ModelComparison::new(&first, &second);
         assert!((found.curve.rms - 0.012).abs() < 1e-12 && (found.curve.worst.value - 0.012).abs() < 1e-12);
-        // 12 mV on slopes of 1.275 and 1.125 V per unit of SOC at 25 degrees C: the second model reads the SOC too low.
+        // 12 mV on slopes of 1.325 and 1.075 V per unit of SOC at 25 degrees C: the second model reads the SOC too low.
         let worst = found.rest_soc.worst.value;
-        assert!((worst + 0.012 / 1.125).abs() < 2e-4, "{worst}");
+        assert!((worst + 0.012 / 1.075).abs() < 2e-4, "{worst}");
         let mut second = first.clone();
         second.r0_ohm.values.iter_mut().flatten().for_each(|r| *r *= 2.0);
         let found = ModelComparison::new(&first, &second);

@@ -73,13 +73,24 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
         prior: Box::new(prior.clone()),
     };
     let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));
-    let method = match &own {
+    let origin = match &own {
         Some(_) => "learned on board from what the vehicle has noted of its own cells, starting from the label",
         None => "chemistry prior of the label",
     };
-    let provenance = toml::Table::from_iter([("method".to_owned(), method.into())]);
-    let source = ModelSource { state: view.state, provenance, learned: Some(learned), ..source };
+    let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);
+    let measured = own.as_ref().map_or_else(MeasuredRange::default, |_| seen_range(&learned.seen));
+    let source = ModelSource { state: view.state, provenance, measured, learned: Some(learned), ..source };
     Some(SourcedModel { model: own.unwrap_or(prior), source })
+}
+
+/// From the lowest to the highest that was seen.
+fn seen_range(seen: &Coverage) -> MeasuredRange {
+    let whole = |ranges: Vec<[f64; 2]>| Some([ranges.first()?[0], ranges.last()?[1]]);
+    MeasuredRange {
+        temperature_c: whole(seen.temperature_ranges_c()),
+        soc: whole(seen.soc_ranges()),
+        ..MeasuredRange::default()
+    }
 }
 
 /// Notes keys of a label beside a model file, which has them.

@@ -46,11 +46,12 @@ fn an_error_that_is_larger_in_the_cold_is_one_of_the_resistances_there() {
     let errors = vec![vec![0.03; 3], vec![0.005; 3]];
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), ..small_model() };
     let bands = ModelBands::new(&model);
-    assert_eq!(bands.curve_std_v(0.5), Some(0.005));
+    assert!(bands.curve_std_v(0.5).is_some_and(|v| (v - 0.005).abs() < 1e-12));
     // C/2 of 2 Ah through 0.08 ohm at 0 degrees C: 80 mV.
     let cold = bands.resistance(0.5, 0.0);
     assert!((cold.local - (0.03_f64.powi(2) - 0.005_f64.powi(2)).sqrt() / 0.08).abs() < 1e-12, "{cold:?}");
-    assert_eq!(bands.resistance(0.5, 40.0), ResistanceBand { common: 0.2, local: 0.0 });
+    let warm = bands.resistance(0.5, 40.0);
+    assert!(warm.common == 0.2 && warm.local < 1e-6, "{warm:?}");
     let (points, advice) = advise(&bands).expect("stated");
     assert!(points > 0.5 && points < 8.0, "{points}");
     let drives = advice.iter().filter_map(|it| match it.measurement {
@@ -65,7 +66,6 @@ fn each_measurement_of_the_advice_leaves_less_than_the_one_before() {
     for (chemistry, name) in Chemistry::ALL {
         let model = of_label(chemistry);
         let (points, advice) = advise(&ModelBands::new(&model)).expect("stated");
-        println!("{name}: {points:.1} points; {advice:?}");
         assert!(!advice.is_empty(), "{name}: a model of a label has much to learn");
         let mut before = points;
         for Advice { left_points, measurement } in advice {

@@ -8,8 +8,8 @@ use crate::monitor::ModelState;
 
 /// Most that the end of a measured range is rounded.
 const ROUNDED: f64 = 0.01;
-/// Part of the label's deviation that is left where data say more than the label.
-const LEFT: f64 = 0.5;
+/// Part of the label's deviation that is left where data say as much as the label.
+const LEFT: f64 = 0.7;
 /// SOC at which a temperature's resistances are judged.
 const MIDDLE_SOC: f64 = 0.5;
 
