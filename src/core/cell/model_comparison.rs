@@ -138,7 +138,7 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
         let soc = f64::from(k) / f64::from(CURVE_STEPS);
         AtSoc { soc, value: nearest(&places, &readings_v, terminal_v(first, soc), soc) - soc }
     };
-    let middle = (0..=CURVE_STEPS).map(at).filter(|at| at.soc >= MIDDLE.0 && at.soc <= MIDDLE.1);
+    let middle = (0..=CURVE_STEPS).map(at).filter(|at| (MIDDLE.0..=MIDDLE.1).contains(&at.soc));
     Difference::of(&middle.collect::<Vec<_>>())
 }
 

@@ -166,7 +166,7 @@ impl ModelSource {
             (ModelState::Prior | ModelState::Unfit, None) => KnownBy::Prior,
             (_, None) => KnownBy::NotStated,
             // The ends are written with few digits.
-            (_, Some([low, high])) if value >= low - ROUNDED && value <= high + ROUNDED => KnownBy::Measured,
+            (_, Some([low, high])) if (low - ROUNDED..=high + ROUNDED).contains(&value) => KnownBy::Measured,
             (_, Some(_)) => KnownBy::Extrapolated,
         }
     }
