@@ -219,18 +219,18 @@ fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
     let exported = json(&["model", "show", "--json", &out]);
     assert_eq!(exported["capacity_std_ah"], document["capacity_std_ah"]);
     assert!(exported["data"].as_str().unwrap().contains("learned on board"), "{exported}");
+    #[cfg(feature = "lab")]
+    check_report(&place, &document);
 }
 
+/// Checks that reports of the log and of the store give the advice of `model show`.
 #[cfg(feature = "lab")]
-#[test]
-fn the_report_says_the_same_of_the_model_as_model_show() {
-    let place = learned();
+fn check_report(place: &Place, document: &Value) {
     let page = place.name("page.html");
     good(&["report", "-c", &place.name("pack.toml"), &place.name("day.log.gz"), "-o", &page]);
     let from_log = std::fs::read_to_string(&page).unwrap();
     good(&["report", "--state", &place.name("state"), "-o", &page]);
     let from_store = std::fs::read_to_string(&page).unwrap();
-    let document = json(&["model", "show", "--json", &place.name("snapshot.json")]);
     let advice = document["advice"].as_array().unwrap();
     assert!(!advice.is_empty());
     for page in [from_log, from_store] {
