@@ -57,6 +57,19 @@ pub enum ModelState {
     Given,
 }
 
+impl ModelState {
+    /// Its code of the wire.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Prior => 0,
+            Self::Learning => 1,
+            Self::Learned => 2,
+            Self::Unfit => 3,
+            Self::Given => 4,
+        }
+    }
+}
+
 /// What is known of the cells' model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
