@@ -42,6 +42,7 @@ mod life_decodes;
 mod log_grammar;
 mod measured_life;
 mod monitor_alarms;
+mod monitor_cuts;
 mod monitor_damaged;
 mod monitor_properties;
 mod monitor_reconfigure;

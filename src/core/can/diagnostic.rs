@@ -241,6 +241,15 @@ struct Link {
     reported_at: Option<Timestamp>,
 }
 
+/// An answer under way of one controller: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkProgress {
+    controller: Controller,
+    receiver: Receiver,
+    asked: Option<([u8; 3], Timestamp)>,
+    reported_at: Option<Timestamp>,
+}
+
 /// Listens to all configured controllers.
 #[derive(Debug, Clone, Default)]
 pub struct Listener {
@@ -303,6 +312,27 @@ impl Listener {
         for (controller, counts) in counts {
             if let Some(link) = self.links.iter_mut().find(|link| link.controller == controller) {
                 link.counts = counts;
+            }
+        }
+    }
+
+    /// Answers under way.
+    pub fn progress(&self) -> Vec<LinkProgress> {
+        let of = |link: &Link| LinkProgress {
+            controller: link.controller,
+            receiver: link.receiver.clone(),
+            asked: link.asked,
+            reported_at: link.reported_at,
+        };
+        self.links.iter().map(of).collect()
+    }
+
+    /// Continues stored answers under way.
+    pub fn resume(&mut self, stored: &[LinkProgress]) {
+        for link in &mut self.links {
+            if let Some(of) = stored.iter().find(|of| of.controller == link.controller) {
+                link.receiver.resume(&of.receiver);
+                (link.asked, link.reported_at) = (of.asked, of.reported_at);
             }
         }
     }

@@ -11,11 +11,11 @@ use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
-use crate::can::diagnostic::{self, Controller, ControllerCounts, Listener};
+use crate::can::diagnostic::{self, Controller, ControllerCounts, LinkProgress, Listener};
 use crate::can::e2e::Status;
 use crate::can::encode::{self, CommandFields, CommandPlan, CommandRefusal};
-use crate::can::flood::{FloodCount, FloodGate};
-use crate::can::guard::{GuardCounts, Guards};
+use crate::can::flood::{FloodCount, FloodGate, FloodProgress};
+use crate::can::guard::{GuardCounts, GuardProgress, Guards};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
 
@@ -67,6 +67,17 @@ pub(super) struct IntakeState {
     dropped: Vec<FloodCount>,
     #[serde(default)]
     controllers: Vec<ControllerCount>,
+}
+
+/// What holds only while frames are received without a break.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct IntakeProgress {
+    protected: Vec<GuardProgress>,
+    floods: Vec<FloodProgress>,
+    answers: Vec<LinkProgress>,
+    moments: Vec<Option<Moment>>,
+    bad_command_at: Option<Timestamp>,
 }
 
 /// What came from a controller that answers diagnostic requests.
@@ -204,6 +215,28 @@ impl Intake {
             controllers: self.controllers().collect(),
         };
         (state, self.buses.clone())
+    }
+
+    /// What holds only while frames are received without a break.
+    pub(super) fn progress(&self) -> IntakeProgress {
+        IntakeProgress {
+            protected: self.guards.progress(),
+            floods: self.gate.progress(),
+            answers: self.listener.progress(),
+            moments: self.moments.clone(),
+            bad_command_at: self.bad_command_at,
+        }
+    }
+
+    /// Continues without a break.
+    pub(super) fn resume(&mut self, stored: &IntakeProgress) {
+        self.guards.resume(&stored.protected);
+        self.gate.resume(&stored.floods);
+        self.listener.resume(&stored.answers);
+        if stored.moments.len() == self.moments.len() {
+            self.moments.clone_from(&stored.moments);
+        }
+        self.bad_command_at = stored.bad_command_at;
     }
 
     pub(super) fn restore(&mut self, state: &IntakeState, buses: Buses) {

@@ -20,6 +20,7 @@ mod batch;
 mod buses;
 mod clock;
 mod config;
+mod continuation;
 mod digest;
 mod estimation;
 mod event;
@@ -263,6 +264,10 @@ impl Monitor {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sender.restart(time);
         let beginning = self.apply_pending(time, out);
+        if beginning == Beginning::Continued {
+            self.find_due();
+            return;
+        }
         let (taken, stages) = (self.clock.now, &mut self.stages);
         let away_s = time.since(taken);
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;

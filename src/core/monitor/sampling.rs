@@ -28,7 +28,7 @@ pub(super) struct Identity {
     pub(super) known: Option<f64>,
     /// Another number, and how many readings in a row have given it.
     #[serde(skip)]
-    candidate: Option<(f64, u32)>,
+    pub(super) candidate: Option<(f64, u32)>,
 }
 
 impl Identity {

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alarm_queue::AlarmKey;
 use super::batch::CellBatch;
 use super::buses::Buses;
+use super::continuation::Continuation;
 use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
@@ -57,6 +58,9 @@ pub struct Snapshot {
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
+    /// `None` in states of earlier programs, and in those for a restart.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    continuation: Option<Box<Continuation>>,
 }
 
 /// One cell of a snapshot.
@@ -108,6 +112,8 @@ impl From<InvalidState> for RestoreError {
 pub(super) enum Beginning {
     /// Without a stored state.
     New,
+    /// With a state on the same clock: as if the program had not stopped.
+    Continued,
     /// With a state that was taken at the clock's present time.
     Restored,
     /// With a state of unknown age.
@@ -145,12 +151,14 @@ impl Monitor {
             identity: sampling.identity,
             statistics: statistics.clone(),
             asleep_since: sleep.since,
+            continuation: Some(Box::new(self.continuation())),
         }
     }
 
     /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
     /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
-    /// other.
+    /// other. [`Downtime::AsStamped`] says that the same clock goes on: then frames, events and estimates are, byte for byte,
+    /// those of a monitor that had not stopped, unless the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
     /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
@@ -185,6 +193,13 @@ impl Monitor {
     /// to the caller.
     pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
+        if let (Downtime::AsStamped, Some(continuation)) = (downtime, snapshot.continuation.take()) {
+            (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
+            self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses));
+            self.stages.restore(*snapshot, now, true, out);
+            self.resume(&continuation);
+            return Beginning::Continued;
+        }
         let taken = match downtime {
             Downtime::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
             Downtime::Seconds(seconds) => Some(now.plus_secs(-seconds)),
@@ -193,7 +208,7 @@ impl Monitor {
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
         (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
         self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
-        self.stages.restore(*snapshot, now, out);
+        self.stages.restore(*snapshot, now, false, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
 }
@@ -212,8 +227,8 @@ impl Stages {
         }
     }
 
-    /// Continues from a checked and rebased snapshot.
-    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
+    /// Continues from a checked and rebased snapshot. `is_continued`: without a break, so that no frame was missed.
+    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, is_continued: bool, out: &mut Outputs) {
         let Self { sampling, estimation, learning, .. } = self;
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in snapshot.cells.iter().enumerate() {
@@ -234,16 +249,20 @@ impl Stages {
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
         self.sender.schedule = snapshot.schedule;
         self.sleep.since = snapshot.asleep_since;
-        self.restore_alarms(now, &snapshot.alarms, out);
+        self.restore_alarms(now, &snapshot.alarms, is_continued, out);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
     }
 
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, out: &mut Outputs) {
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
         self.alarming.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(state);
-        self.sender.skip_counters(time, &self.alarming.engine);
+        if !is_continued {
+            self.sender.compare_first(time);
+            self.sender.skip_counters(time, &self.alarming.engine);
+        }
+        let has_changed = !is_continued || !orphans.is_empty();
         for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
@@ -251,11 +270,19 @@ impl Stages {
             out.events.push(Event { time, kind });
             self.sender.note_change(time, AlarmKey::new(rule, severity, cell));
         }
-        self.sender.send_changed_alarms(time, &self.alarming.engine, out);
+        if has_changed {
+            self.sender.send_changed_alarms(time, &self.alarming.engine, out);
+        }
     }
 }
 
 impl Snapshot {
+    /// The state without what holds only where the same clock goes on: smaller, for a program that will be restarted.
+    #[must_use]
+    pub fn for_restart(self) -> Self {
+        Self { continuation: None, ..self }
+    }
+
     /// Whether the waiting samples are of its cells, each of another, and known to have come.
     fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();

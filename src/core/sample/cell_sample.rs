@@ -52,7 +52,7 @@ impl CellSample {
 
 /// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
 /// answer to a diagnostic request does.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Moment {
     pub(super) time: Timestamp,
     pub(super) current_a: Option<f64>,
