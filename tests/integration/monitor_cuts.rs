@@ -13,7 +13,25 @@ use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
 use crate::support::config_texts;
 use crate::support::dice::Dice;
-use crate::support::rig::{DBC, PACK, command_frame};
+use crate::support::rig::{PACK, command_frame};
+
+/// The rig's signals, with room for the protection of the current's message.
+const DBC: &str = r#"VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 256 Status: 8 A
+ SG_ Current : 16|16@1- (0.01,0) [-300|300] "A" A
+ SG_ Temperature1 : 32|8@1+ (1,-40) [-40|200] "degC" A
+ SG_ Temperature2 : 40|8@1+ (1,-40) [-40|200] "degC" A
+ SG_ Contactor : 48|4@1+ (1,0) [0|14] "" A
+BO_ 257 Pack: 8 A
+ SG_ Soc : 0|16@1+ (0.01,0) [0|120] "%" A
+BO_ 272 Cells: 8 A
+ SG_ Voltage1 : 0|16@1+ (0.0001,0) [0|5] "V" A
+ SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] "V" A
+ SG_ Serial : 32|32@1+ (1,0) [0|0] "" A
+"#;
 
 const MORE: &str = r#"
 [input.contactor]
@@ -21,6 +39,7 @@ signal = "Status.Contactor"
 open = [0]
 [input.pack_identity]
 signal = "Cells.Serial"
+accept_unprotected = true
 [[input.protected]]
 message = "Status"
 profile = "1A"
@@ -101,7 +120,7 @@ impl Record {
 }
 
 fn config() -> MonitorConfig {
-    config_texts::load(&format!("{PACK}{MORE}"), DBC).monitor
+    config_texts::load(&format!("{}{MORE}", PACK.replace("Status.Soc", "Pack.Soc")), DBC).monitor
 }
 
 /// The vehicle and its faults at one moment.
