@@ -36,6 +36,7 @@ mod gp_peer;
 mod gpr_cli;
 #[cfg(feature = "lab")]
 mod import_obdb;
+mod hostile;
 mod isotp_peer;
 mod layering;
 mod life_decodes;

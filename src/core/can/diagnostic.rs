@@ -401,10 +401,10 @@ impl Listener {
         let message = link.receiver.message();
         if let &[NEGATIVE, service, code, ..] = message {
             if code == PENDING {
-                link.counts.pending += 1;
+                link.counts.pending = link.counts.pending.saturating_add(1);
                 link.asked = link.asked.map(|(head, _)| (head, now));
             } else {
-                link.counts.refused += 1;
+                link.counts.refused = link.counts.refused.saturating_add(1);
                 link.counts.latest_refusal = Some(code);
             }
             return Heard::Refused { controller, refusal: Refusal { service, code } };
@@ -413,15 +413,15 @@ impl Listener {
             answer.question.controller == link.controller && message.starts_with(&answer.question.answer_head())
         };
         let Some(answer) = answers.iter().find(is_own) else {
-            link.counts.other += 1;
+            link.counts.other = link.counts.other.saturating_add(1);
             return Heard::Nothing;
         };
         let head = answer.question.answer_head();
-        link.counts.read += 1;
+        link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= ANSWER_WITHIN_NS
         });
-        link.counts.unasked += u64::from(!is_asked);
+        link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
         Heard::Whole { controller, answer, data: &link.receiver.message()[head.len()..], is_single }
     }
 }
@@ -445,7 +445,7 @@ impl Link {
         let Some(fault) = fault else { return };
         let place = IsoTpFault::ALL.iter().position(|other| *other == fault);
         if let Some(count) = place.and_then(|place| self.counts.lost.get_mut(place)) {
-            *count += 1;
+            *count = count.saturating_add(1);
         }
         if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= REPORT_EVERY_NS) {
             self.reported_at = Some(now);

@@ -131,12 +131,12 @@ impl FloodGate {
             bucket.spent_until = Some(spent);
             return true;
         }
-        bucket.dropped += 1;
+        bucket.dropped = bucket.dropped.saturating_add(1);
         let (frames, _) = bucket.flood.unwrap_or((0, now));
         if frames == 0 {
             self.changes.push(FloodChange { bus, id, active: true, dropped: 1 });
         }
-        bucket.flood = Some((frames + 1, now));
+        bucket.flood = Some((frames.saturating_add(1), now));
         false
     }
 

@@ -23,6 +23,8 @@ pub(super) struct Continuation {
     intake: IntakeProgress,
     identity_candidate: Option<(f64, u32)>,
     has_usable_reading: bool,
+    has_second_sender: bool,
+    is_current_doubtful: bool,
     /// Every alarm, also those at rest, with the latest value.
     alarms: Vec<RunningAlarm>,
     inputs_shown_at: Timestamp,
@@ -42,6 +44,8 @@ impl Monitor {
             intake: self.intake.progress(),
             identity_candidate: sampling.identity.candidate,
             has_usable_reading: sampling.has_usable_reading,
+            has_second_sender: sampling.has_second_sender,
+            is_current_doubtful: self.stages.estimation.is_current_doubtful,
             alarms: alarming.engine.running(),
             inputs_shown_at: alarming.inputs_shown_at,
             innovations_shown_at: alarming.innovations_shown_at,
@@ -59,7 +63,9 @@ impl Monitor {
         let (sampling, alarming, sender) =
             (&mut self.stages.sampling, &mut self.stages.alarming, &mut self.stages.sender);
         sampling.identity = Identity { candidate: stored.identity_candidate, ..sampling.identity };
-        sampling.has_usable_reading = stored.has_usable_reading;
+        (sampling.has_usable_reading, sampling.has_second_sender) =
+            (stored.has_usable_reading, stored.has_second_sender);
+        self.stages.estimation.is_current_doubtful = stored.is_current_doubtful;
         alarming.engine.resume(&stored.alarms);
         (alarming.inputs_shown_at, alarming.innovations_shown_at) =
             (stored.inputs_shown_at, stored.innovations_shown_at);

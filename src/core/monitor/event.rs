@@ -10,7 +10,9 @@ use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
+use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
+use crate::can::rate::SenderChange;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -217,6 +219,10 @@ pub enum EventKind {
     Protection(GuardChange),
     /// More frames of one identifier come than the limit allows; or no more.
     Flood(FloodChange),
+    /// A second sender of an unprotected input message was found, or is gone.
+    SecondSender(SenderChange),
+    /// Another sender uses our own identifiers, or does no more.
+    OwnIdentifier(OwnIdChange),
     /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
     MessageLoss(MessageLoss),
     /// Diagnostic requests are sent, or no more.

@@ -21,8 +21,14 @@ use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
-use crate::quantity::{InvalidState, Timestamp};
+use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SamplerState};
+
+/// Charge of a stored state that no current moved.
+const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
+/// Room for limits of the current that were wider when the charge was counted, and for a clock that was set.
+const CHARGE_TOLERANCE: f64 = 2.0;
+const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].
 const SNAPSHOT_VERSION: u32 = 2;
@@ -185,6 +191,9 @@ impl Monitor {
             )));
         }
         snapshot.check()?;
+        let config = sampling.sampler.config();
+        let most_a = config.current.min.abs().max(config.current.max.abs()) / f64::from(config.strings.max(1));
+        snapshot.check_charges(f64::from(config.strings.max(1)), most_a)?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
         Ok(())
     }
@@ -208,6 +217,7 @@ impl Monitor {
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
         (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
         self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
+        self.intake.senders.restart();
         self.stages.restore(*snapshot, now, false, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
@@ -245,13 +255,15 @@ impl Stages {
         sampling.sampler.restore(snapshot.sampler);
         sampling.identity = snapshot.identity;
         learning.state = snapshot.learning;
+        // Earlier programs combined cells beyond empty and full.
+        learning.state.pack = learning.state.pack.filter(|pack| (0.0..=1.0).contains(&pack.soc));
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
         self.sender.schedule = snapshot.schedule;
         self.sleep.since = snapshot.asleep_since;
         self.restore_alarms(now, &snapshot.alarms, is_continued, out);
         self.statistics = snapshot.statistics;
-        self.statistics.restores += 1;
+        self.statistics.restores = self.statistics.restores.saturating_add(1);
     }
 
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
@@ -293,13 +305,29 @@ impl Snapshot {
     /// Checks that every number is possible.
     fn check(&self) -> Result<(), RestoreError> {
         for (cell, stored) in self.cells.iter().enumerate() {
-            let at_cell =
-                |InvalidState { what, found, allowed }| RestoreError::Number { what, cell: Some(cell), found, allowed };
-            stored.check().map_err(at_cell)?;
+            stored.check().map_err(|invalid| at_cell(cell, invalid))?;
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
         self.sampler.check()?;
+        // Stamps differ by what the clock's range holds.
+        bounds::STAMP_NS.check("the time of the state, ns", self.time.nanos() as f64)?;
         Ok(self.learning.check()?)
+    }
+
+    /// Checks that the charge between a moment of the past and the state is one that a current of at most `most_a` moves.
+    /// Only its differences mean anything, so that each of both numbers alone may be what it likes.
+    fn check_charges(&self, strings: f64, most_a: f64) -> Result<(), RestoreError> {
+        let charge_as = self.sampler.charge_as() / strings;
+        let check = |time: Timestamp, before_as: f64| {
+            let passed_s = self.time.since(time).abs() + CHARGE_TOLERANCE_S;
+            let moved_as = charge_as - before_as;
+            let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;
+            InvalidState::unless(is_possible, CHARGE, moved_as / 3600.0, "Ah that the largest plausible current moves")
+        };
+        for (cell, consumed) in self.cells.iter().enumerate().filter_map(|(i, cell)| Some((i, cell.consumed?))) {
+            check(consumed.time, consumed.charge_as).map_err(|invalid| at_cell(cell, invalid))?;
+        }
+        Ok(self.learning.learner.marks().try_for_each(|(time, charge_as)| check(time, charge_as))?)
     }
 
     /// Moves every stamp by `by_nanos`.
@@ -323,7 +351,7 @@ impl LearningState {
         self.learner.check()?;
         self.recharge.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
-        InvalidState::unless_natural("the recharge period", self.recharge_period_s.unwrap_or(0.0))?;
+        bounds::TIME_S.check_all("the recharge period", self.recharge_period_s)?;
         check_positive("the normalised recharge period", self.normalised_recharge)
     }
 }
@@ -332,19 +360,23 @@ impl StoredCell {
     fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
         self.model_check.check()?;
-        InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;
+        bounds::STORED_SOC.check("the SOC of a full cell", self.health.full_soc)?;
         check_positive("the usable capacity", self.health.usable)?;
         check_positive("the resistance of discharge", self.health.discharge_resistance)?;
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
-        InvalidState::unless_number("the charge taken in", charge_as)?;
-        InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
+        bounds::CHARGE_AS.check("the charge taken in", charge_as)?;
+        bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {
         let forecast = self.forecast.clone();
         forecast.map_or_else(|| CellLife::new(model, config), |forecast| CellLife::restore(forecast, config))
     }
+}
+
+fn at_cell(cell: usize, InvalidState { what, found, allowed }: InvalidState) -> RestoreError {
+    RestoreError::Number { what, cell: Some(cell), found, allowed }
 }
 
 /// Checks that mean and variance are 0 or more.

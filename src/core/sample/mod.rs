@@ -11,6 +11,7 @@ pub mod cell_sample;
 pub mod charge;
 pub mod config;
 pub mod counts;
+mod frozen;
 pub mod sampler;
 pub mod signal;
 

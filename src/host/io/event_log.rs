@@ -9,6 +9,8 @@ use crate::alarm::{Change, Severity};
 use crate::can::diagnostic::MessageLoss;
 use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
+use crate::can::own_frames::OwnIdChange;
+use crate::can::rate::SenderChange;
 use crate::can::guard::GuardChange;
 use crate::can::poll::PollChange;
 use crate::config::VehicleIdentity;
@@ -106,6 +108,18 @@ impl EventLog {
             }
             EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
+            EventKind::SecondSender(SenderChange { bus, id, active: true, frames_per_s, expected_per_s }) => {
+                tracing::warn!(interface = self.name(bus), %id, frames_per_s, expected_per_s, "second sender");
+            }
+            EventKind::SecondSender(SenderChange { bus, id, .. }) => {
+                tracing::info!(interface = self.name(bus), %id, "second sender gone");
+            }
+            EventKind::OwnIdentifier(OwnIdChange { bus, id, active: true, .. }) => {
+                tracing::warn!(interface = self.name(bus), %id, "another sender uses an identifier of ours");
+            }
+            EventKind::OwnIdentifier(OwnIdChange { bus, id, frames, .. }) => {
+                tracing::info!(interface = self.name(bus), %id, frames, "no other sender uses identifiers of ours");
             }
             EventKind::MessageLoss(MessageLoss { bus, id, fault, lost }) => {
                 tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());

@@ -15,6 +15,7 @@ fn limits(min: f64, max: f64, max_age_s: f64) -> Limits {
 
 fn config() -> SampleConfig {
     SampleConfig {
+        voltage_noise_v: 0.005,
         cells: 2,
         voltage_source: VoltageSource::Cells,
         strings: 1,
