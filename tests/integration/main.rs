@@ -34,9 +34,9 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+mod hostile;
 #[cfg(feature = "lab")]
 mod import_obdb;
-mod hostile;
 mod isotp_peer;
 mod layering;
 mod life_decodes;

@@ -4,11 +4,11 @@
 //! is put through random drives, faults, holes, sleep and clocks that are set back. One monitor runs through; the other is
 //! replaced by its own snapshot (through JSON) at random inputs. `PACKWATCH_CUTS` sets the number of cuts.
 
+use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{BusEvent, Command, Downtime, Input, Monitor, MonitorConfig, Outputs, Snapshot};
-use packwatch::alarm::{Rule, Selector};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
 use crate::support::config_texts;
@@ -212,7 +212,9 @@ impl Vehicle {
             0 => self.now_ns += [700_000_000, 6_000_000_000, 3_600_000_000_000][dice.below(3)],
             1 => self.now_ns -= [200_000_000, 4_000_000_000][dice.below(2)],
             2 => records.push(Record::Other(Input::UnknownGap { time })),
-            3 => records.push(Record::Other(Input::Command { time, command: Command::Acknowledge(Selector::default()) })),
+            3 => {
+                records.push(Record::Other(Input::Command { time, command: Command::Acknowledge(Selector::default()) }))
+            }
             4 => records.push(Record::Other(Input::Command { time, command: Command::Clear(Selector::default()) })),
             5 => {
                 let (rule, seconds) = (Rule::SocLow, dice.between(0.0, 5.0));

@@ -390,8 +390,12 @@ impl Poller {
 
     /// The question to ask next and when.
     fn next(&self) -> Option<(usize, Timestamp)> {
-        let waiting =
-            self.progress.items.iter().enumerate().filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
+        let waiting = self
+            .progress
+            .items
+            .iter()
+            .enumerate()
+            .filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
         waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
     }
 

@@ -157,7 +157,7 @@ impl SecondSenders {
         self.next_end = self.rates.iter().filter_map(|rate| rate.window_from).min();
     }
 
-    /// After time without listening, or a step of the clock: counting begins anew. Rates stay, and so does a second sender until
+    /// After time without listening, or a step of the clock: counting begins again. Rates stay, and so does a second sender until
     /// enough windows have come without.
     pub fn restart(&mut self) {
         for rate in &mut self.rates {
@@ -240,9 +240,8 @@ impl MessageRate {
     fn end_window(&mut self, expected: Option<f64>, changes: &mut Vec<SenderChange>) {
         let frames = f64::from(self.frames);
         let signs = f64::from(self.short.max(self.contradictions));
-        let is_excess = expected.is_some_and(|expected| {
-            frames > EXCESS * expected + DELAYED && signs >= (SIGNS * expected).max(1.0)
-        });
+        let is_excess = expected
+            .is_some_and(|expected| frames > EXCESS * expected + DELAYED && signs >= (SIGNS * expected).max(1.0));
         (self.excess, self.calm) = match is_excess {
             true => (self.excess.saturating_add(1), 0),
             false => (0, self.calm.saturating_add(1)),

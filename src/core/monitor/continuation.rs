@@ -1,8 +1,8 @@
-//! The part of a snapshot that holds only where the same clock goes on: with it a restored monitor continues byte-identical.
+//! The part of a snapshot that holds only where the same clock continues: with it a restored monitor continues byte-identical.
 //!
 //! In: a monitor between two inputs. Out: sequence counters, budgets, messages under way, shown values. A program that was
 //! restarted ([`Downtime::Seconds`](super::Downtime), [`Downtime::Unknown`](super::Downtime)) has missed frames and has another
-//! clock: it leaves this part out, waits for first frames again, and compares every value anew.
+//! clock: it leaves this part out, waits for first frames again, and compares every value again.
 
 use serde::{Deserialize, Serialize};
 

@@ -10,7 +10,6 @@ use super::buses::Buses;
 use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
-use crate::can::{CanId, Frame};
 use crate::can::diagnostic::{self, Controller, ControllerCounts, LinkProgress, Listener};
 use crate::can::e2e::Status;
 use crate::can::encode::{self, CommandFields, CommandPlan, CommandRefusal};
@@ -18,6 +17,7 @@ use crate::can::flood::{FloodCount, FloodGate, FloodProgress};
 use crate::can::guard::{GuardCounts, GuardProgress, Guards};
 use crate::can::own_frames::{OwnFrames, OwnFramesState};
 use crate::can::rate::{MessageRate, SecondSenders};
+use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
 

@@ -163,7 +163,7 @@ impl Monitor {
 
     /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
     /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
-    /// other. [`Downtime::AsStamped`] says that the same clock goes on: then frames, events and estimates are, byte for byte,
+    /// other. [`Downtime::AsStamped`] says that the same clock continues: then frames, events and estimates are, byte for byte,
     /// those of a monitor that had not stopped, unless the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
@@ -289,7 +289,7 @@ impl Stages {
 }
 
 impl Snapshot {
-    /// The state without what holds only where the same clock goes on: smaller, for a program that will be restarted.
+    /// The state without what holds only where the same clock continues: smaller, for a program that will be restarted.
     #[must_use]
     pub fn for_restart(self) -> Self {
         Self { continuation: None, ..self }

@@ -3,13 +3,13 @@
 use super::stages::Stages;
 use super::{ControllerCount, Estimate, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
+use crate::can::CanId;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
-use crate::can::CanId;
 use crate::quantity::BusIndex;
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};

@@ -19,13 +19,14 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 const MIN_READINGS: u32 = 20;
 /// Time over which they were, s: a constant load of a few seconds is usual.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Times the voltages turned back.
-const MIN_REVERSALS: u32 = 4;
+/// Times the voltages turned back: one stop of a vehicle is two, braking, accelerating and cruising. A vehicle that cruises is not
+/// judged, nor is its current wrong then.
+const MIN_REVERSALS: u32 = 2;
 /// Step that is no noise of a voltage, in its standard deviations.
 const STEP_SIGMA: f64 = 5.0;
 /// Least step, V: less may be a charger's ripple.
 const MIN_STEP_V: f64 = 0.01;
-/// Cells of which the median is taken: the first ones, as many as tell a glitch from a load.
+/// Cells of which the median is taken: the first ones, as many as separate a glitch from a load.
 const MAX_MEDIAN: usize = 15;
 /// Without a change of the current for longer than this between two readings the time in between is not judged, s.
 const MAX_PAUSE_S: f64 = 5.0;
@@ -83,6 +84,8 @@ pub(super) struct FrozenCheck {
     reversals: Reversals,
     /// Voltages of the round at hand, V, at most [`MAX_MEDIAN`]; the first cell begins a round.
     round_v: Vec<f64>,
+    /// Median of the round before, V.
+    median_v: f64,
     is_frozen: bool,
 }
 
@@ -102,7 +105,12 @@ impl FrozenCheck {
     pub(super) fn handle_current(&mut self, now: Timestamp, current_a: f64) -> bool {
         let is_paused = now.since(self.latest) > MAX_PAUSE_S;
         if self.current_a != Some(current_a) || (is_paused && !self.is_frozen) {
-            *self = Self { current_a: Some(current_a), since: now, round_v: std::mem::take(&mut self.round_v), ..Self::default() };
+            *self = Self {
+                current_a: Some(current_a),
+                since: now,
+                round_v: std::mem::take(&mut self.round_v),
+                ..Self::default()
+            };
             self.round_v.clear();
         }
         (self.latest, self.readings) = (now, self.readings.saturating_add(1));
@@ -126,9 +134,13 @@ impl FrozenCheck {
     }
 
     fn end_round(&mut self, step_v: f64) {
-        let middle = self.round_v.len() / 2;
-        let (_, median, _) = self.round_v.select_nth_unstable_by(middle, f64::total_cmp);
-        let median = *median;
+        self.round_v.sort_unstable_by(f64::total_cmp);
+        let cells = self.round_v.len();
+        // Of two middle cells the one that has moved less: a load moves both.
+        let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
+        let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
+        let median = if is_low_nearer { low } else { high };
+        self.median_v = median;
         self.round_v.clear();
         self.reversals.handle(median, step_v);
     }
@@ -145,10 +157,16 @@ impl FrozenCheck {
     /// Checks a stored state; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.reversals.range_v.unwrap_or_default();
-        bounds::VOLTAGE_V.check_all("a voltage beside a constant current", self.round_v.iter().copied().chain([low, high]))?;
+        bounds::VOLTAGE_V
+            .check_all("a voltage beside a constant current", self.round_v.iter().copied().chain([low, high]))?;
         bounds::CURRENT_A.check_all("a constant current", self.current_a)?;
         let cells = self.round_v.len() as f64;
-        InvalidState::unless(self.round_v.len() <= MAX_MEDIAN, "the cells beside a constant current", cells, "at most 15")
+        InvalidState::unless(
+            self.round_v.len() <= MAX_MEDIAN,
+            "the cells beside a constant current",
+            cells,
+            "at most 15",
+        )
     }
 }
 
@@ -175,7 +193,11 @@ mod tests {
     #[test]
     fn a_frozen_current_is_found_by_the_voltages_within_a_minute() {
         for frozen_a in [0.0, 12.3] {
-            let found = found_s(120, |time_s| if time_s < 30.0 { load_a(time_s) } else { frozen_a }, |time_s| 3.7 - 1.5e-3 * load_a(time_s));
+            let found = found_s(
+                120,
+                |time_s| if time_s < 30.0 { load_a(time_s) } else { frozen_a },
+                |time_s| 3.7 - 1.5e-3 * load_a(time_s),
+            );
             assert!(found.is_some_and(|found_s| found_s > 30.0 && found_s < 90.0), "{found:?}");
         }
     }

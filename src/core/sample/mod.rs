@@ -8,6 +8,7 @@
 //! * [`sampler`] holds one signal per channel and combines samples.
 
 pub mod cell_sample;
+mod channels;
 pub mod charge;
 pub mod config;
 pub mod counts;

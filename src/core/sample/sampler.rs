@@ -12,8 +12,9 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::cell_sample::{CellSample, Moment};
+use super::channels::{channels, limits, should_move_s};
 use super::charge::{ChargeCounter, ChargeTotals};
-use super::config::{Limits, SampleConfig, VoltageSource};
+use super::config::{SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::frozen::{self, FrozenCheck};
 use super::signal::Signal;
@@ -566,49 +567,6 @@ impl Sampler {
                 Some(first + found)
             }
         }
-    }
-}
-
-fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
-    match channel {
-        Channel::Current => &config.current,
-        Channel::Temperature(_) => &config.temperature,
-        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
-            &config.voltage
-        }
-        Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
-        Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
-        Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
-    }
-}
-
-/// Every channel in use, in the order of the signals.
-fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
-    let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
-    let mut channels = vec![Channel::Current];
-    channels.extend((0..sensors).map(|sensor| Channel::Temperature(SensorIndex(narrow(sensor)))));
-    match config.voltage_source {
-        VoltageSource::Cells => channels.extend((0..config.cells).map(|cell| Channel::CellVoltage(CellIndex(cell)))),
-        VoltageSource::PackTotal { .. } => channels.push(Channel::PackVoltage),
-    }
-    channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
-    channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
-    channels.extend(config.contactor.as_ref().map(|_| Channel::Contactor));
-    channels
-}
-
-/// Clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
-/// constant, so only discharging counts for a voltage; temperature and current should move while current flows.
-fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
-    match channel {
-        Channel::Current | Channel::Temperature(_) => totals.flowing_s,
-        Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // No rule says when they should move.
-        Channel::ReportedSoc
-        | Channel::ReportedSoh
-        | Channel::SupplyVoltage
-        | Channel::PackIdentity
-        | Channel::Contactor => 0.0,
     }
 }
 

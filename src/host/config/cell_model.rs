@@ -15,10 +15,10 @@ use super::schema::{SchemaReader, Section as _, SectionInfo, section};
 use super::setting::ValueRange::{Above, Any, Between, NotEmpty};
 use super::setting::{Setting, ValueFault, ValueRange, in_range, typed, within};
 use super::{ConfigFaults, ConfigFiles, ReadFile, Sources};
-use crate::quantity::bounds;
 use crate::cell::{
     AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, NegativeMaterial, PositiveMaterial, Table, Thermal,
 };
+use crate::quantity::bounds;
 
 section! {
     /// A cell type.

@@ -33,9 +33,9 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::can::CanId;
 use crate::can::dbc::Database;
 use crate::cell::CellModel;
-use crate::can::CanId;
 use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 

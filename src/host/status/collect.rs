@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
-    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
-    StoreStatus, VERSION, Intruder, IntruderKind,
+    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, Intruder, IntruderKind, LossStatus,
+    MessageFlood, MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters,
+    StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::CanId;

@@ -70,11 +70,13 @@ impl NumberKey {
     }
 }
 
+/// Any order of magnitude.
+fn magnitude(dice: &mut Dice, low: f64, high: f64) -> f64 {
+    dice.between(low.ln(), high.ln()).exp()
+}
+
 /// A cell model between coin cell and bar of copper.
-fn cell_model(dice: &mut Dice) -> String {
-    let magnitude = |dice: &mut Dice, low: f64, high: f64| dice.between(low.ln(), high.ln()).exp();
-    let is_usual = !dice.one_in(4);
-    let capacity_ah = if is_usual { magnitude(dice, 1.0, 100.0) } else { magnitude(dice, 1.1e-3, 0.9e5) };
+fn cell_model(dice: &mut Dice, capacity_ah: f64, is_usual: bool) -> String {
     let (low_ohm, high_ohm) = if is_usual { (1e-4, 0.2) } else { (1e-9, 1e3) };
     let (low_f, high_f) = if is_usual { (1e2, 1e5) } else { (1e-6, 1e12) };
     let row = |dice: &mut Dice, low, high| {
@@ -89,23 +91,41 @@ fn cell_model(dice: &mut Dice) -> String {
         row(dice, low_ohm, high_ohm),
     );
     for _ in 0..=dice.below(3) {
-        let rows = [(low_ohm, high_ohm), (low_f, high_f)].map(|(low, high)| format!("{}, {}", row(dice, low, high), row(dice, low, high)));
+        let rows = [(low_ohm, high_ohm), (low_f, high_f)]
+            .map(|(low, high)| format!("{}, {}", row(dice, low, high), row(dice, low, high)));
         text += &format!("[[tables.branches]]\nr_ohm = [{}]\nc_farad = [{}]\n", rows[0], rows[1]);
     }
     if dice.one_in(2) {
-        text += &format!("[thermal]\nheat_capacity_j_per_k = {:e}\nresistance_k_per_w = {:e}\n", magnitude(dice, 1.0, 1e4), magnitude(dice, 0.1, 1e3));
+        text += &format!(
+            "[thermal]\nheat_capacity_j_per_k = {:e}\nresistance_k_per_w = {:e}\n",
+            magnitude(dice, 1.0, 1e4),
+            magnitude(dice, 0.1, 1e3)
+        );
     }
     text
 }
 
 /// A configuration with a few, or many, of its numbers drawn.
 fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
+    let is_usual = !dice.one_in(4);
+    let capacity_ah = if is_usual { magnitude(dice, 1.0, 100.0) } else { magnitude(dice, 1.1e-3, 0.9e5) };
     let share = [2, 5, 20][dice.below(3)];
     let base = PACK.replace("cells/example_nmc_2600.toml", "cell.toml");
     let mut tables: Vec<(&str, String)> = Vec::new();
     for key in keys.iter().filter(|key| key.table != "usable") {
         if dice.one_in(share) {
-            let line = format!("{} = {:e}\n", key.name, key.draw(dice));
+            let value = match key.name {
+                "initial_capacity_ah" => capacity_ah * magnitude(dice, 0.051, 2.95),
+                "rated_capacity_ah" => capacity_ah * magnitude(dice, 0.35, 2.95),
+                "min_v" | "from_soc" => dice.between(0.0, 0.4),
+                "max_v" => dice.between(4.3, 1000.0),
+                "min_c" => dice.between(-100.0, -10.0),
+                "max_c" | "to_soc" => dice.between(0.5, 1.0) * key.high,
+                // Of a cell without a model file.
+                "voltage_min_v" | "voltage_max_v" => continue,
+                _ => key.draw(dice),
+            };
+            let line = format!("{} = {value:e}\n", key.name);
             match tables.iter_mut().find(|(table, _)| *table == key.table) {
                 Some((_, text)) => *text += &line,
                 None => tables.push((key.table, line)),
@@ -113,10 +133,16 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
         }
     }
     if dice.one_in(3) {
-        tables.push(("usable", format!("current_a = {:e}\ntemperature_c = 25.0\ncutoff_v = 3.0\n", dice.between(0.01, 300.0))));
+        tables.push((
+            "usable",
+            format!("current_a = {:e}\ntemperature_c = 25.0\ncutoff_v = 3.0\n", dice.between(0.01, 300.0)),
+        ));
     }
     if dice.one_in(8) {
-        tables.iter_mut().filter(|(table, _)| *table == "capacity").for_each(|(_, text)| *text += "method = \"nominal\"\n");
+        tables
+            .iter_mut()
+            .filter(|(table, _)| *table == "capacity")
+            .for_each(|(_, text)| *text += "method = \"nominal\"\n");
         tables.push(("estimator", "capacity_state = \"held\"\n".to_owned()));
     }
     let mut text = base;
@@ -137,7 +163,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
             None => format!("{text}{header}{lines}"),
         };
     }
-    (text, cell_model(dice))
+    (text, cell_model(dice, capacity_ah, is_usual))
 }
 
 /// Random readings through an accepted configuration; then its own state.
@@ -149,7 +175,8 @@ fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
         if dice.one_in(5) {
             current_a = [0.0, 300.0, -300.0, dice.between(-300.0, 300.0), dice.between(-1.0, 1.0)][dice.below(5)];
         }
-        let voltage = |dice: &mut Dice| [dice.between(0.0, 5.0), dice.between(3.0, 4.2), dice.between(3.6, 3.7)][dice.below(3)];
+        let voltage =
+            |dice: &mut Dice| [dice.between(0.0, 5.0), dice.between(3.0, 4.2), dice.between(3.6, 3.7)][dice.below(3)];
         let values = [
             (Channel::Current, (!dice.one_in(9)).then_some(current_a)),
             (Channel::Temperature(SensorIndex(0)), (!dice.one_in(3)).then(|| dice.between(-40.0, 120.0))),

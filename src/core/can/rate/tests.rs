@@ -36,7 +36,8 @@ fn watched(cycle_s: Option<f64>) -> SecondSenders {
 
 #[test]
 fn a_second_sender_is_found_within_five_seconds_and_its_end_is_noticed() {
-    for (first_ms, second_ms) in [(10.0, 1.0), (100.0, 1.0), (100.0, 10.0), (100.0, 100.0), (10.0, 10.0), (20.0, 30.0)] {
+    for (first_ms, second_ms) in [(10.0, 1.0), (100.0, 1.0), (100.0, 10.0), (100.0, 100.0), (10.0, 10.0), (20.0, 30.0)]
+    {
         let found = run(&mut watched(None), &[(first_ms, 0.0, 120.0, 0.05), (second_ms, 60.0, 90.0, 0.05)]);
         let [(begun_s, true), (ended_s, false)] = found[..] else { panic!("{first_ms} {second_ms}: {found:?}") };
         assert!(begun_s > 60.0 && begun_s < 65.0, "{first_ms} {second_ms}: {begun_s}");

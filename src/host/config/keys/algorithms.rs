@@ -11,8 +11,8 @@ use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Any, Between};
 use crate::config::setting::within;
 use crate::filter::ScalarGaussian;
-use crate::quantity::bounds;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
+use crate::quantity::bounds;
 
 /// A month of 365.25 / 12 days.
 const SECONDS_PER_MONTH: f64 = 2_629_800.0;

@@ -10,7 +10,7 @@ fn faults_of_a_cell_model() {
         (
             "capacity_ah = 1.9",
             "capacity_ah = -1.9",
-            "cell.toml:4: capacity_ah = -1.9, must be above 0 and at most 100000",
+            "cell.toml:4: capacity_ah = -1.9, must be 0.001 to 100000",
         ),
         (
             "voltage_max_v = 4.2",
