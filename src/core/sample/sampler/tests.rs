@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::sample::ContactorConfig;
+use crate::sample::Limits;
 
 fn at(seconds: f64) -> Timestamp {
     Timestamp::from_secs(seconds)
