@@ -134,7 +134,7 @@ pub const RESISTANCES: usize = 4;
 pub const TAU_S: [f64; RESISTANCES - 1] = [RESISTANCE[1].tau_s, RESISTANCE[2].tau_s, RESISTANCE[3].tau_s];
 
 /// SOC nodes of [`ResistanceFactors`].
-pub const FACTOR_SOC: [f64; 5] = [0.0, 0.1, 0.3, 0.7, 1.0];
+pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0];
 
 /// Resistances of a cell relative to those of its label.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -228,13 +228,14 @@ impl Label {
             drop_sqrt_s: DROP_SQRT_S,
         };
         let curve = CurveOfCells { mean_v: curve.mean_v, modes_v, rest_v, electrodes: curve.electrodes };
-        Some(self.model_of(&curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
+        Some(self.model_of(self.rated_ah, &curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
     }
 
-    /// The model of a cell with this curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
+    /// The model of a cell with this present capacity, Ah, curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
     /// temperature of the tables, counted in the model's error at a usual load.
     pub fn model_of(
         &self,
+        capacity_ah: f64,
         curve: &CurveOfCells,
         factors: &ResistanceFactors,
         drop_std: &[f64; TEMPERATURE_NODES],
@@ -243,8 +244,8 @@ impl Label {
         let rows = vec![curve.mean_v.clone(); TEMPERATURE_C.len()];
         let mut aged_ocv = curve
             .electrodes
-            .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, self.rated_ah, &rows))
-            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, self.rated_ah, &rows));
+            .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
+            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {
             let UsualResistance { ohm_ah, shape, .. } = &RESISTANCE[j];
@@ -274,7 +275,7 @@ impl Label {
         CellModel {
             name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
             rated_capacity_ah: self.rated_ah,
-            capacity_ah: self.rated_ah,
+            capacity_ah,
             voltage_min_v: self.voltage_min_v,
             voltage_max_v: self.voltage_max_v,
             soc: SOC.to_vec(),

@@ -61,7 +61,7 @@ impl OwnModel {
             capacity: self.capacity.std() / self.capacity.mean,
             drop_sqrt_s: DROP_SQRT_S,
         };
-        let mut model = label.model_of(&curve, &self.factors, &self.drop_std, spread);
+        let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
         model.name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);
         Some(model)
     }
@@ -116,7 +116,7 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows by a model, `None` = that of the label ([`fit::Fit::cost`] without the prior); `None` when there are no rows.
+/// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density; `None` when there are no rows.
 pub fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(label, own, rows)
 }
