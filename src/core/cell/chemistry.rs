@@ -292,7 +292,7 @@ impl Label {
 }
 
 /// Load at which an error of the resistances counts as one of the model, per rated capacity: C/2.
-const USUAL_LOAD_PER_H: f64 = 0.5;
+pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 /// Shift of the curve of an ageing cell whose electrodes are not in the library.
 const AGEING_SHIFT: f64 = 0.5;

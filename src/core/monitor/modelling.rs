@@ -4,7 +4,7 @@
 //! state in which they continue, and what is known of it ([`ModelView`]). Only a pack whose cells are known by their [`Label`] has
 //! one; that of a model file is given.
 //!
-//! A model is fitted anew when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
+//! A model is fitted again when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
 //! driving. Before that the model in force and the one before it are judged on the new rows, which neither has seen: the
 //! one that predicts them worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
 //! temperature or part of the charge; the capacity is then left to the half-cycles.
@@ -55,6 +55,19 @@ pub enum ModelState {
     Unfit,
     /// From a model file: nothing is learned.
     Given,
+}
+
+impl ModelState {
+    /// Its code of the wire.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Prior => 0,
+            Self::Learning => 1,
+            Self::Learned => 2,
+            Self::Unfit => 3,
+            Self::Given => 4,
+        }
+    }
 }
 
 /// What is known of the cells' model.
@@ -142,6 +155,33 @@ impl ModellingState {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.notebook.check()?;
         self.own.iter().chain(&self.before).try_for_each(OwnModel::check)
+    }
+
+    /// What is known of cells with this label; `None` = of a model file.
+    fn view(&self, label: Option<Label>) -> ModelView<'_> {
+        let Self { notebook, own, chemistry, fits, taken_back, .. } = self;
+        let state = match (label, own) {
+            (None, _) => ModelState::Given,
+            _ if chemistry.is_some() => ModelState::Unfit,
+            (_, None) => ModelState::Prior,
+            (_, Some(own)) if own.is_settled() => ModelState::Learned,
+            _ => ModelState::Learning,
+        };
+        ModelView {
+            state,
+            label,
+            own: own.as_ref(),
+            notebook: label.map(|_| notebook),
+            chemistry: *chemistry,
+            fits: *fits,
+            taken_back: *taken_back,
+        }
+    }
+
+    /// What a stored state says; the label is that with which it was learned, else `label`. `None` without either.
+    pub(super) fn stored_view(&self, label: Option<Label>) -> Option<ModelView<'_>> {
+        let label = self.label.or(label)?;
+        Some(self.view(Some(label)))
     }
 
     fn fits_label(&self, label: &Label) -> bool {
@@ -321,23 +361,7 @@ impl Modelling {
 
     /// What is known.
     pub(super) fn view(&self) -> ModelView<'_> {
-        let ModellingState { notebook, own, chemistry, fits, taken_back, .. } = &self.state;
-        let state = match (self.label, own) {
-            (None, _) => ModelState::Given,
-            _ if chemistry.is_some() => ModelState::Unfit,
-            (_, None) => ModelState::Prior,
-            (_, Some(own)) if own.is_settled() => ModelState::Learned,
-            _ => ModelState::Learning,
-        };
-        ModelView {
-            state,
-            label: self.label,
-            own: own.as_ref(),
-            notebook: self.label.map(|_| notebook),
-            chemistry: *chemistry,
-            fits: *fits,
-            taken_back: *taken_back,
-        }
+        self.state.view(self.label)
     }
 
     /// What follows does not hang together with the rows so far.

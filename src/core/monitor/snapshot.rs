@@ -13,13 +13,13 @@ use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
-use super::modelling::ModellingState;
+use super::modelling::{ModelView, ModellingState};
 use super::sampling::Identity;
 use super::sender::Schedule;
 use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
-use crate::cell::{CellEstimator, CellModel, CellState, ModelCheck};
+use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp, bounds};
@@ -301,6 +301,17 @@ impl Snapshot {
     #[must_use]
     pub fn for_restart(self) -> Self {
         Self { continuation: None, ..self }
+    }
+
+    /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
+    /// model file, or the label is not known.
+    ///
+    /// # Errors
+    /// The first number that is out of range.
+    pub fn model(&self, label: Option<Label>) -> Result<Option<ModelView<'_>>, RestoreError> {
+        let Some(stored) = &self.modelling else { return Ok(None) };
+        stored.check()?;
+        Ok(stored.stored_view(label))
     }
 
     /// Whether the waiting samples are of its cells, each of another, and known to have come.
