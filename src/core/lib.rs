@@ -25,7 +25,9 @@
 //! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
 //! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
-//! | a plausibility check of a signal | `sample/signal.rs` |
+//! | a plausibility check of a signal | `sample/signal.rs`; of the current by the voltages: `sample/frozen.rs` |
+//! | what counts as a second sender | `can/rate.rs`, `can/own_frames.rs` |
+//! | a physical bound | `quantity/bounds.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |

@@ -34,6 +34,7 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+mod hostile;
 #[cfg(feature = "lab")]
 mod import_obdb;
 mod isotp_peer;
@@ -43,6 +44,7 @@ mod log_grammar;
 mod measured_life;
 mod model_cli;
 mod monitor_alarms;
+mod monitor_cuts;
 mod monitor_damaged;
 mod monitor_properties;
 mod monitor_reconfigure;

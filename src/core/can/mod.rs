@@ -15,7 +15,9 @@ pub mod guard;
 mod id_table;
 pub mod isotp;
 pub mod j1939;
+pub mod own_frames;
 pub mod poll;
+pub mod rate;
 pub mod signal;
 pub mod unit;
 

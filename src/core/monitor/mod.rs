@@ -20,6 +20,7 @@ mod batch;
 mod buses;
 mod clock;
 mod config;
+mod continuation;
 mod digest;
 mod estimation;
 mod event;
@@ -90,6 +91,9 @@ impl Monitor {
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
         let (first_event, first_frame) = (out.events.len(), out.frames.len());
         self.dispatch(input, out);
+        for sent in &out.frames[first_frame..] {
+            self.intake.own.note_sent(sent.time, sent.bus, &sent.frame);
+        }
         if self.stages.sender.poller.is_some() {
             // Own requests do not come back from the bus: their answers were asked for all the same.
             for sent in &out.frames[first_frame..] {
@@ -150,7 +154,8 @@ impl Monitor {
                 let CommandOutcome { changed, refused } = stages.handle_command(now, Source::Bus(bus), command, out);
                 (changed, refused)
             });
-            stages.statistics.bad_commands += u64::from(outcome.is_err());
+            let bad_commands = &mut stages.statistics.bad_commands;
+            *bad_commands = bad_commands.saturating_add(u64::from(outcome.is_err()));
             let counter_expected = intake.next_command_counter(commands);
             stages.sender.send_reply(now, bus, &ReplyFields { outcome, command, counter_expected }, out);
             return;
@@ -163,7 +168,11 @@ impl Monitor {
                 stages.end_bus_sleep(now, out);
             }
         }
+        let step_a = stages.sampling.sampler.flow_a();
         config.input.decode(bus, frame, |Reading { channel, value }| {
+            if let (Channel::Current, Ok(current_a)) = (channel, value) {
+                intake.senders.note_current(bus, frame.id(), current_a, step_a);
+            }
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
         if !intake.listener.is_empty() {
@@ -220,6 +229,7 @@ impl Monitor {
                         intake.restart(now, out);
                         stages.begin_bus_sleep(now, out);
                     }
+                    stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
                 stages.send_due(now, out);
@@ -265,6 +275,10 @@ impl Monitor {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sender.restart(time);
         let beginning = self.apply_pending(time, out);
+        if beginning == Beginning::Continued {
+            self.find_due();
+            return;
+        }
         let (taken, stages) = (self.clock.now, &mut self.stages);
         let away_s = time.since(taken);
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;

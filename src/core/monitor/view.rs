@@ -3,12 +3,14 @@
 use super::stages::Stages;
 use super::{ControllerCount, Estimate, ModelView, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
+use crate::can::CanId;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
+use crate::quantity::BusIndex;
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 
@@ -100,6 +102,21 @@ impl Monitor {
     /// Input messages with dropped frames, because more came than the limit allows.
     pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.intake.dropped()
+    }
+
+    /// Interfaces and input messages with a second sender.
+    pub fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.intake.second_senders()
+    }
+
+    /// Interfaces on which another sender uses our own identifiers, with the latest of these.
+    pub fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.intake.own_id_uses()
+    }
+
+    /// Whether the current's reading is frozen: the voltages show another load.
+    pub fn is_current_frozen(&self) -> bool {
+        self.stages.sampling.sampler.is_current_frozen()
     }
 
     /// What came from each controller that answers diagnostic requests.

@@ -77,6 +77,8 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         }],
         asleep_since: None,
         poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
+        intruders: Vec::new(),
+        current_frozen: false,
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
         store: Some(StoreStatus {
