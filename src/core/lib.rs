@@ -28,7 +28,9 @@
 //! | another end-to-end profile | `can/e2e.rs` |
 //! | authentication of frames; which commands are executed | `can/secoc.rs`; `monitor/command_gate.rs` |
 //! | what is kept of exchanged packs | `monitor/pack_memory.rs` |
-//! | a plausibility check of a signal | `sample/signal.rs` |
+//! | a plausibility check of a signal | `sample/signal.rs`; of the current by the voltages: `sample/frozen.rs` |
+//! | what counts as a second sender | `can/rate.rs`, `can/own_frames.rs` |
+//! | a physical bound | `quantity/bounds.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |

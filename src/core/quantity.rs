@@ -4,6 +4,10 @@
 //! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
 //! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
 //! * SOC and SOH are fractions 0..1.
+//!
+//! [`bounds`] states what each of them can be at most.
+
+pub mod bounds;
 
 use serde::{Deserialize, Serialize};
 
@@ -80,7 +84,7 @@ impl InvalidState {
 
     /// Rejects a number that is not finite, or whose square or cube may overflow. Measured values stay far below the bound.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
-        Self::unless(found.abs() <= 1e20, what, found, "at most 1e20 in size")
+        bounds::NUMBER.check(what, found)
     }
 
     /// Rejects a number as [`Self::unless_number`] does, and negative ones.
@@ -105,7 +109,7 @@ impl InvalidState {
 
     /// Rejects a capacity that no cell can have, Ah.
     pub fn unless_capacity(what: &'static str, found: f64) -> Result<(), Self> {
-        Self::unless((1e-6..=1e9).contains(&found), what, found, "1e-6 to 1e9 Ah")
+        bounds::CAPACITY_AH.check(what, found)
     }
 }
 

@@ -307,7 +307,7 @@ impl Store {
     fn document(&self, monitor: &Monitor, now: Timestamp) -> StateDocument {
         let stamp = Stamp::now(now, self.boot);
         let folder = self.folder.to_string_lossy().into_owned();
-        StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot()) }
+        StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot().for_restart()) }
     }
 }
 

@@ -94,7 +94,7 @@ fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
         at("pack.toml", 2) + "pack.cells = 0, must be 1 to 1024",
         at("pack.toml", 6) + "input.speed is not a known key",
         at("cell.toml", 1) + "tables.soc is missing",
-        at("cell.toml", 3) + "rated_capacity_ah = 0, must be above 0 and at most 100000",
+        at("cell.toml", 3) + "rated_capacity_ah = 0, must be 0.001 to 100000",
         at("pack.dbc", 3),
     ];
     for beginning in beginnings {

@@ -35,6 +35,7 @@ mod gp_measured;
 mod gp_peer;
 #[cfg(feature = "lab")]
 mod gpr_cli;
+mod hostile;
 #[cfg(feature = "lab")]
 mod import_obdb;
 mod isotp_peer;
@@ -44,12 +45,14 @@ mod log_grammar;
 mod measured_life;
 mod model_cli;
 mod monitor_alarms;
+mod monitor_cuts;
 mod monitor_damaged;
 mod monitor_properties;
 mod monitor_reconfigure;
 mod monitor_restart;
 mod monitor_scenarios;
 mod monitor_statistics;
+mod on_board_model;
 mod other_cell;
 mod output_dbc;
 mod pack_memory;

@@ -58,7 +58,7 @@ fn is_odd(text: &str) -> bool {
 #[test]
 fn one_damaged_number_is_refused_or_harmless() {
     let mut rig = learned();
-    let whole = serde_json::to_value(rig.monitor.snapshot()).unwrap();
+    let whole = serde_json::to_value(rig.monitor.snapshot().for_restart()).unwrap();
     let start_deci = rig.deci;
     let mut paths = Vec::new();
     numbers(&whole, "", &mut paths);
@@ -127,7 +127,7 @@ fn names_of(text: &str) -> Vec<&str> {
 fn the_stored_form_keeps_its_names_and_their_order() {
     let snapshot = learned().monitor.snapshot();
     let expected = "version time cells waiting sampler detector learner learned_at offset_at recharge \
-                    recharge_period_s normalised_recharge pack updated_cells time_backwards alarms schedule intake buses identity statistics";
+                    recharge_period_s normalised_recharge pack updated_cells time_backwards alarms schedule intake buses identity statistics continuation";
     assert_eq!(names_of(&serde_json::to_string(&snapshot).unwrap()), expected.split_whitespace().collect::<Vec<_>>());
     let mut document = serde_json::to_value(snapshot).unwrap();
     assert!(serde_json::from_value::<Snapshot>(document.clone()).is_ok());

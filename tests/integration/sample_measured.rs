@@ -16,6 +16,7 @@ fn data_folder() -> Option<PathBuf> {
 fn config() -> SampleConfig {
     let limits = |min, max| Limits { min, max, max_rate_per_s: None, stuck_after_s: None, max_age_s: 60.0 };
     SampleConfig {
+        voltage_noise_v: 0.005,
         cells: 1,
         voltage_source: VoltageSource::Cells,
         strings: 1,

@@ -9,7 +9,7 @@ use crate::cli::output;
 use crate::io::stamp;
 use crate::monitor::ModelState;
 use crate::status::counters::LATENCY_BOUNDS_S;
-use crate::status::document::{CellStatus, LossStatus, PackStatus, StatusDocument};
+use crate::status::document::{CellStatus, Intruder, IntruderKind, LossStatus, PackStatus, StatusDocument};
 
 /// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;
@@ -50,6 +50,16 @@ fn pack(text: &mut String, document: &StatusDocument) {
             text,
             "asleep     for {asleep}: the buses are silent at rest, nothing is measured and nothing missing"
         );
+    }
+    for Intruder { interface, id, kind } in &document.intruders {
+        let what = match kind {
+            IntruderKind::SecondSender => "has a second sender: which of its values are the sensor's is not known",
+            IntruderKind::OwnIdentifier => "is sent by another node: it is an identifier of this program's frames",
+        };
+        let _ = writeln!(text, "intruder   {interface} {id} {what}");
+    }
+    if document.current_frozen {
+        let _ = writeln!(text, "current    frozen: its reading does not change, and the voltages show another load");
     }
     let band = match (pack.soc_low, pack.soc_high) {
         (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),

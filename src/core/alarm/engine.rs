@@ -91,6 +91,16 @@ impl StoredAlarm {
     }
 }
 
+/// One alarm with its latest value: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunningAlarm {
+    #[serde(flatten)]
+    alarm: StoredAlarm,
+    is_known: bool,
+    observation: Observation,
+    probability: Option<f64>,
+}
+
 /// Stored part of an engine: every alarm that was raised or is about to be.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct AlarmSnapshot {
@@ -312,6 +322,36 @@ impl AlarmEngine {
             self.update_index(index, slot, Machine::default().index_entry());
         }
         orphans
+    }
+
+    /// Every alarm that is not as at the start.
+    pub fn running(&self) -> Vec<RunningAlarm> {
+        let of_rule = |rule: &RuleSlots| {
+            let used = rule.slots().filter(|&slot| self.machines[slot] != Machine::default());
+            let running = |slot: usize| {
+                let (machine, RuleConfig { rule: name, severity, .. }) = (self.machines[slot], &rule.config);
+                RunningAlarm {
+                    alarm: StoredAlarm { rule: *name, severity: *severity, cell: rule.cell(slot), machine },
+                    is_known: machine.is_known,
+                    observation: machine.observation,
+                    probability: machine.probability,
+                }
+            };
+            used.map(running).collect::<Vec<_>>()
+        };
+        self.rules.iter().flat_map(of_rule).collect()
+    }
+
+    /// Continues each alarm as it was, with its value; those that no threshold watches are left out.
+    pub fn resume(&mut self, alarms: &[RunningAlarm]) {
+        for RunningAlarm { alarm, is_known, observation, probability } in alarms {
+            let Some((index, slot)) = self.locate(alarm.rule, alarm.severity, alarm.cell) else { continue };
+            let before = self.machines[slot].index_entry();
+            let mut machine = alarm.machine;
+            (machine.is_known, machine.observation, machine.probability) = (*is_known, *observation, *probability);
+            self.machines[slot] = machine;
+            self.update_index(index, slot, before);
+        }
     }
 
     /// Continues with other rules: an alarm with a rule, severity and cell that are still watched stays, and is judged again

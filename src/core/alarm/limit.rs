@@ -16,6 +16,8 @@
 //! A learned value (a capacity, a resistance, a life) does not recover by itself: an estimate that wanders about its
 //! threshold must not clear its alarm, whichever quantity is compared.
 
+use serde::{Deserialize, Serialize};
+
 use super::{Direction, Rule, Severity};
 
 /// Highest probability of being beyond the clear threshold that clears.
@@ -55,7 +57,7 @@ pub struct RuleConfig {
 }
 
 /// A rule's value at one moment.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observation {
     /// In the rule's unit; `None` or not finite = not known.
     pub value: Option<f64>,

@@ -18,7 +18,7 @@ pub mod rule;
 pub mod selector;
 
 pub use engine::summary::RuleSummary;
-pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmSnapshot, StoredAlarm, ThresholdState};
+pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmSnapshot, RunningAlarm, StoredAlarm, ThresholdState};
 pub use input::AlarmInput;
 pub use limit::{Comparison, Observation, RuleConfig};
 pub use machine::{AlarmState, Change, Refusal};

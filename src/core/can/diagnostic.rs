@@ -241,6 +241,15 @@ struct Link {
     reported_at: Option<Timestamp>,
 }
 
+/// An answer under way of one controller: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkProgress {
+    controller: Controller,
+    receiver: Receiver,
+    asked: Option<([u8; 3], Timestamp)>,
+    reported_at: Option<Timestamp>,
+}
+
 /// Listens to all configured controllers.
 #[derive(Debug, Clone, Default)]
 pub struct Listener {
@@ -303,6 +312,27 @@ impl Listener {
         for (controller, counts) in counts {
             if let Some(link) = self.links.iter_mut().find(|link| link.controller == controller) {
                 link.counts = counts;
+            }
+        }
+    }
+
+    /// Answers under way.
+    pub fn progress(&self) -> Vec<LinkProgress> {
+        let of = |link: &Link| LinkProgress {
+            controller: link.controller,
+            receiver: link.receiver.clone(),
+            asked: link.asked,
+            reported_at: link.reported_at,
+        };
+        self.links.iter().map(of).collect()
+    }
+
+    /// Continues stored answers under way.
+    pub fn resume(&mut self, stored: &[LinkProgress]) {
+        for link in &mut self.links {
+            if let Some(of) = stored.iter().find(|of| of.controller == link.controller) {
+                link.receiver.resume(&of.receiver);
+                (link.asked, link.reported_at) = (of.asked, of.reported_at);
             }
         }
     }
@@ -371,10 +401,10 @@ impl Listener {
         let message = link.receiver.message();
         if let &[NEGATIVE, service, code, ..] = message {
             if code == PENDING {
-                link.counts.pending += 1;
+                link.counts.pending = link.counts.pending.saturating_add(1);
                 link.asked = link.asked.map(|(head, _)| (head, now));
             } else {
-                link.counts.refused += 1;
+                link.counts.refused = link.counts.refused.saturating_add(1);
                 link.counts.latest_refusal = Some(code);
             }
             return Heard::Refused { controller, refusal: Refusal { service, code } };
@@ -383,15 +413,15 @@ impl Listener {
             answer.question.controller == link.controller && message.starts_with(&answer.question.answer_head())
         };
         let Some(answer) = answers.iter().find(is_own) else {
-            link.counts.other += 1;
+            link.counts.other = link.counts.other.saturating_add(1);
             return Heard::Nothing;
         };
         let head = answer.question.answer_head();
-        link.counts.read += 1;
+        link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= ANSWER_WITHIN_NS
         });
-        link.counts.unasked += u64::from(!is_asked);
+        link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
         Heard::Whole { controller, answer, data: &link.receiver.message()[head.len()..], is_single }
     }
 }
@@ -415,7 +445,7 @@ impl Link {
         let Some(fault) = fault else { return };
         let place = IsoTpFault::ALL.iter().position(|other| *other == fault);
         if let Some(count) = place.and_then(|place| self.counts.lost.get_mut(place)) {
-            *count += 1;
+            *count = count.saturating_add(1);
         }
         if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= REPORT_EVERY_NS) {
             self.reported_at = Some(now);

@@ -59,6 +59,15 @@ pub struct FloodCount {
     pub dropped: u64,
 }
 
+/// Spent budget and present flood of one message: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FloodProgress {
+    bus: BusIndex,
+    id: CanId,
+    spent_until: Option<Timestamp>,
+    flood: Option<(u64, Timestamp)>,
+}
+
 #[derive(Debug, Clone)]
 struct LeakyBucket {
     bus: BusIndex,
@@ -122,12 +131,12 @@ impl FloodGate {
             bucket.spent_until = Some(spent);
             return true;
         }
-        bucket.dropped += 1;
+        bucket.dropped = bucket.dropped.saturating_add(1);
         let (frames, _) = bucket.flood.unwrap_or((0, now));
         if frames == 0 {
             self.changes.push(FloodChange { bus, id, active: true, dropped: 1 });
         }
-        bucket.flood = Some((frames + 1, now));
+        bucket.flood = Some((frames.saturating_add(1), now));
         false
     }
 
@@ -146,6 +155,27 @@ impl FloodGate {
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
+    }
+
+    /// Spent budgets and present floods.
+    pub fn progress(&self) -> Vec<FloodProgress> {
+        let is_used = |bucket: &&LeakyBucket| bucket.spent_until.is_some() || bucket.flood.is_some();
+        let of = |bucket: &LeakyBucket| FloodProgress {
+            bus: bucket.bus,
+            id: bucket.id,
+            spent_until: bucket.spent_until,
+            flood: bucket.flood,
+        };
+        self.buckets.iter().filter(is_used).map(of).collect()
+    }
+
+    /// Continues stored budgets and floods.
+    pub fn resume(&mut self, stored: &[FloodProgress]) {
+        for of in stored {
+            if let Some(bucket) = self.buckets.get_mut(self.numbers.number(of.bus, of.id)) {
+                (bucket.spent_until, bucket.flood) = (of.spent_until, of.flood);
+            }
+        }
     }
 
     /// Restores stored counts; those of messages that are no longer configured are dropped.

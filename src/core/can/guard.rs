@@ -8,9 +8,9 @@
 //! sender with jitter would fill the log.
 //!
 //! Time without listening is no fault of the sender: after sleep, a restart of the program or a step of the clock the
-//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a snapshot keeps the counts and not
-//! the counters: the sender has continued in the meantime, so a stored counter would reject good frames, or accept an old
-//! one that follows it by chance.
+//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a restarted program restores the counts
+//! and not the counters: the sender has continued in the meantime, so a stored counter would reject good frames, or accept
+//! an old one that follows it by chance. Only a state that continues without a break restores both ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -59,6 +59,17 @@ pub struct GuardCounts {
     pub id: CanId,
     /// How often each status was given.
     pub counts: StatusCounts,
+}
+
+/// How far one message's check has come: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GuardProgress {
+    bus: BusIndex,
+    id: CanId,
+    receiver: Receiver,
+    missed_at: Option<Timestamp>,
+    missed: u64,
+    failed: u64,
 }
 
 #[derive(Debug, Clone)]
@@ -155,6 +166,30 @@ impl Guards {
             id: guard.config.id,
             counts: *guard.receiver.counts(),
         })
+    }
+
+    /// How far each check has come.
+    pub fn progress(&self) -> Vec<GuardProgress> {
+        let of = |guard: &Guard| GuardProgress {
+            bus: guard.config.bus,
+            id: guard.config.id,
+            receiver: guard.receiver.clone(),
+            missed_at: guard.missed_at,
+            missed: guard.missed,
+            failed: guard.failed,
+        };
+        self.guards.iter().map(of).collect()
+    }
+
+    /// Continues the checks as they were stored; the counts are restored before.
+    pub fn resume(&mut self, stored: &[GuardProgress]) {
+        for guard in &mut self.guards {
+            let key = (guard.config.bus, guard.config.id);
+            if let Some(of) = stored.iter().find(|of| (of.bus, of.id) == key) {
+                guard.receiver.resume(guard.config.check.protection.profile, &of.receiver);
+                (guard.missed_at, guard.missed, guard.failed) = (of.missed_at, of.missed, of.failed);
+            }
+        }
     }
 
     /// Restores stored counts and restarts the receivers. Counts of a message that is no longer protected are dropped.

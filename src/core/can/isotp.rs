@@ -89,7 +89,7 @@ pub enum Progress {
 }
 
 /// Reassembles the messages of one sender.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Receiver {
     /// First data byte of every frame with extended addressing.
     extension: Option<u8>,
@@ -115,6 +115,17 @@ impl Receiver {
     /// The message that the latest frame completed.
     pub fn message(&self) -> &[u8] {
         &self.message
+    }
+
+    /// Continues as `stored`: a message that cannot be under way is left out.
+    pub fn resume(&mut self, stored: &Self) {
+        let is_possible = stored.message.len() < stored.length
+            && stored.length <= MAX_MESSAGE
+            && (2..=64).contains(&stored.frame_len)
+            && stored.next < 16;
+        let (is_discarding, extension) = (stored.is_discarding, self.extension);
+        *self = if is_possible { stored.clone() } else { Self { is_discarding, ..Self::new(extension) } };
+        self.extension = extension;
     }
 
     /// Whether a message is under way.

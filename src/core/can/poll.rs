@@ -32,7 +32,7 @@ const NEVER_AGAIN: [u8; 3] = [0x11, 0x31, 0x33];
 const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
 /// What the car does, as far as the pack's current says it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 pub enum CarState {
     /// The pack is discharged.
     Drive,
@@ -127,7 +127,7 @@ pub struct PollOutputs {
 }
 
 /// A question's state.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Item {
     due: Timestamp,
     /// Failures in a row.
@@ -137,7 +137,7 @@ struct Item {
 }
 
 /// The question that waits for its answer.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Outstanding {
     index: usize,
     sent: Timestamp,
@@ -148,6 +148,12 @@ struct Outstanding {
 #[derive(Debug, Clone)]
 pub struct Poller {
     config: PollConfig,
+    progress: PollProgress,
+}
+
+/// How far the questions have come: what a snapshot keeps for a continuation without a break.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PollProgress {
     items: Vec<Item>,
     outstanding: Option<Outstanding>,
     /// The latest question, asked or answered.
@@ -175,68 +181,88 @@ impl Poller {
         buses.sort_unstable();
         buses.dedup();
         Self {
-            items: vec![item; config.requests.len()],
+            progress: PollProgress {
+                items: vec![item; config.requests.len()],
+                outstanding: None,
+                latest: None,
+                rate_allows_at: LONG_AGO,
+                state: CarState::default(),
+                is_standby: false,
+                supply_good_until: LONG_AGO,
+                foreign_until: LONG_AGO,
+                heard: buses.into_iter().map(|bus| (bus, LONG_AGO)).collect(),
+                silence: Some(PollSilence::BusAsleep),
+            },
             config: config.clone(),
-            outstanding: None,
-            latest: None,
-            rate_allows_at: LONG_AGO,
-            state: CarState::default(),
-            is_standby: false,
-            supply_good_until: LONG_AGO,
-            foreign_until: LONG_AGO,
-            heard: buses.into_iter().map(|bus| (bus, LONG_AGO)).collect(),
-            silence: Some(PollSilence::BusAsleep),
+        }
+    }
+
+    /// How far the questions have come.
+    pub fn progress(&self) -> &PollProgress {
+        &self.progress
+    }
+
+    /// Continues stored questions, if they are of the same configuration.
+    pub fn resume(&mut self, stored: &PollProgress) {
+        let questions = self.progress.items.len();
+        let exists = |index: usize| index < questions;
+        let fits = stored.items.len() == questions
+            && stored.outstanding.is_none_or(|outstanding| exists(outstanding.index))
+            && stored.latest.is_none_or(exists)
+            && stored.heard.iter().map(|(bus, _)| bus).eq(self.progress.heard.iter().map(|(bus, _)| bus));
+        if fits {
+            self.progress.clone_from(stored);
         }
     }
 
     /// Whether it sends on a bus, and so has to hear every frame of it.
     pub fn is_on(&self, bus: BusIndex) -> bool {
-        self.heard.iter().any(|(other, _)| *other == bus)
+        self.progress.heard.iter().any(|(other, _)| *other == bus)
     }
 
     /// Why nothing is sent; `None` = it asks.
     pub fn silence(&self) -> Option<PollSilence> {
-        self.silence
+        self.progress.silence
     }
 
     /// Questions that are never asked again.
     pub fn refused(&self) -> usize {
-        self.items.iter().filter(|item| item.is_refused).count()
+        self.progress.items.iter().filter(|item| item.is_refused).count()
     }
 
     /// Another period may hold from here on.
     pub fn set_state(&mut self, now: Timestamp, state: CarState) {
-        if state == self.state {
+        if state == self.progress.state {
             return;
         }
-        self.state = state;
-        for index in 0..self.items.len() {
+        self.progress.state = state;
+        for index in 0..self.progress.items.len() {
             // A shorter period begins now, not when the longer one is over.
             if let Some(period_s) = self.period_s(index) {
-                self.items[index].due = self.items[index].due.min(now.plus_secs(period_s));
+                self.progress.items[index].due = self.progress.items[index].due.min(now.plus_secs(period_s));
             }
         }
     }
 
     /// Takes a reading of the supply voltage: until when it may be counted on, `None` = it is low or bad.
     pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
-        self.supply_good_until = good_until.unwrap_or(LONG_AGO);
+        self.progress.supply_good_until = good_until.unwrap_or(LONG_AGO);
     }
 
     /// Sets or ends the standby.
     pub fn set_standby(&mut self, is_standby: bool) {
-        self.is_standby = is_standby;
+        self.progress.is_standby = is_standby;
     }
 
     /// Begins again after time without the buses: nothing was heard.
     pub fn restart(&mut self) {
-        self.outstanding = None;
-        self.heard.iter_mut().for_each(|(_, at)| *at = LONG_AGO);
+        self.progress.outstanding = None;
+        self.progress.heard.iter_mut().for_each(|(_, at)| *at = LONG_AGO);
     }
 
     /// Takes a frame of others; those of [`Self::poll`] do not come back.
     pub fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut PollOutputs) {
-        let Some(heard) = self.heard.iter_mut().find(|(other, _)| *other == bus) else { return };
+        let Some(heard) = self.progress.heard.iter_mut().find(|(other, _)| *other == bus) else { return };
         let of_polled = |wanted: fn(&Controller) -> CanId| {
             let same = |request: &PollRequest| request.question.controller.bus == bus;
             self.config
@@ -246,8 +272,8 @@ impl Poller {
                 .any(|request| wanted(&request.question.controller) == frame.id())
         };
         if of_polled(|controller| controller.request) || is_tester(frame.id()) {
-            self.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
-            self.outstanding = None;
+            self.progress.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
+            self.progress.outstanding = None;
         } else if !of_polled(|controller| controller.response) {
             // An answer to a question of ours does not say that the car is awake by itself.
             heard.1 = now;
@@ -275,11 +301,11 @@ impl Poller {
 
     /// A whole answer.
     pub fn handle_answer(&mut self, now: Timestamp, question: &Question, out: &mut PollOutputs) {
-        if let Some(Outstanding { index, .. }) = self.outstanding
+        if let Some(Outstanding { index, .. }) = self.progress.outstanding
             && self.config.requests[index].question == *question
         {
-            self.items[index].failures = 0;
-            self.outstanding = None;
+            self.progress.items[index].failures = 0;
+            self.progress.outstanding = None;
             self.poll(now, out);
         }
     }
@@ -294,9 +320,9 @@ impl Poller {
         if code == PENDING {
             return self.extend_wait(now, PENDING_WITHIN_NS);
         }
-        let Some(Outstanding { index, .. }) = self.outstanding.take() else { return };
+        let Some(Outstanding { index, .. }) = self.progress.outstanding.take() else { return };
         if NEVER_AGAIN.contains(&code) {
-            self.items[index].is_refused = true;
+            self.progress.items[index].is_refused = true;
             let (id, service) = (controller.response, question.service as u8);
             out.changes.push(PollChange::Refused { id, service, identifier: question.identifier, code });
         } else {
@@ -308,22 +334,22 @@ impl Poller {
     /// Sends the request that is due.
     pub fn poll(&mut self, now: Timestamp, out: &mut PollOutputs) {
         let silence = self.silence_at(now);
-        if silence != self.silence {
-            self.silence = silence;
+        if silence != self.progress.silence {
+            self.progress.silence = silence;
             out.changes.push(silence.map_or(PollChange::Asking, |reason| PollChange::Silent { reason }));
         }
         if silence.is_some() {
-            self.outstanding = None;
+            self.progress.outstanding = None;
             return;
         }
-        if let Some(Outstanding { index, deadline, .. }) = self.outstanding {
+        if let Some(Outstanding { index, deadline, .. }) = self.progress.outstanding {
             if now < deadline {
                 return;
             }
-            self.outstanding = None;
+            self.progress.outstanding = None;
             self.fail(now, index);
         }
-        if now < self.rate_allows_at {
+        if now < self.progress.rate_allows_at {
             return;
         }
         if let Some((index, due)) = self.next()
@@ -335,42 +361,46 @@ impl Poller {
 
     /// When [`poll`](Self::poll) has something to do; `None` = only a frame, a command or a reading can change that.
     pub fn next_due(&self) -> Option<Timestamp> {
-        match self.silence {
-            Some(PollSilence::OtherTester) => return Some(self.foreign_until),
+        match self.progress.silence {
+            Some(PollSilence::OtherTester) => return Some(self.progress.foreign_until),
             Some(_) => return None,
             None => {}
         }
-        let asleep = self.heard.iter().map(|(_, at)| at.plus_nanos(ASLEEP_AFTER_NS)).min();
-        let request = match self.outstanding {
+        let asleep = self.progress.heard.iter().map(|(_, at)| at.plus_nanos(ASLEEP_AFTER_NS)).min();
+        let request = match self.progress.outstanding {
             Some(outstanding) => Some(outstanding.deadline),
-            None => self.next().map(|(_, due)| due.max(self.rate_allows_at)),
+            None => self.next().map(|(_, due)| due.max(self.progress.rate_allows_at)),
         };
-        let supply = self.config.watches_supply.then_some(self.supply_good_until);
+        let supply = self.config.watches_supply.then_some(self.progress.supply_good_until);
         asleep.into_iter().chain(supply).chain(request).min()
     }
 
     fn silence_at(&self, now: Timestamp) -> Option<PollSilence> {
         let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
-        if self.is_standby {
+        if self.progress.is_standby {
             Some(PollSilence::Standby)
-        } else if now < self.foreign_until {
+        } else if now < self.progress.foreign_until {
             Some(PollSilence::OtherTester)
-        } else if self.config.watches_supply && now >= self.supply_good_until {
+        } else if self.config.watches_supply && now >= self.progress.supply_good_until {
             Some(PollSilence::LowSupply)
         } else {
-            self.heard.iter().any(is_asleep).then_some(PollSilence::BusAsleep)
+            self.progress.heard.iter().any(is_asleep).then_some(PollSilence::BusAsleep)
         }
     }
 
     /// The question to ask next and when.
     fn next(&self) -> Option<(usize, Timestamp)> {
-        let waiting =
-            self.items.iter().enumerate().filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
+        let waiting = self
+            .progress
+            .items
+            .iter()
+            .enumerate()
+            .filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
         waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
     }
 
     fn period_s(&self, index: usize) -> Option<f64> {
-        self.config.requests[index].every_s[self.state as usize]
+        self.config.requests[index].every_s[self.progress.state as usize]
     }
 
     /// The question to ask before this one: that for the current before one for voltages.
@@ -383,9 +413,9 @@ impl Poller {
             .config
             .requests
             .iter()
-            .zip(&self.items)
+            .zip(&self.progress.items)
             .position(|(request, item)| request.has_current && !item.is_refused && item.failures == 0);
-        current.filter(|current| self.latest != Some(*current)).unwrap_or(index)
+        current.filter(|current| self.progress.latest != Some(*current)).unwrap_or(index)
     }
 
     fn send(&mut self, now: Timestamp, index: usize, out: &mut PollOutputs) {
@@ -395,12 +425,12 @@ impl Poller {
         let payload = segment(request_extension, &message, 0);
         out.frames
             .extend(payload.first().and_then(|payload| Frame::classic(request, payload)).map(|frame| (bus, frame)));
-        self.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
-        self.latest = Some(index);
-        self.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
+        self.progress.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
+        self.progress.latest = Some(index);
+        self.progress.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
         // Without a period in this state it is asked for the sake of another one.
         let period_s = self.period_s(index).unwrap_or(0.0);
-        let item = &mut self.items[index];
+        let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);
         // On time, the next one keeps the rhythm.
         item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
@@ -408,7 +438,7 @@ impl Poller {
 
     /// Waits longer, but not for ever.
     fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
-        if let Some(outstanding) = &mut self.outstanding {
+        if let Some(outstanding) = &mut self.progress.outstanding {
             outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(GIVE_UP_AFTER_NS));
         }
     }
@@ -416,14 +446,14 @@ impl Poller {
     /// Asks a question that failed less often.
     fn fail(&mut self, now: Timestamp, index: usize) {
         let period_s = self.period_s(index).unwrap_or(1.0);
-        let item = &mut self.items[index];
+        let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
         item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(LONGEST_PAUSE_S))));
     }
 
     fn outstanding_of(&self, controller: &Controller) -> Option<Question> {
-        let question = self.config.requests[self.outstanding?.index].question;
+        let question = self.config.requests[self.progress.outstanding?.index].question;
         (question.controller == *controller).then_some(question)
     }
 }

@@ -157,6 +157,10 @@ impl ModelCheck {
         for (sum, value) in self.score.iter_mut().zip([1.0, soc]) {
             *sum += weight * value * update.innovation;
         }
+        if self.check().is_err() {
+            // Sums that cannot be stored are evidence of nothing.
+            *self = Self::new(self.model);
+        }
         if self.use_s < SETTLING_S {
             return;
         }

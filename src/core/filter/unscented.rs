@@ -45,6 +45,9 @@ pub enum FilterError {
     /// The result contains a NaN or an infinity.
     #[error("a number is not finite")]
     NotFinite,
+    /// The result is beyond what the filtered system can be.
+    #[error("a state is beyond its physical bounds")]
+    Impossible,
 }
 
 /// Scale and weights of the sigma points for N states.

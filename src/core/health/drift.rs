@@ -15,6 +15,7 @@ use super::CapacityConfig;
 use super::end_errors::END_ERRORS;
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
+use crate::quantity::bounds;
 
 const C: usize = 0;
 const FADE: usize = 1;
@@ -110,6 +111,11 @@ impl DriftFilter {
                 self.p[i][j] += gain[i] * gain[j] * own_variance - gain[i] * cross[j] - cross[i] * gain[j];
             }
         }
+    }
+
+    /// Whether a capacity of the model's cell, and numbers that can be stored.
+    pub(super) fn is_possible(&self, cell_ah: f64) -> bool {
+        bounds::TRUSTED_CAPACITY.has(self.x[C] / cell_ah) && self.check().is_ok()
     }
 
     /// Widens the capacity to at least a variance, Ah^2: what was measured does not hold.

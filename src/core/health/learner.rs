@@ -20,6 +20,7 @@ use super::offset::CurrentOffset;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Measurement, ScalarGaussian};
+use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Largest part of a half-cycle's capacity that may come from the capacity of the curve itself.
@@ -66,10 +67,10 @@ struct CellMark {
 
 impl CellMark {
     fn check(&self) -> Result<(), InvalidState> {
-        let numbers = [self.temperature_integral, self.temperature_s];
-        InvalidState::unless_numbers("a temperature at a half-cycle's end", numbers)?;
+        InvalidState::unless_number("a temperature at a half-cycle's end", self.temperature_integral)?;
+        bounds::TIME_S.check("the time with a temperature", self.temperature_s)?;
         let Some(soc) = self.soc else { return Ok(()) };
-        InvalidState::unless_number("the SOC at a half-cycle's end", soc.mean)?;
+        bounds::STORED_SOC.check("the SOC at a half-cycle's end", soc.mean)?;
         InvalidState::unless_natural("its variance", soc.variance)
     }
 }
@@ -237,8 +238,13 @@ impl Learner {
             CapacityMethod::Nominal { swing, variance_ah2 } => {
                 let measurement = Measurement { value: half_cycle.charge_ah / swing, variance: variance_ah2 };
                 let capacity = &mut self.capacity[cell];
+                let before = *capacity;
                 capacity.predict(config.noise_ah_per_cycle * config.noise_ah_per_cycle);
                 capacity.update(measurement);
+                if !bounds::TRUSTED_CAPACITY.has(capacity.mean / model.capacity_ah) {
+                    *capacity = before;
+                    return CapacityUpdate { measurement: None, capacity: before };
+                }
                 estimator.hold_capacity(capacity.mean);
                 Some(measurement)
             }
@@ -322,18 +328,29 @@ impl Learner {
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
         });
         let drift = &mut self.drift[cell];
+        let before = *drift;
         if let Some(z) = measurement {
             drift.update(z, &effects_ah(model, config, half_cycle, after.mean));
         } else if is_in_doubt {
             drift.at_least(half_cycle.charge_ah);
         }
+        // A charge or swing that no such cell can have is not this cell's.
+        let is_possible = drift.is_possible(model.capacity_ah);
+        if !is_possible {
+            *drift = before;
+        }
+        let measurement = measurement.filter(|_| is_possible);
         self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
         let rest_days = (self.rest_s / 86_400.0).min(1.0);
         let walk = config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
             + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days;
         let charged = if half_cycle.mode == Mode::Charge { 2.0 * cycles } else { 0.0 };
+        let learned = *drift;
         drift.predict(config, cycles, charged, walk);
+        if !drift.is_possible(model.capacity_ah) {
+            *drift = learned;
+        }
         // The sample filter continues from the event filter's capacity.
         estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
@@ -373,11 +390,16 @@ impl Learner {
         }
         self.drift.iter().try_for_each(DriftFilter::check)?;
         self.offset.check()?;
-        InvalidState::unless_natural("the time at rest", self.rest_s)?;
+        bounds::TIME_S.check("the time at rest", self.rest_s)?;
         let marks = [&self.start, &self.candidate].into_iter().flatten();
         let charges_as = marks.clone().map(|mark| mark.charge_as);
-        InvalidState::unless_numbers("the charge at a half-cycle's end", charges_as)?;
+        bounds::CHARGE_AS.check_all("the charge at a half-cycle's end", charges_as)?;
         marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
+    }
+
+    /// Times and charges, As per cell, at which the present half-cycle and the one that may follow began.
+    pub fn marks(&self) -> impl Iterator<Item = (Timestamp, f64)> + '_ {
+        [&self.start, &self.candidate].into_iter().flatten().map(|mark| (mark.time, mark.charge_as))
     }
 
     /// Moves stored stamps onto another clock.

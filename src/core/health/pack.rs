@@ -8,6 +8,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::filter::ScalarGaussian;
+use crate::quantity::bounds;
 use crate::quantity::{CellIndex, InvalidState};
 
 /// One cell's contribution to the pack.
@@ -64,9 +65,13 @@ impl PackState {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        InvalidState::unless_number("the pack's SOC", self.soc)?;
-        let natural = [self.soc_std, self.capacity_ah, self.capacity_std_ah];
-        InvalidState::unless_naturals("the pack's capacity or a deviation", natural)
+        bounds::STORED_SOC.check("the pack's SOC", self.soc)?;
+        // A pack with an empty and a full cell has none.
+        let capacity_ah = self.capacity_ah;
+        let is_possible = (0.0..=bounds::CAPACITY_AH.high).contains(&capacity_ah);
+        InvalidState::unless(is_possible, "the pack's capacity", capacity_ah, "0 to 1e9 Ah")?;
+        let natural = [self.soc_std, self.capacity_std_ah];
+        InvalidState::unless_naturals("a deviation of the pack's values", natural)
     }
 }
 

@@ -31,6 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RechargeConfig;
 use crate::filter::ScalarGaussian;
+use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Times the pack's SOC through the window during charges.
@@ -98,8 +99,9 @@ impl RechargeTimer {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.range.unwrap_or_default();
-        let all = [self.last.map_or(0.0, |(_, soc)| soc), low, high, self.raw_s.unwrap_or(0.0)];
-        InvalidState::unless_numbers("a SOC or time of the charge under way", all)
+        let socs = [self.last.map_or(0.0, |(_, soc)| soc), low, high];
+        bounds::STORED_SOC.check_all("a SOC of the charge under way", socs)?;
+        bounds::TIME_S.check_all("the time of the charge under way", self.raw_s)
     }
 
     /// Moves stored stamps onto another clock.

@@ -3,6 +3,8 @@
 //! In: values of the rules, from the [`Publisher`](super::publisher::Publisher) and the periodic
 //! [`watch`](super::watch). Out: raised alarms and their changes.
 
+use serde::{Deserialize, Serialize};
+
 use super::MonitorConfig;
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::quantity::Timestamp;
@@ -62,7 +64,7 @@ pub(super) fn take_show_due(shown_at: &mut Timestamp, now: Timestamp) -> bool {
 }
 
 /// Whether the files can be written; not known before the driver has reported.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub(super) struct StoreHealth {
     is_known: bool,
     failing_since: Option<Timestamp>,

@@ -18,7 +18,7 @@ const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 struct BusState {
-    #[serde(skip)]
+    #[serde(default)]
     is_known: bool,
     down_since: Option<Timestamp>,
     off_since: Option<Timestamp>,
@@ -82,6 +82,7 @@ impl Buses {
         for state in &mut self.states {
             let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
             state.unsent = unsent.map(|(first, _)| (first, now));
+            state.is_known = false;
         }
         self
     }

@@ -63,7 +63,7 @@ impl Clock {
     fn jump(&mut self, time: Timestamp) -> Option<TimeJump> {
         let elapsed_s = time.since(self.now);
         if elapsed_s < 0.0 {
-            self.time_backwards += 1;
+            self.time_backwards = self.time_backwards.saturating_add(1);
             let is_set_back = time < self.now.plus_nanos(-MERGE_TOLERANCE_NS);
             return is_set_back.then_some(TimeJump::Backwards { seconds: -elapsed_s });
         }

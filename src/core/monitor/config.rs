@@ -33,6 +33,8 @@ pub struct MonitorConfig {
     pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
+    /// Cycle time of input messages, s, where it is known.
+    pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
     /// Readings in a row that must give another pack identity, where such a signal is among `input`.
     pub identity_readings: u32,
     /// Limits on the number of frames of one identifier.
@@ -74,8 +76,34 @@ impl MonitorConfig {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
     }
 
-    /// Identifiers to be received on an interface, ascending.
+    /// Identifiers to be received on an interface, ascending: also those of our own frames, which another sender may use.
     pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
+        let mut ids = self.listened_ids(bus);
+        ids.extend(self.own_ids().filter(|(other, _)| *other == bus).map(|(_, id)| id));
+        ids.sort_unstable();
+        ids.dedup();
+        ids
+    }
+
+    /// Identifiers of the frames of `[output]`, on each of its interfaces.
+    pub(super) fn own_ids(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        let of = |output: &OutputConfig| {
+            let ids = output.plan.ids();
+            output.buses.clone().into_iter().flat_map(move |bus| ids.clone().into_iter().map(move |id| (bus, id)))
+        };
+        self.output.iter().flat_map(of)
+    }
+
+    /// Unprotected input messages with their cycle time, s, where it is known.
+    pub(super) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
+        let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
+        let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
+        let messages = self.input.messages().filter(move |(bus, id, _)| !is_protected(*bus, *id));
+        messages.map(move |(bus, id, _)| (bus, id, cycle_s(bus, id)))
+    }
+
+    /// Identifiers that are decoded on an interface, ascending.
+    fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
         ids.extend(diagnostic::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
@@ -121,7 +149,7 @@ impl MonitorConfig {
             ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
             ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
             ("[input]", self.input == new.input && self.answers == new.answers),
-            ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
+            ("[commands]", buses().all(|bus| self.listened_ids(bus) == new.listened_ids(bus))),
             ("[commands] and [output]: secoc", self.authentications() == new.authentications()),
             ("[poll]", self.poll == new.poll && self.supply == new.supply),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
@@ -161,6 +189,7 @@ impl MonitorConfig {
                 "[input]",
                 self.flood == new.flood
                     && self.guards == new.guards
+                    && self.cycle_times_s == new.cycle_times_s
                     && self.asleep_after_s == new.asleep_after_s
                     && old_sample.contactor == new_sample.contactor,
             ),

@@ -16,6 +16,9 @@ use crate::health::{CapacityConfig, Learner};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
+/// Contradiction of an estimate that is certainly wrong, in units of the consistency limit: beyond it, and beyond an alarm at it.
+const DOUBT: f64 = 2.0;
+
 /// The estimation stage.
 #[derive(Debug)]
 pub(super) struct Estimation {
@@ -30,6 +33,8 @@ pub(super) struct Estimation {
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(super) any_mismatched: bool,
+    /// The current is contradicted by the voltages.
+    pub(super) is_current_doubtful: bool,
     ambient_c: f64,
     /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
     after_gap: Vec<usize>,
@@ -66,6 +71,7 @@ impl Estimation {
             checks: vec![ModelCheck::new(model_id(&config.model, config.estimator.initial.log_resistance_std)); cells],
             any_check_open: true,
             any_mismatched: false,
+            is_current_doubtful: false,
             ambient_c: config.sample.ambient_c,
             after_gap: Vec::new(),
         }
@@ -258,15 +264,15 @@ impl Estimation {
         self.checks[index]
     }
 
-    /// How much a cell contradicts its estimate: the mean normalised innovation squared, or the mismatch of a model that is
-    /// another cell's, in the same scale: times the consistency limit.
+    /// How much a cell contradicts its estimate: the mean normalised innovation squared, or, in the same scale (times the
+    /// consistency limit), the mismatch of a model that is another cell's, or [`DOUBT`]: an estimate that no cell can have, or
+    /// a current that is not the cell's.
     pub(super) fn contradiction(&self, index: usize) -> f64 {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
-        if check.is_mismatched() {
-            mean_nis.max(check.mismatch() * self.bank.config().consistency.limit)
-        } else {
-            mean_nis
-        }
+        let limit = self.bank.config().consistency.limit;
+        let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
+        let doubt = if self.is_current_doubtful || !self.bank.is_plausible(index) { DOUBT } else { 0.0 };
+        if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
     }
 
     /// Judges a cell's innovations; whether it is trusted, when that has changed.

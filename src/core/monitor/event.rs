@@ -11,7 +11,9 @@ use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
+use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
+use crate::can::rate::SenderChange;
 use crate::cell::Chemistry;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
@@ -228,6 +230,10 @@ pub enum EventKind {
     Protection(GuardChange),
     /// More frames of one identifier come than the limit allows; or no more.
     Flood(FloodChange),
+    /// A second sender of an unprotected input message was found, or is gone.
+    SecondSender(SenderChange),
+    /// Another sender uses our own identifiers, or does no more.
+    OwnIdentifier(OwnIdChange),
     /// Diagnostic messages of a controller were lost (reported at most once a minute, all are counted).
     MessageLoss(MessageLoss),
     /// Diagnostic requests are sent, or no more.

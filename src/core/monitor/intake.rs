@@ -11,12 +11,14 @@ use super::command_gate::CommandGate;
 use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
-use crate::can::Frame;
-use crate::can::diagnostic::{self, Controller, ControllerCounts, Listener};
+use crate::can::diagnostic::{self, Controller, ControllerCounts, LinkProgress, Listener};
 use crate::can::e2e::Status;
 use crate::can::encode::{self, CommandFields, CommandPlan, CommandRefusal};
-use crate::can::flood::{FloodCount, FloodGate};
-use crate::can::guard::{GuardCounts, Guards};
+use crate::can::flood::{FloodCount, FloodGate, FloodProgress};
+use crate::can::guard::{GuardCounts, GuardProgress, Guards};
+use crate::can::own_frames::{OwnFrames, OwnFramesState};
+use crate::can::rate::{MessageRate, SecondSenders};
+use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
 
@@ -37,6 +39,8 @@ pub struct CommandConfig {
 pub(super) struct Intake {
     gate: FloodGate,
     guards: Guards,
+    pub(super) senders: SecondSenders,
+    pub(super) own: OwnFrames,
     buses: Buses,
     /// Authenticated commands.
     pub(super) gate_of_commands: CommandGate,
@@ -81,6 +85,20 @@ pub(super) struct IntakeState {
     controllers: Vec<ControllerCount>,
     #[serde(default)]
     pub(super) commands: CommandGate,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    senders: Vec<MessageRate>,
+}
+
+/// What holds only while frames are received without a break.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct IntakeProgress {
+    protected: Vec<GuardProgress>,
+    floods: Vec<FloodProgress>,
+    answers: Vec<LinkProgress>,
+    moments: Vec<Option<Moment>>,
+    bad_command_at: Option<Timestamp>,
+    own: OwnFramesState,
 }
 
 /// What came from a controller that answers diagnostic requests.
@@ -102,6 +120,8 @@ impl Intake {
         Self {
             gate: FloodGate::new(&config.flood, config.input.messages().chain(commands).chain(answers)),
             guards: Guards::new(config.guards.clone()),
+            senders: SecondSenders::new(config.unprotected()),
+            own: OwnFrames::new(config.own_ids()),
             buses: Buses::default(),
             gate_of_commands: CommandGate::default(),
             moments: vec![None; listener.counts().count()],
@@ -116,6 +136,10 @@ impl Intake {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
         self.guards = new.guards.inheriting(&self.guards);
+        let (rates, own) = (self.senders.snapshot(), self.own.state().clone());
+        (self.senders, self.own) = (new.senders, new.own);
+        self.senders.restore(&rates);
+        self.own.resume(&own);
         // The answers are the same (checked): messages under way stay.
     }
 
@@ -129,6 +153,8 @@ impl Intake {
         out: &mut Outputs,
     ) -> Option<Admission> {
         self.buses.handle_frame(bus);
+        self.own.handle(now, bus, frame);
+        self.senders.handle(now, bus, frame.id());
         let admitted = self.gate.admit(now, bus, frame.id());
         let status = if admitted { self.guards.check(now, bus, frame) } else { None };
         self.report(now, out);
@@ -180,13 +206,17 @@ impl Intake {
     /// The value of the rule about interfaces: for how long the worst of them has been out of order, s.
     pub(super) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
-        Observation::new(fault_s).of_part(!is_whole)
+        let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);
+        let longest_s = fault_s.into_iter().chain(foreign_s).reduce(f64::max);
+        Observation::new(longest_s).of_part(!is_whole)
     }
 
     /// Finds periods without a frame, and floods that are over.
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.poll(now);
         self.gate.poll(now);
+        self.senders.poll(now);
+        self.own.poll(now);
         self.listener.poll(now);
         self.report(now, out);
     }
@@ -195,6 +225,8 @@ impl Intake {
     pub(super) fn restart(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.restart();
         self.gate.restart();
+        self.senders.restart();
+        self.own.restart();
         self.listener.restart();
         self.gate_of_commands.restart(now);
         self.moments.fill(None);
@@ -223,8 +255,43 @@ impl Intake {
             dropped: self.gate.counts().collect(),
             controllers: self.controllers().collect(),
             commands: self.gate_of_commands.clone(),
+            senders: self.senders.snapshot(),
         };
         (state, self.buses.clone())
+    }
+
+    /// What holds only while frames are received without a break.
+    pub(super) fn progress(&self) -> IntakeProgress {
+        IntakeProgress {
+            protected: self.guards.progress(),
+            floods: self.gate.progress(),
+            answers: self.listener.progress(),
+            moments: self.moments.clone(),
+            bad_command_at: self.bad_command_at,
+            own: self.own.state().clone(),
+        }
+    }
+
+    /// Messages with a second sender.
+    pub(super) fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.senders.doubtful()
+    }
+
+    /// Interfaces on which another sender uses our identifiers, and the latest of these.
+    pub(super) fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.own.uses()
+    }
+
+    /// Continues without a break.
+    pub(super) fn resume(&mut self, stored: &IntakeProgress) {
+        self.guards.resume(&stored.protected);
+        self.gate.resume(&stored.floods);
+        self.listener.resume(&stored.answers);
+        if stored.moments.len() == self.moments.len() {
+            self.moments.clone_from(&stored.moments);
+        }
+        self.bad_command_at = stored.bad_command_at;
+        self.own.resume(&stored.own);
     }
 
     pub(super) fn restore(&mut self, state: &IntakeState, buses: Buses) {
@@ -232,12 +299,18 @@ impl Intake {
         self.gate.restore(&state.dropped);
         self.listener.restore(state.controllers.iter().map(|of| (of.controller, of.counts)));
         self.gate_of_commands = state.commands.clone();
+        self.senders.restore(&state.senders);
         self.buses = buses;
     }
 
     #[inline]
     pub(super) fn report(&mut self, time: Timestamp, out: &mut Outputs) {
-        if !self.guards.changes.is_empty() || !self.gate.changes.is_empty() || !self.listener.losses.is_empty() {
+        let is_quiet = self.guards.changes.is_empty()
+            && self.gate.changes.is_empty()
+            && self.listener.losses.is_empty()
+            && self.senders.changes.is_empty()
+            && self.own.changes.is_empty();
+        if !is_quiet {
             self.report_changes(time, out);
         }
     }
@@ -246,7 +319,10 @@ impl Intake {
         let protection = self.guards.changes.drain(..).map(EventKind::Protection);
         let floods = self.gate.changes.drain(..).map(EventKind::Flood);
         let losses = self.listener.losses.drain(..).map(EventKind::MessageLoss);
-        out.events.extend(protection.chain(floods).chain(losses).map(|kind| Event { time, kind }));
+        let senders = self.senders.changes.drain(..).map(EventKind::SecondSender);
+        let own = self.own.changes.drain(..).map(EventKind::OwnIdentifier);
+        let kinds = protection.chain(floods).chain(losses).chain(senders).chain(own);
+        out.events.extend(kinds.map(|kind| Event { time, kind }));
     }
 }
 

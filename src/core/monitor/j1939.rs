@@ -40,7 +40,7 @@ pub struct AlarmCode {
 #[derive(Debug)]
 pub(super) struct J1939 {
     config: J1939Config,
-    node: Node,
+    pub(super) node: Node,
     out: NodeOutputs,
     active: Vec<ActiveCode>,
     previously_active: Vec<TroubleCode>,

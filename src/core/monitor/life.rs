@@ -55,6 +55,10 @@ impl CellLife {
             })
         });
         self.forecast.update(usage, reading);
+        if self.forecast.check(Axis::Cycles).is_err() {
+            // Use or readings that no cell can have: it begins again.
+            self.forecast = Forecast::new(Axis::Cycles, model.rated_capacity_ah);
+        }
         self.restate(config);
     }
 

@@ -21,6 +21,7 @@ mod buses;
 mod clock;
 mod command_gate;
 mod config;
+mod continuation;
 mod digest;
 mod estimation;
 mod event;
@@ -71,6 +72,9 @@ pub use snapshot::{RestoreError, Snapshot};
 pub use statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 pub use view::{CellView, PackView, ReportedState};
 
+/// Longest time between a state and the first input of a monitor that continues from it on the same clock with its freshness, s.
+const CONTINUED_S: f64 = 2.0;
+
 /// The pure core.
 #[derive(Debug)]
 pub struct Monitor {
@@ -94,6 +98,9 @@ impl Monitor {
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
         let (first_event, first_frame) = (out.events.len(), out.frames.len());
         self.dispatch(input, out);
+        for sent in &out.frames[first_frame..] {
+            self.intake.own.note_sent(sent.time, sent.bus, &sent.frame);
+        }
         if self.stages.sender.poller.is_some() {
             // Own requests do not come back from the bus: their answers were asked for all the same.
             for sent in &out.frames[first_frame..] {
@@ -159,7 +166,8 @@ impl Monitor {
                 let CommandOutcome { changed, refused } = stages.handle_command(now, Source::Bus(bus), command, out);
                 (changed, refused)
             });
-            stages.statistics.bad_commands += u64::from(outcome.is_err());
+            let bad_commands = &mut stages.statistics.bad_commands;
+            *bad_commands = bad_commands.saturating_add(u64::from(outcome.is_err()));
             let counter_expected = intake.next_command_counter(commands);
             stages.sender.send_reply(now, bus, &ReplyFields { outcome, command, counter_expected }, out);
             return;
@@ -172,7 +180,11 @@ impl Monitor {
                 stages.end_bus_sleep(now, out);
             }
         }
+        let step_a = stages.sampling.sampler.flow_a();
         config.input.decode(bus, frame, |Reading { channel, value }| {
+            if let (Channel::Current, Ok(current_a)) = (channel, value) {
+                intake.senders.note_current(bus, frame.id(), current_a, step_a);
+            }
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
         if !intake.listener.is_empty() {
@@ -229,6 +241,7 @@ impl Monitor {
                         intake.restart(now, out);
                         stages.begin_bus_sleep(now, out);
                     }
+                    stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
                 if stages.sender.take_freshness_due(now) {
@@ -288,6 +301,15 @@ impl Monitor {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sender.restart(time);
         let beginning = self.apply_pending(time, out);
+        if beginning == Beginning::Continued {
+            // Only where no time passed is no freshness of another run possible.
+            let passed_s = time.since(self.clock.now);
+            if !self.config.authentications().is_empty() && !(0.0..=CONTINUED_S).contains(&passed_s) {
+                self.begin_freshness(time);
+            }
+            self.find_due();
+            return;
+        }
         let (taken, stages) = (self.clock.now, &mut self.stages);
         let away_s = time.since(taken);
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;
@@ -314,6 +336,12 @@ impl Monitor {
             self.stages.sender.claim_address(time, out);
         }
         self.find_due();
+    }
+
+    /// Begins the freshness of commands and sent frames beyond that of any earlier run.
+    fn begin_freshness(&mut self, now: Timestamp) {
+        self.intake.gate_of_commands.begin(now);
+        self.stages.sender.begin_freshness(now);
     }
 
     /// Moves the clock to the time of an input.

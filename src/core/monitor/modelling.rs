@@ -99,9 +99,9 @@ pub(super) struct Modelling {
     notebook: NotebookConfig,
     pub(super) state: ModellingState,
     /// Since when the pack rests.
-    rest_since: Option<Timestamp>,
+    pub(super) rest_since: Option<Timestamp>,
     /// A row is complete.
-    has_row: bool,
+    pub(super) has_row: bool,
     /// Of the latest fit.
     outcome: FitOutcome,
 }

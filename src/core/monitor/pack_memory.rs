@@ -24,7 +24,7 @@ pub(super) struct PackMemory {
     packs: Vec<StoredPack>,
     /// The connected pack as it was before the first reading of another number.
     #[serde(skip)]
-    aside: Option<Box<StoredPack>>,
+    pub(super) aside: Option<Box<StoredPack>>,
 }
 
 /// What was learned of one pack.

@@ -18,6 +18,8 @@ pub(super) struct Sampling {
     identity_readings: u32,
     /// Whether a usable reading has come since the first input.
     pub(super) has_usable_reading: bool,
+    /// An input message has a second sender.
+    pub(super) has_second_sender: bool,
     /// Changes of the input at hand, kept for their memory.
     changes: Vec<SignalChange>,
 }
@@ -28,7 +30,7 @@ pub(super) struct Identity {
     pub(super) known: Option<f64>,
     /// Another number, and how many readings in a row have given it.
     #[serde(skip)]
-    candidate: Option<(f64, u32)>,
+    pub(super) candidate: Option<(f64, u32)>,
 }
 
 impl Identity {
@@ -64,6 +66,7 @@ impl Sampling {
             identity: Identity::default(),
             identity_readings: config.identity_readings,
             has_usable_reading: false,
+            has_second_sender: false,
             changes: Vec::new(),
         }
     }

@@ -55,7 +55,7 @@ pub(super) struct Sender {
     config: Option<OutputConfig>,
     pub(super) schedule: Schedule,
     /// A running test of an alarm frame; it ends with the process.
-    test: Option<AlarmTest>,
+    pub(super) test: Option<AlarmTest>,
     pub(super) j1939: Option<J1939>,
     pub(super) poller: Option<Poller>,
     supply: Option<SupplyConfig>,
@@ -66,8 +66,8 @@ pub(super) struct Sender {
 }
 
 /// A running test of an alarm frame.
-#[derive(Debug, Clone, Copy)]
-struct AlarmTest {
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(super) struct AlarmTest {
     rule: Rule,
     next: Timestamp,
     end: Timestamp,
@@ -199,6 +199,11 @@ impl Sender {
                 self.claim_address(now, out);
             }
         }
+    }
+
+    /// Values are compared before anything is sent: after a restart none is known.
+    pub(super) fn compare_first(&mut self, now: Timestamp) {
+        self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
     /// Makes everything due now: after a start and after time asleep.

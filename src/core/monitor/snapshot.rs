@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alarm_queue::AlarmKey;
 use super::batch::CellBatch;
 use super::buses::Buses;
+use super::continuation::Continuation;
 use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
@@ -22,8 +23,14 @@ use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
-use crate::quantity::{InvalidState, Timestamp};
+use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SamplerState};
+
+/// Charge of a stored state that no current moved.
+const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
+/// Room for limits of the current that were wider when the charge was counted, and for a clock that was set.
+const CHARGE_TOLERANCE: f64 = 2.0;
+const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 /// Layout version of [`Snapshot`].
 const SNAPSHOT_VERSION: u32 = 2;
@@ -64,6 +71,9 @@ pub struct Snapshot {
     /// Packs that were connected before.
     #[serde(default, skip_serializing_if = "PackMemory::is_empty")]
     packs: PackMemory,
+    /// `None` in states of earlier programs, and in those for a restart.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    continuation: Option<Box<Continuation>>,
 }
 
 /// One cell of a snapshot.
@@ -115,6 +125,8 @@ impl From<InvalidState> for RestoreError {
 pub(super) enum Beginning {
     /// Without a stored state.
     New,
+    /// With a state on the same clock: as if the program had not stopped.
+    Continued,
     /// With a state that was taken at the clock's present time.
     Restored,
     /// With a state of unknown age.
@@ -155,12 +167,14 @@ impl Monitor {
             modelling: modelling.stored(),
             asleep_since: sleep.since,
             packs: packs.clone(),
+            continuation: Some(Box::new(self.continuation())),
         }
     }
 
     /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
     /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
-    /// other.
+    /// other. [`Downtime::AsStamped`] says that the same clock continues: then frames, events and estimates are, byte for byte,
+    /// those of a monitor that had not stopped, unless the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
     /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
@@ -187,6 +201,9 @@ impl Monitor {
             )));
         }
         snapshot.check()?;
+        let config = sampling.sampler.config();
+        let most_a = config.current.min.abs().max(config.current.max.abs()) / f64::from(config.strings.max(1));
+        snapshot.check_charges(f64::from(config.strings.max(1)), most_a)?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
         Ok(())
     }
@@ -195,6 +212,13 @@ impl Monitor {
     /// to the caller.
     pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
+        if let (Downtime::AsStamped, Some(continuation)) = (downtime, snapshot.continuation.take()) {
+            (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
+            self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses));
+            self.stages.restore(*snapshot, now, true, out);
+            self.resume(&continuation);
+            return Beginning::Continued;
+        }
         let taken = match downtime {
             Downtime::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
             Downtime::Seconds(seconds) => Some(now.plus_secs(-seconds)),
@@ -203,7 +227,8 @@ impl Monitor {
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
         (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
         self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
-        self.stages.restore(*snapshot, now, out);
+        self.intake.senders.restart();
+        self.stages.restore(*snapshot, now, false, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
 }
@@ -222,8 +247,8 @@ impl Stages {
         }
     }
 
-    /// Continues from a checked and rebased snapshot.
-    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
+    /// Continues from a checked and rebased snapshot. `is_continued`: without a break, so that no frame was missed.
+    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, is_continued: bool, out: &mut Outputs) {
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
         let batch = CellBatch::restore(has_reported, snapshot.waiting);
         self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
@@ -234,11 +259,13 @@ impl Stages {
         let (cells, branches) = (self.estimation.cells(), self.estimation.bank.model().branches.len());
         self.packs.retain(|pack| pack.fits(cells, branches));
         self.sender.schedule = snapshot.schedule;
-        self.sender.begin_freshness(now);
+        if !is_continued {
+            self.sender.begin_freshness(now);
+        }
         self.sleep.since = snapshot.asleep_since;
-        self.restore_alarms(now, &snapshot.alarms, out);
+        self.restore_alarms(now, &snapshot.alarms, is_continued, out);
         self.statistics = snapshot.statistics;
-        self.statistics.restores += 1;
+        self.statistics.restores = self.statistics.restores.saturating_add(1);
     }
 
     /// Restores the cells' model, filters and learned values of all cells.
@@ -264,6 +291,8 @@ impl Stages {
         }
         estimation.restore(cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check)), batch);
         learning.state = state;
+        // Earlier programs combined cells beyond empty and full.
+        learning.state.pack = learning.state.pack.filter(|pack| (0.0..=1.0).contains(&pack.soc));
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }
@@ -299,10 +328,14 @@ impl Stages {
     }
 
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, out: &mut Outputs) {
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
         self.alarming.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(state);
-        self.sender.skip_counters(time, &self.alarming.engine);
+        if !is_continued {
+            self.sender.compare_first(time);
+            self.sender.skip_counters(time, &self.alarming.engine);
+        }
+        let has_changed = !is_continued || !orphans.is_empty();
         for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
@@ -310,7 +343,9 @@ impl Stages {
             out.events.push(Event { time, kind });
             self.sender.note_change(time, AlarmKey::new(rule, severity, cell));
         }
-        self.sender.send_changed_alarms(time, &self.alarming.engine, out);
+        if has_changed {
+            self.sender.send_changed_alarms(time, &self.alarming.engine, out);
+        }
     }
 }
 
@@ -324,6 +359,12 @@ impl StoredPack {
 }
 
 impl Snapshot {
+    /// The state without what holds only where the same clock continues: smaller, for a program that will be restarted.
+    #[must_use]
+    pub fn for_restart(self) -> Self {
+        Self { continuation: None, ..self }
+    }
+
     /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
     /// model file, or the label is not known.
     ///
@@ -345,16 +386,32 @@ impl Snapshot {
     /// Checks that every number is possible.
     fn check(&self) -> Result<(), RestoreError> {
         for (cell, stored) in self.cells.iter().enumerate() {
-            let at_cell =
-                |InvalidState { what, found, allowed }| RestoreError::Number { what, cell: Some(cell), found, allowed };
-            stored.check().map_err(at_cell)?;
+            stored.check().map_err(|invalid| at_cell(cell, invalid))?;
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
         self.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
+        // Stamps differ by what the clock's range holds.
+        bounds::STAMP_NS.check("the time of the state, ns", self.time.nanos() as f64)?;
         Ok(self.learning.check()?)
+    }
+
+    /// Checks that the charge between a moment of the past and the state is one that a current of at most `most_a` moves.
+    /// Only its differences mean anything, so that each of both numbers alone may be what it likes.
+    fn check_charges(&self, strings: f64, most_a: f64) -> Result<(), RestoreError> {
+        let charge_as = self.sampler.charge_as() / strings;
+        let check = |time: Timestamp, before_as: f64| {
+            let passed_s = self.time.since(time).abs() + CHARGE_TOLERANCE_S;
+            let moved_as = charge_as - before_as;
+            let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;
+            InvalidState::unless(is_possible, CHARGE, moved_as / 3600.0, "Ah that the largest plausible current moves")
+        };
+        for (cell, consumed) in self.cells.iter().enumerate().filter_map(|(i, cell)| Some((i, cell.consumed?))) {
+            check(consumed.time, consumed.charge_as).map_err(|invalid| at_cell(cell, invalid))?;
+        }
+        Ok(self.learning.learner.marks().try_for_each(|(time, charge_as)| check(time, charge_as))?)
     }
 
     /// Moves every stamp by `by_nanos`.
@@ -379,7 +436,7 @@ impl LearningState {
         self.learner.check()?;
         self.recharge.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
-        InvalidState::unless_natural("the recharge period", self.recharge_period_s.unwrap_or(0.0))?;
+        bounds::TIME_S.check_all("the recharge period", self.recharge_period_s)?;
         check_positive("the normalised recharge period", self.normalised_recharge)
     }
 }
@@ -388,19 +445,23 @@ impl StoredCell {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
         self.model_check.check()?;
-        InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;
+        bounds::STORED_SOC.check("the SOC of a full cell", self.health.full_soc)?;
         check_positive("the usable capacity", self.health.usable)?;
         check_positive("the resistance of discharge", self.health.discharge_resistance)?;
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
-        InvalidState::unless_number("the charge taken in", charge_as)?;
-        InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
+        bounds::CHARGE_AS.check("the charge taken in", charge_as)?;
+        bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {
         let forecast = self.forecast.clone();
         forecast.map_or_else(|| CellLife::new(model, config), |forecast| CellLife::restore(forecast, config))
     }
+}
+
+fn at_cell(cell: usize, InvalidState { what, found, allowed }: InvalidState) -> RestoreError {
+    RestoreError::Number { what, cell: Some(cell), found, allowed }
 }
 
 /// Checks that mean and variance are 0 or more.

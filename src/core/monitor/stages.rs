@@ -366,6 +366,9 @@ impl Stages {
             // A cell without a voltage may be the weakest.
             self.forget_pack_state();
         }
+        // A current that is not the cells', or not alone on the bus, moves their estimates.
+        self.estimation.is_current_doubtful =
+            self.sampling.has_second_sender || self.sampling.sampler.is_current_frozen();
         if is_judged {
             self.watch(now, out);
         }

@@ -12,6 +12,11 @@ use crate::alarm::{Change, Severity};
 use crate::cell::StepResult;
 use crate::quantity::BusIndex;
 
+/// Adds to a count; stored counts may be anything.
+fn add(count: &mut u64, by: u64) {
+    *count = count.saturating_add(by);
+}
+
 /// Counts since the first start.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
@@ -128,9 +133,9 @@ impl AlarmCounts {
 
     fn add(&mut self, severity: Severity) {
         match severity {
-            Severity::Info => self.info += 1,
-            Severity::Warning => self.warning += 1,
-            Severity::Severe => self.severe += 1,
+            Severity::Info => add(&mut self.info, 1),
+            Severity::Warning => add(&mut self.warning, 1),
+            Severity::Severe => add(&mut self.severe, 1),
         }
     }
 }
@@ -173,11 +178,11 @@ impl Statistics {
     /// Counts an input and its events.
     pub(super) fn note(&mut self, input: &Input<'_>, events: &[Event]) {
         match *input {
-            Input::Frame { bus, .. } | Input::SecuredFrame { bus, .. } => self.bus(bus).frames += 1,
+            Input::Frame { bus, .. } | Input::SecuredFrame { bus, .. } => add(&mut self.bus(bus).frames, 1),
             Input::Bus { bus, event: BusEvent::ErrorFrame { class }, .. } => {
                 let counts = self.bus(bus);
-                counts.error_frames += 1;
-                counts.bus_offs += u64::from(class & CAN_ERR_BUSOFF != 0);
+                add(&mut counts.error_frames, 1);
+                add(&mut counts.bus_offs, u64::from(class & CAN_ERR_BUSOFF != 0));
             }
             Input::Bus { .. }
             | Input::Tick { .. }
@@ -195,20 +200,20 @@ impl Statistics {
 
     fn note_event(&mut self, kind: &EventKind) {
         match *kind {
-            EventKind::FilterReset { .. } => self.filter_resets += 1,
-            EventKind::Trust { trusted: false, .. } => self.trust_lost += 1,
-            EventKind::Gap { .. } => self.gaps += 1,
-            EventKind::Mode { .. } => self.mode_changes += 1,
-            EventKind::HalfCycle { .. } => self.learning.half_cycles += 1,
+            EventKind::FilterReset { .. } => add(&mut self.filter_resets, 1),
+            EventKind::Trust { trusted: false, .. } => add(&mut self.trust_lost, 1),
+            EventKind::Gap { .. } => add(&mut self.gaps, 1),
+            EventKind::Mode { .. } => add(&mut self.mode_changes, 1),
+            EventKind::HalfCycle { .. } => add(&mut self.learning.half_cycles, 1),
             EventKind::Capacity { measured_ah, .. } => {
-                self.learning.capacity_updates += 1;
-                self.learning.capacity_measurements += u64::from(measured_ah.is_some());
+                add(&mut self.learning.capacity_updates, 1);
+                add(&mut self.learning.capacity_measurements, u64::from(measured_ah.is_some()));
             }
-            EventKind::RechargePeriod { .. } => self.learning.recharge_periods += 1,
+            EventKind::RechargePeriod { .. } => add(&mut self.learning.recharge_periods, 1),
             EventKind::Alarm { change: Change::Raised, severity, .. } => self.alarms_raised.add(severity),
-            EventKind::Command { .. } => self.commands += 1,
-            EventKind::PackReplaced { .. } => self.packs_replaced += 1,
-            EventKind::Store { works: false } => self.store_failures += 1,
+            EventKind::Command { .. } => add(&mut self.commands, 1),
+            EventKind::PackReplaced { .. } => add(&mut self.packs_replaced, 1),
+            EventKind::Store { works: false } => add(&mut self.store_failures, 1),
             _ => {}
         }
     }
@@ -221,9 +226,9 @@ impl Statistics {
             compared += u64::from(update.is_some());
             used += u64::from(update.is_some_and(|update| update.accepted));
         }
-        self.voltages.used += used;
-        self.voltages.gated += compared - used;
-        self.voltages.without_current += all - compared;
+        add(&mut self.voltages.used, used);
+        add(&mut self.voltages.gated, compared - used);
+        add(&mut self.voltages.without_current, all - compared);
     }
 
     fn bus(&mut self, bus: BusIndex) -> &mut BusStatistics {

@@ -114,6 +114,21 @@ impl Monitor {
         self.intake.dropped()
     }
 
+    /// Interfaces and input messages with a second sender.
+    pub fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.intake.second_senders()
+    }
+
+    /// Interfaces on which another sender uses our own identifiers, with the latest of these.
+    pub fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+        self.intake.own_id_uses()
+    }
+
+    /// Whether the current's reading is frozen: the voltages show another load.
+    pub fn is_current_frozen(&self) -> bool {
+        self.stages.sampling.sampler.is_current_frozen()
+    }
+
     /// What came from each controller that answers diagnostic requests.
     pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.intake.controllers()

@@ -6,6 +6,7 @@
 
 use super::alarming::take_show_due;
 use super::clock::HOUSEKEEPING_S;
+use super::estimation::Estimation;
 use super::publisher::learned;
 use super::stages::Stages;
 use super::{EventKind, Outputs};
@@ -75,7 +76,8 @@ impl Stages {
         let quiet = |(silence_s, share): (f64, f64)| {
             engine.is_quiet(Rule::InputMissing, silence_s) && engine.is_quiet(Rule::InputImplausible, share)
         };
-        if !out.want_alarm_inputs && worst.is_some_and(quiet) {
+        let has_second_sender = self.sampling.has_second_sender;
+        if !out.want_alarm_inputs && !has_second_sender && worst.is_some_and(quiet) {
             if take_show_due(&mut self.alarming.inputs_shown_at, now) {
                 self.show_inputs(now);
             }
@@ -91,7 +93,11 @@ impl Stages {
                 pack = Some(pack.map_or(input, |pack| pack.worst(input)));
             }
         }
-        if let Some(pack) = pack {
+        if let Some(mut pack) = pack {
+            if has_second_sender {
+                // Which of its readings are the sensor's is not known: none counts as good.
+                pack.bad_share = Observation::new(Some(1.0));
+            }
             self.observe_input(now, None, pack, out);
         }
     }
@@ -237,11 +243,14 @@ impl Stages {
 
     /// Whether no cell's innovations can change an alarm or its trust: then they are only shown.
     pub(super) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
-        let is_known_good = self.estimation.all_trusted && !self.estimation.any_mismatched;
+        let Estimation { all_trusted, any_mismatched, is_current_doubtful, .. } = self.estimation;
+        let is_known_good = all_trusted && !any_mismatched && !is_current_doubtful;
         is_known_good && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
-            worst <= bank.config().consistency.limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
+            worst <= bank.config().consistency.limit
+                && bank.are_all_plausible()
+                && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
         }
     }
 

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::quantity::bounds;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
 
 /// Inputs of a cell's update, at the time of its voltage.
@@ -37,9 +38,11 @@ impl CellSample {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        let known = [self.current_a, self.temperature_c].into_iter().flatten();
-        let numbers = [self.voltage_v, self.charge_as, self.offset_s, self.unmeasured_s].into_iter().chain(known);
-        InvalidState::unless_numbers("a sample that waits for its step", numbers)
+        bounds::VOLTAGE_V.check("the voltage of a sample that waits for its step", self.voltage_v)?;
+        bounds::CURRENT_A.check_all("its current", self.current_a)?;
+        bounds::CHARGE_AS.check("its charge", self.charge_as)?;
+        bounds::TEMPERATURE_C.check_all("its temperature", self.temperature_c)?;
+        bounds::TIME_S.check_all("its times", [self.offset_s, self.unmeasured_s])
     }
 
     /// The same voltage, measured at this moment.
@@ -52,7 +55,7 @@ impl CellSample {
 
 /// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
 /// answer to a diagnostic request does.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Moment {
     pub(super) time: Timestamp,
     pub(super) current_a: Option<f64>,

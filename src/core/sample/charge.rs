@@ -12,6 +12,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Timestamp};
 
 /// Cumulative charge and unmeasured time at one moment.
@@ -132,8 +133,14 @@ impl ChargeCounter {
     /// Checks a stored counter; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let ChargeTotals { charge_as, offset_s, unmeasured_s, flowing_s, discharging_s } = self.totals;
-        let all = [charge_as, offset_s, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
-        InvalidState::unless_numbers("the counted charge, a time or its current", all)
+        bounds::CHARGE_AS.check("the counted charge", charge_as)?;
+        bounds::CURRENT_A.check_all("the current that is counted", self.current_a)?;
+        bounds::TIME_S.check_all("the time that charge is counted", [offset_s, unmeasured_s, flowing_s, discharging_s])
+    }
+
+    /// Charge counted so far, As.
+    pub(super) fn charge_as(&self) -> f64 {
+        self.totals.charge_as
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {

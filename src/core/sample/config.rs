@@ -61,6 +61,8 @@ pub struct SampleConfig {
     pub contactor: Option<ContactorConfig>,
     /// Temperature sensor of each cell; `None` = no sensor, the thermal model alone.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
+    /// Standard deviation of a voltage sensor's noise, V.
+    pub voltage_noise_v: f64,
     /// Ambient temperature without a sensor, degrees C.
     pub ambient_c: f64,
 }

@@ -8,9 +8,11 @@
 //! * [`sampler`] holds one signal per channel and combines samples.
 
 pub mod cell_sample;
+mod channels;
 pub mod charge;
 pub mod config;
 pub mod counts;
+mod frozen;
 pub mod sampler;
 pub mod signal;
 

@@ -12,9 +12,11 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::cell_sample::{CellSample, Moment};
+use super::channels::{channels, limits, should_move_s};
 use super::charge::{ChargeCounter, ChargeTotals};
-use super::config::{Limits, SampleConfig, VoltageSource};
+use super::config::{SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
+use super::frozen::{self, FrozenCheck};
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
@@ -41,6 +43,8 @@ pub struct SamplerState {
     unused_readings: u64,
     #[serde(default)]
     counts: ReadingCounts,
+    #[serde(default)]
+    frozen: FrozenCheck,
 }
 
 impl SamplerState {
@@ -50,13 +54,20 @@ impl SamplerState {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.charge.check()?;
+        self.frozen.check()?;
         self.signals.iter().try_for_each(Signal::check)
+    }
+
+    /// Charge counted up to the latest reading, As, for the pack.
+    pub fn charge_as(&self) -> f64 {
+        self.charge.charge_as()
     }
 
     /// Moves every stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));
         self.charge.rebase(by_nanos);
+        self.frozen.rebase(by_nanos);
         self.began = self.began.map(|stamp| stamp.plus_nanos(by_nanos));
         self.latest = self.latest.plus_nanos(by_nanos);
     }
@@ -75,6 +86,8 @@ pub struct Sampler {
     /// Signals of the cells' own voltages; empty where the pack's total is measured.
     cell_voltages: Range<usize>,
     flow_a: f64,
+    /// Step of a voltage that is no noise, V.
+    step_v: f64,
     state: SamplerState,
     /// No signal becomes stale before this time; `None` = unknown.
     next_stale: Option<Timestamp>,
@@ -110,6 +123,7 @@ impl Sampler {
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
         let first = 1 + sensors;
         Self {
+            step_v: frozen::step_v(config.voltage_noise_v),
             config,
             channels,
             sensors,
@@ -147,15 +161,21 @@ impl Sampler {
         let time = self.advance(time);
         let channel = reading.channel;
         let Some(slot) = self.slot(channel) else {
-            self.state.unused_readings += 1;
+            self.state.unused_readings = self.state.unused_readings.saturating_add(1);
             return None;
         };
         self.refresh_shared_inputs(time);
         let limits = limits(&self.config, channel);
-        let value = reading.value.map(|value| value / self.divisor(channel));
+        let mut value = reading.value.map(|value| value / self.divisor(channel));
+        if let (Channel::Current, Ok(current_a)) = (channel, value)
+            && self.state.frozen.handle_current(time, current_a)
+        {
+            value = Err(Fault::Stuck);
+        }
         let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &self.shared.totals));
         self.state.counts.note(judged.value.err());
-        self.state.counts.levels_believed += u64::from(judged.is_new_level);
+        let counts = &mut self.state.counts;
+        counts.levels_believed = counts.levels_believed.saturating_add(u64::from(judged.is_new_level));
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
             // Only a good signal turns bad, and only a bad one good: the count never falls below 0.
@@ -180,9 +200,25 @@ impl Sampler {
                 None
             }
             Channel::ReportedSoc | Channel::ReportedSoh | Channel::SupplyVoltage | Channel::PackIdentity => None,
-            Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
-            Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
+            Channel::PackVoltage => {
+                self.state.frozen.handle_voltage(true, value, self.step_v);
+                Some(self.sample(CellIndex(0), value))
+            }
+            Channel::CellVoltage(cell) => {
+                self.state.frozen.handle_voltage(cell.0 == 0, value, self.step_v);
+                Some(self.sample(cell, value))
+            }
         }
+    }
+
+    /// Whether the current's reading is frozen: the voltages show another load.
+    pub fn is_current_frozen(&self) -> bool {
+        self.state.frozen.is_frozen()
+    }
+
+    /// Change of the pack current that is no noise of its sensor, A.
+    pub fn flow_a(&self) -> f64 {
+        self.flow_a
     }
 
     /// Handles the state of the contactors: with open ones no current flows, whatever its sensor reports.
@@ -212,7 +248,8 @@ impl Sampler {
         if !signal.take_ordinary(time, voltage_v, &config.voltage, clock_s) {
             return None;
         }
-        state.counts.accepted += 1;
+        state.counts.accepted = state.counts.accepted.saturating_add(1);
+        state.frozen.handle_voltage(cell.0 == 0, voltage_v, self.step_v);
         Some(self.sample(cell, voltage_v))
     }
 
@@ -244,6 +281,7 @@ impl Sampler {
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
+        self.state.frozen.restart();
         self.state.began = Some(time);
         self.state.latest = time;
         (self.next_stale, self.shared.is_known) = (None, false);
@@ -529,49 +567,6 @@ impl Sampler {
                 Some(first + found)
             }
         }
-    }
-}
-
-fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
-    match channel {
-        Channel::Current => &config.current,
-        Channel::Temperature(_) => &config.temperature,
-        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
-            &config.voltage
-        }
-        Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
-        Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
-        Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
-    }
-}
-
-/// Every channel in use, in the order of the signals.
-fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
-    let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
-    let mut channels = vec![Channel::Current];
-    channels.extend((0..sensors).map(|sensor| Channel::Temperature(SensorIndex(narrow(sensor)))));
-    match config.voltage_source {
-        VoltageSource::Cells => channels.extend((0..config.cells).map(|cell| Channel::CellVoltage(CellIndex(cell)))),
-        VoltageSource::PackTotal { .. } => channels.push(Channel::PackVoltage),
-    }
-    channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
-    channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
-    channels.extend(config.contactor.as_ref().map(|_| Channel::Contactor));
-    channels
-}
-
-/// Clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
-/// constant, so only discharging counts for a voltage; temperature and current should move while current flows.
-fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
-    match channel {
-        Channel::Current | Channel::Temperature(_) => totals.flowing_s,
-        Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // No rule says when they should move.
-        Channel::ReportedSoc
-        | Channel::ReportedSoh
-        | Channel::SupplyVoltage
-        | Channel::PackIdentity
-        | Channel::Contactor => 0.0,
     }
 }
 

@@ -15,6 +15,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::config::Limits;
+use crate::quantity::bounds;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
 /// Consecutive readings that must agree on a new level: two could be one disturbance.
@@ -162,8 +163,10 @@ impl Signal {
     /// Checks a stored signal; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
-        let others = [self.rests_since_s, self.rests_at.unwrap_or(0.0), self.bad_share];
-        InvalidState::unless_numbers("a signal", values.chain(others))
+        InvalidState::unless_numbers("a signal", values.chain(self.rests_at))?;
+        bounds::TIME_S.check("how long a signal has been unchanged", self.rests_since_s)?;
+        let share = self.bad_share;
+        InvalidState::unless((0.0..=1.0).contains(&share), "the share of a signal's bad readings", share, "0 to 1")
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {
@@ -238,7 +241,7 @@ impl Signal {
                 Some(Err(fault))
             }
             (Some(_), Some(_)) => {
-                self.bad_readings += readings;
+                self.bad_readings = self.bad_readings.saturating_add(readings);
                 None
             }
             (Some(_), None) => {

@@ -23,17 +23,16 @@ use super::document::{Document, Faults, TablePlace};
 use super::schema::Presence::{Optional, Required};
 use super::schema::{SchemaReader, Section as _, SectionInfo, section};
 use super::setting::ValueRange::{Above, Any, Between, NotEmpty};
-use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
+use super::setting::{Setting, ValueFault, ValueRange, in_range, typed, within};
 use super::{ConfigFaults, ConfigFiles, ReadFile, Sources};
 use crate::cell::{
     AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, ModelSpread, NegativeMaterial, PositiveMaterial, Table,
     Thermal,
 };
 use crate::monitor::ModelState;
+use crate::quantity::bounds;
 pub use source::{KnownBy, LearnedFrom, MeasuredRange, ModelSource, SourcedModel, state_words};
 pub use write::text;
-
-const INF: f64 = f64::INFINITY;
 
 section! {
     /// A cell type.
@@ -45,9 +44,9 @@ section! {
         /// Chemistry, for people.
         chemistry: Option<String>, "", NotEmpty, Optional;
         /// Capacity on the label, which SOH is relative to.
-        rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        rated_capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
         /// Charge of a new cell from full to empty open-circuit voltage.
-        capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
         /// How far the open-circuit curve shifts as the cell loses capacity, where `[electrodes]` does not say it: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner. Without either: 0.
         ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional;
         /// Lowest voltage under load.
@@ -63,11 +62,11 @@ section! {
         /// SOC breakpoints, strictly rising from 0 to 1.
         soc: Vec<f64>, "fraction", Between(0.0, 1.0), Required;
         /// Temperature breakpoints, strictly rising.
-        temperature_c: Vec<f64>, "degrees C", Between(-100.0, 200.0), Required;
+        temperature_c: Vec<f64>, "degrees C", within(bounds::TEMPERATURE_C), Required;
         /// Open-circuit voltage, strictly rising along each row.
         ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
         /// Series resistance of a new cell.
-        r0_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        r0_ohm: Vec<Vec<f64>>, "ohm", within(bounds::RESISTANCE_OHM), Required;
         /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` determines it. Without it: the estimator's `model_error_v_sqrt_s`.
         voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
     }
@@ -77,9 +76,9 @@ section! {
     /// Where the cell was measured, as `packwatch fit` writes it. For people: beyond these temperatures the tables of a fit continue with larger `voltage_error_v`, so that estimates are less certain there.
     Measured at "measured" {
         /// Lowest and highest temperature. Without it: not known.
-        temperature_c: Option<Vec<f64>>, "degrees C", Between(-100.0, 200.0), Optional;
+        temperature_c: Option<Vec<f64>>, "degrees C", within(bounds::TEMPERATURE_C), Optional;
         /// Lowest and highest current; positive = discharge. Without it: not known.
-        current_a: Option<Vec<f64>>, "A", Between(-1e6, 1e6), Optional;
+        current_a: Option<Vec<f64>>, "A", within(bounds::CURRENT_A), Optional;
         /// Lowest and highest state of charge. Without it: not known.
         soc: Option<Vec<f64>>, "fraction", Between(-1.0, 2.0), Optional;
     }
@@ -89,9 +88,9 @@ section! {
     /// A branch of a resistor and a capacitor in parallel, 1 to 3 of them.
     BranchTables at "tables.branches" gives Branch, |keys| {
         /// Resistance of a new cell.
-        r_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required => r_ohm: Table { values: keys.r_ohm.clone() };
+        r_ohm: Vec<Vec<f64>>, "ohm", within(bounds::RESISTANCE_OHM), Required => r_ohm: Table { values: keys.r_ohm.clone() };
         /// Capacitance.
-        c_farad: Vec<Vec<f64>>, "F", Above(0.0, INF), Required => c_farad: Table { values: keys.c_farad.clone() };
+        c_farad: Vec<Vec<f64>>, "F", within(bounds::CAPACITANCE_F), Required => c_farad: Table { values: keys.c_farad.clone() };
     }
 }
 

@@ -5,6 +5,7 @@ use std::num::NonZeroU32;
 use super::alarm::RatedCell;
 use super::keys::{Pack, TemperatureInput};
 use super::tables::RawTables;
+use crate::can::CanId;
 use crate::can::decode::InputMap;
 use crate::can::diagnostic::Answer;
 use crate::can::flood::FloodConfig;
@@ -13,7 +14,7 @@ use crate::can::poll::PollConfig;
 use crate::cell::CellModel;
 use crate::health::HealthConfig;
 use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig, SupplyConfig};
-use crate::quantity::SensorIndex;
+use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
 /// The frames of the buses, received and sent.
@@ -23,6 +24,7 @@ pub(super) struct Traffic {
     pub answers: Vec<Answer>,
     pub poll: Option<PollConfig>,
     pub guards: Vec<GuardConfig>,
+    pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
     pub output: Option<OutputConfig>,
     pub commands: Option<CommandConfig>,
     pub j1939: Option<J1939Config>,
@@ -41,6 +43,7 @@ pub(super) fn monitor(
     let rated = RatedCell::new(rated_ah, raw.recharge.as_ref()?);
     model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
     let capacity = raw.capacity.as_ref()?.config(rated_ah);
+    let estimator = raw.estimator.as_ref()?.config(pack, &model, &capacity, found.voltage_step_v);
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
         interfaces: raw.interfaces.len(),
@@ -52,14 +55,15 @@ pub(super) fn monitor(
             .as_ref()
             .map(|keys| SupplyConfig { minimum_v: keys.minimum_v, max_age_s: keys.max_age_s }),
         guards: traffic.guards,
+        cycle_times_s: traffic.cycle_times_s,
         asleep_after_s: Some(raw.input.as_ref()?.asleep_after_s).filter(|after_s| *after_s > 0.0),
         identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output: traffic.output,
         commands: traffic.commands,
         j1939: traffic.j1939,
-        sample: sample(raw, pack, &model, found)?,
-        estimator: raw.estimator.as_ref()?.config(pack, &model, &capacity, found.voltage_step_v),
+        sample: SampleConfig { voltage_noise_v: estimator.voltage.noise_v, ..sample(raw, pack, &model, found)? },
+        estimator,
         health: HealthConfig {
             transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
             capacity,
@@ -109,6 +113,7 @@ fn sample(raw: &RawTables, pack: &Pack, model: &CellModel, found: &DbcRanges) ->
             limits: Limits { min: f64::NEG_INFINITY, max: f64::INFINITY, ..reported_limits(keys.max_age_s) },
         }),
         sensor_of_cell: sensors(&raw.temperatures, cells),
+        voltage_noise_v: 0.0,
         ambient_c: pack.ambient_c,
     })
 }

@@ -12,7 +12,7 @@ use super::schema::Presence::{Default, Optional, Required};
 use super::schema::SubTables;
 use super::schema::section;
 use super::setting::ValueRange::{self, Above, Any, Between, NotEmpty};
-use super::setting::{CellRanges, NumberRange, choice};
+use super::setting::{CellRanges, NumberRange, choice, within};
 use super::threshold::Threshold;
 use super::{StoreConfig, VehicleIdentity};
 
@@ -21,7 +21,7 @@ use crate::can::e2e::Profile;
 use crate::can::secoc;
 use crate::cell::{CapacityState, Chemistry, Discretisation};
 use crate::health::RechargeAlarm;
-use crate::quantity::MAX_CELLS;
+use crate::quantity::{MAX_CELLS, bounds};
 
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
 pub(crate) use input::{
@@ -36,9 +36,9 @@ pub(crate) use traffic::{
 };
 
 /// Coldest and hottest temperature that may be configured, degrees C.
-const TEMPERATURE_C: ValueRange = Between(-100.0, 200.0);
+const TEMPERATURE_C: ValueRange = within(bounds::TEMPERATURE_C);
 /// Range of standard deviations and of noise densities.
-const DEVIATION: ValueRange = Between(0.0, 1e6);
+const DEVIATION: ValueRange = within(bounds::DEVIATION);
 
 /// Which way a positive current flows on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -140,9 +140,9 @@ section! {
         /// Highest voltage of a cell without a model file: full. Without it: usual of the chemistry (LFP 3.65 V, else 4.2 V).
         voltage_max_v: Option<f64>, "V", Above(0.0, 100.0), Optional;
         /// Capacity on the label of one cell, which SOH is relative to. Without it: the cell model's.
-        rated_capacity_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+        rated_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional;
         /// Capacity of a cell to start from, before any is learned. Without it: the cell model's `capacity_ah`.
-        initial_capacity_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+        initial_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional;
         /// Standard deviation of the capacity to start from. Without it: 10 % of that capacity.
         initial_capacity_std_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
         /// Temperature of the surroundings, for cells without a sensor.

@@ -33,8 +33,10 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::can::CanId;
 use crate::can::dbc::Database;
 use crate::monitor::MonitorConfig;
+use crate::quantity::BusIndex;
 
 mod alarm;
 pub mod cell_model;
@@ -220,6 +222,18 @@ fn read_all(files: &ConfigFiles, read: ReadFile<'_>) -> Result<(Config, Descript
     }
 }
 
+/// Cycle times that the DBC files give the input messages, s.
+fn cycle_times_s(found: &[resolve::ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
+    let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
+    let times = in_frames.filter_map(|resolved| {
+        let cycle_ms = resolved.message.cycle_time_ms.filter(|cycle_ms| *cycle_ms > 0)?;
+        Some((resolved.bus, resolved.message.id, f64::from(cycle_ms) / 1000.0))
+    });
+    let mut times: Vec<_> = times.collect();
+    times.dedup_by_key(|(bus, id, _)| (*bus, *id));
+    times
+}
+
 fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
     let path = files.main.as_path();
     let sources = Sources::read(files, read, faults)?;
@@ -230,6 +244,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     cross::check(&raw, model.as_ref(), faults);
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
+    plausible::initial_capacity(&raw, model.as_ref(), faults);
     let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
@@ -255,6 +270,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
         answers: answers(&found).ok()?,
         poll,
         guards,
+        cycle_times_s: cycle_times_s(&found),
         output,
         commands,
         j1939,

@@ -11,7 +11,7 @@ use crate::can::dbc::{MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout};
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::cell::CellModel;
-use crate::quantity::Channel;
+use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
 /// A scale that differs from the unit's by less is a calibration.
@@ -443,6 +443,18 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel, faults: &mut F
     match range.input.filter(|_| !range.place.has(key)) {
         Some(input) => input.fault(faults, "signal", &what),
         None => range.place.fault(faults, key, &what),
+    }
+}
+
+/// Notes an initial capacity that no cell of the model can have.
+pub(super) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
+    let Some(initial_ah) = pack.initial_capacity_ah else { return };
+    if !bounds::INITIAL_CAPACITY.has(initial_ah / model.capacity_ah) {
+        let [low, high] =
+            [bounds::INITIAL_CAPACITY.low, bounds::INITIAL_CAPACITY.high].map(|by| digits(by * model.capacity_ah, 3));
+        let what = format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name);
+        pack.place.fault(faults, "initial_capacity_ah", &what);
     }
 }
 

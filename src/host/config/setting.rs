@@ -7,6 +7,7 @@ use toml::Spanned;
 use toml::de::{DeInteger, DeValue};
 
 use super::schema::{Key, TableReader};
+use crate::quantity::bounds::Bounds;
 
 /// Most numbers in a row: more than any pack has cells.
 const MAX_ROW: usize = 2048;
@@ -22,6 +23,11 @@ pub(crate) enum ValueRange {
     Above(f64, f64),
     /// A text or list that is not empty.
     NotEmpty,
+}
+
+/// The range of a key with physical bounds.
+pub(crate) const fn within(bounds: Bounds) -> ValueRange {
+    ValueRange::Between(bounds.low, bounds.high)
 }
 
 impl ValueRange {

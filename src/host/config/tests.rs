@@ -314,7 +314,7 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
         "pack.toml:3: pack.x is not a known key",
         "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
         "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",
-        "cell.toml:4: capacity_ah = 0, must be above 0 and at most 100000",
+        "cell.toml:4: capacity_ah = 0, must be 0.001 to 100000",
         "cell.toml:10: tables.soc = [0, 0.5, 0.5], must begin with 0 and end with 1",
         "cell.toml:10: tables.soc: 0.5 follows 0.5, must rise strictly",
         "pack.dbc:9: identifier 4000, must be 0 to 2047, or have bit 31 set for an extended one",

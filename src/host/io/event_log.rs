@@ -10,7 +10,9 @@ use crate::can::diagnostic::MessageLoss;
 use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
+use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
+use crate::can::rate::SenderChange;
 use crate::cell::Chemistry;
 use crate::config::VehicleIdentity;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
@@ -107,6 +109,18 @@ impl EventLog {
             }
             EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
+            EventKind::SecondSender(SenderChange { bus, id, active: true, frames_per_s, expected_per_s }) => {
+                tracing::warn!(interface = self.name(bus), %id, frames_per_s, expected_per_s, "second sender");
+            }
+            EventKind::SecondSender(SenderChange { bus, id, .. }) => {
+                tracing::info!(interface = self.name(bus), %id, "second sender gone");
+            }
+            EventKind::OwnIdentifier(OwnIdChange { bus, id, active: true, .. }) => {
+                tracing::warn!(interface = self.name(bus), %id, "another sender uses an identifier of ours");
+            }
+            EventKind::OwnIdentifier(OwnIdChange { bus, id, frames, .. }) => {
+                tracing::info!(interface = self.name(bus), %id, frames, "no other sender uses identifiers of ours");
             }
             EventKind::MessageLoss(MessageLoss { bus, id, fault, lost }) => {
                 tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());

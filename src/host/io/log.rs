@@ -363,7 +363,7 @@ impl ReadState {
                 Some(Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } })
             }
             Line::Dropped { interface, frames } => {
-                self.counts.dropped_frames += frames;
+                self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
                 // The line has no stamp: it belongs to the frame before it, if there was one.
                 let time = self.latest?.plus_nanos(-self.shift_ns);

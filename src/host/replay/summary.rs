@@ -108,6 +108,20 @@ pub(super) fn note_event(
                 "flood_over"
             }
         }
+        EventKind::SecondSender(change) => {
+            if change.active {
+                "second_sender"
+            } else {
+                "second_sender_gone"
+            }
+        }
+        EventKind::OwnIdentifier(change) => {
+            if change.active {
+                "own_identifier_used"
+            } else {
+                "own_identifier_free"
+            }
+        }
         EventKind::MessageLoss(_) => "message_loss",
         EventKind::BusAsleep { asleep: true, .. } => "bus_asleep",
         EventKind::BusAsleep { asleep: false, .. } => "bus_awake",

@@ -4,11 +4,12 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
-    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
-    StoreStatus, VERSION,
+    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, Intruder, IntruderKind,
+    LossStatus, MessageFlood, MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters,
+    StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
+use crate::can::CanId;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::cell::LossModes;
@@ -143,6 +144,8 @@ impl Sources<'_> {
             asleep_since: self.monitor.asleep_since(),
             poll: self.monitor.poll().map(|(silent, refused)| PollStatus { silent, refused }),
             floods: self.floods(),
+            intruders: self.intruders(),
+            current_frozen: self.monitor.is_current_frozen(),
             latency: self.latency.clone(),
             store: self.store,
             events: Vec::new(),
@@ -204,6 +207,14 @@ impl Sources<'_> {
             }
         });
         each.collect()
+    }
+
+    fn intruders(&self) -> Vec<Intruder> {
+        let of = |kind| move |(bus, id): (BusIndex, CanId)| (bus, id, kind);
+        let second = self.monitor.second_senders().map(of(IntruderKind::SecondSender));
+        let own = self.monitor.own_id_uses().map(of(IntruderKind::OwnIdentifier));
+        let all = second.chain(own);
+        all.map(|(bus, id, kind)| Intruder { interface: self.name(bus), id: id.to_string(), kind }).collect()
     }
 
     fn floods(&self) -> Vec<MessageFlood> {

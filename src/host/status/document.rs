@@ -77,6 +77,12 @@ pub struct StatusDocument {
     pub poll: Option<PollStatus>,
     /// Input messages with frames dropped beyond the accepted rate.
     pub floods: Vec<MessageFlood>,
+    /// Senders on the buses that should not be there.
+    #[serde(default)]
+    pub intruders: Vec<Intruder>,
+    /// The current's reading is frozen: the voltages show another load.
+    #[serde(default)]
+    pub current_frozen: bool,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
     pub latency: Latency,
     /// The store of state and history; `None` = it is off.
@@ -390,6 +396,27 @@ pub struct MessageFlood {
     pub id: String,
     /// Frames.
     pub dropped: u64,
+}
+
+/// What a sender that should not be there does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IntruderKind {
+    /// It sends an input message beside its own sender.
+    SecondSender,
+    /// It sends with an identifier of this program's frames.
+    OwnIdentifier,
+}
+
+/// A sender that should not be there.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Intruder {
+    /// Interface.
+    pub interface: String,
+    /// Identifier of its latest frames.
+    pub id: String,
+    /// What it does.
+    pub kind: IntruderKind,
 }
 
 /// The store of state and history.

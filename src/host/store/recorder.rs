@@ -68,7 +68,7 @@ impl Recorder {
         let stamp = Stamp::replayed(now);
         self.database.set_horizon_ns(self.keep_years.and_then(|years| stamp.years_ago_ns(years)));
         let folder = self.folder.to_string();
-        let document = StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot()) };
+        let document = StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot().for_restart()) };
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp, rows });
         let written = self.database.commit(batch.as_slice(), Some(StateRecord::new(&document, exact, false)?));
         written.map_err(|error| format!("{}: {error}", self.folder))

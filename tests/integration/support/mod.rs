@@ -1,6 +1,7 @@
 //! Helpers that several subjects share.
 
 pub(crate) mod config_texts;
+pub(crate) mod dice;
 pub(crate) mod measured;
 pub(crate) mod oracle;
 pub(crate) mod rig;

@@ -118,8 +118,8 @@ impl StatusCounts {
     }
 }
 
-/// State of one message's receiver.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+/// State of one message's receiver. Its counts are stored apart from it.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Receiver {
     /// Counter of the last valid frame; `None` = none yet.
     last_valid: Option<u8>,
@@ -129,6 +129,7 @@ pub struct Receiver {
     no_new_or_repeated: u8,
     /// Valid frames still required.
     sync: u8,
+    #[serde(skip)]
     counts: StatusCounts,
 }
 
@@ -155,6 +156,12 @@ impl Receiver {
     /// A receiver that waits for its first frame and has these counts.
     pub(crate) fn with_counts(counts: StatusCounts) -> Self {
         Self { counts, ..Self::default() }
+    }
+
+    /// Continues as `stored`, with the counts of this one.
+    pub(crate) fn resume(&mut self, profile: Profile, stored: &Self) {
+        let last_valid = stored.last_valid.filter(|counter| *counter <= profile.max_counter());
+        *self = Self { last_valid, counts: self.counts, ..stored.clone() };
     }
 
     /// Waits for a first frame again and keeps the counts.

@@ -11,6 +11,8 @@
 //! nodes under one address would destroy each other: a node that receives its own NAME falls silent. (A socket does not
 //! receive its own frames.)
 
+use serde::{Deserialize, Serialize};
+
 use super::event::NodeEvent;
 use super::id::{GLOBAL_ADDRESS, NULL_ADDRESS, PGN_ADDRESS_CLAIMED, PRIORITY, can_id};
 use super::name::Name;
@@ -26,7 +28,7 @@ const CLAIM_SPACING_NS: i64 = 50_000_000;
 const MAX_LOSER_DELAY_MS: u64 = 153;
 
 /// State of the claim.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum ClaimState {
     /// Not started.
     Idle,
@@ -86,7 +88,7 @@ fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
 }
 
 /// The claim to one address.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct AddressClaim {
     name: Name,
     address: u8,
@@ -111,6 +113,11 @@ impl AddressClaim {
             last_sent: None,
             is_first: false,
         }
+    }
+
+    /// Whether both claim the same address for the same node.
+    pub(super) fn is_same(&self, other: &Self) -> bool {
+        (self.name, self.address) == (other.name, other.address)
     }
 
     /// Starts, or starts again after time without listening.

@@ -6,6 +6,8 @@
 //!
 //! The state "everything is known" follows the same rule, but only towards known: unknown is sent at once.
 
+use serde::{Deserialize, Serialize};
+
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
@@ -25,7 +27,7 @@ pub struct ActiveCode {
 }
 
 /// One code, active and as sent.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
     /// Active now.
@@ -100,7 +102,7 @@ fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
 }
 
 /// All codes.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(super) struct Codes {
     followed: Vec<FollowedCode>,
     all_known: bool,

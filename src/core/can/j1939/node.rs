@@ -9,6 +9,8 @@
 
 use std::collections::VecDeque;
 
+use serde::{Deserialize, Serialize};
+
 use super::address::{AddressClaim, ClaimState};
 use super::codes::{ActiveCode, Codes};
 use super::event::NodeEvent;
@@ -68,7 +70,7 @@ pub struct NodeOutputs {
 }
 
 /// An answer to a request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum PendingAnswer {
     Dm1,
     Dm2,
@@ -76,7 +78,7 @@ enum PendingAnswer {
 }
 
 /// One node. Call [`poll`](Self::poll) at [`next_due`](Self::next_due), or at every tick.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Node {
     address: u8,
     claim: AddressClaim,
@@ -108,6 +110,13 @@ impl Node {
             next_answer_at: LONG_AGO,
             polled_at: LONG_AGO,
             codes_left_out: 0,
+        }
+    }
+
+    /// Continues as `stored`, if that is the same node.
+    pub fn resume(&mut self, stored: &Self) {
+        if self.address == stored.address && self.claim.is_same(&stored.claim) {
+            self.clone_from(stored);
         }
     }
 

@@ -3,6 +3,8 @@
 //! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last one was sent, so packets
 //! keep their distance after a late poll.
 
+use serde::{Deserialize, Serialize};
+
 use super::id::{GLOBAL_ADDRESS, PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, TRANSPORT_PRIORITY, can_id, pgn_bytes};
 use super::trouble_code::{DmPayload, MAX_PAYLOAD};
 use crate::can::Frame;
@@ -20,7 +22,7 @@ pub(super) const PACKET_BYTES: usize = 7;
 const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);
 
 /// A transfer under way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Transfer {
     /// Transferred parameter group.
     pub(super) pgn: u32,

@@ -161,7 +161,8 @@ impl Lamps {
 }
 
 /// The payload of a DM1 or DM2: 8 bytes, or more for a transfer in packets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "Vec<u8>", from = "Vec<u8>")]
 pub struct DmPayload {
     bytes: [u8; MAX_PAYLOAD],
     len: usize,
@@ -172,6 +173,21 @@ impl DmPayload {
     /// The bytes.
     pub fn as_slice(&self) -> &[u8] {
         self.bytes.get(..self.len).unwrap_or(&self.bytes)
+    }
+}
+
+impl From<DmPayload> for Vec<u8> {
+    fn from(payload: DmPayload) -> Self {
+        payload.as_slice().to_vec()
+    }
+}
+
+/// A stored payload; what is longer than [`MAX_PAYLOAD`] is cut off.
+impl From<Vec<u8>> for DmPayload {
+    fn from(stored: Vec<u8>) -> Self {
+        let mut bytes = [0xFF; MAX_PAYLOAD];
+        bytes.iter_mut().zip(&stored).for_each(|(place, byte)| *place = *byte);
+        Self { bytes, len: stored.len().min(MAX_PAYLOAD), left_out: 0 }
     }
 }
 

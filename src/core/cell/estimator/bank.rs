@@ -26,10 +26,11 @@ use super::cell_estimator::{CellEstimator, thermal_c};
 use super::filter::Filter;
 use super::memory::Memory;
 use super::slow_branch::SlowBranch;
-use super::state_vector::{LOG_RESISTANCE, widened, within_bounds};
+use super::state_vector::{CAPACITY, LOG_RESISTANCE, widened, within_bounds};
 use super::step::{CellStep, StepResult};
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
+use crate::quantity::bounds;
 
 /// The estimators of a pack's cells.
 #[derive(Debug, Clone)]
@@ -37,6 +38,8 @@ pub struct EstimatorBank {
     model: CellModel,
     config: EstimatorConfig,
     constants: KernelConstants,
+    /// Smallest and largest capacity that is believed, Ah.
+    plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
     /// The steps of the batch. Inputs of absent cells are stale and not read.
@@ -80,6 +83,7 @@ impl EstimatorBank {
         let idle = StepResult { update: None, reset: false };
         let mut bank = Self {
             constants: KernelConstants::new(model, config),
+            plausible_ah: plausible_ah(model, config),
             model: model.clone(),
             config: *config,
             filters,
@@ -228,6 +232,27 @@ impl EstimatorBank {
         each_array!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
+    /// Whether a cell's SOC, resistance and capacity are ones that a cell of the model can have.
+    #[inline]
+    pub fn is_plausible(&self, cell: usize) -> bool {
+        let (block, lane) = (cell / WIDTH, cell % WIDTH);
+        let [soc, log_resistance, capacity_ah] = each_array!(&self.filters, x => {
+            let mean = &x.blocks[block].mean;
+            [mean[0].0[lane], mean[LOG_RESISTANCE].0[lane], mean[CAPACITY].0[lane]]
+        });
+        let (low_ah, high_ah) = self.plausible_ah;
+        !self.cells[cell].has_filter
+            || (bounds::TRUSTED_SOC.has(soc)
+                && bounds::TRUSTED_LOG_RESISTANCE.has(log_resistance)
+                && low_ah <= capacity_ah
+                && capacity_ah <= high_ah)
+    }
+
+    /// Whether all cells are [plausible](Self::is_plausible).
+    pub fn are_all_plausible(&self) -> bool {
+        (0..self.cells.len()).all(|cell| self.is_plausible(cell))
+    }
+
     /// Largest [`Self::mean_nis`] of all cells, not below 0; NaN counts as infinite.
     pub fn worst_nis(&self) -> f64 {
         let larger = |a: f64, b: f64| match () {
@@ -349,6 +374,12 @@ impl EstimatorBank {
             ScalarGaussian { mean: state.mean[i].0[lane], variance }
         })
     }
+}
+
+/// Smallest and largest capacity that is believed, Ah: by the model's and the configured one.
+fn plausible_ah(model: &CellModel, config: &EstimatorConfig) -> (f64, f64) {
+    let (model_ah, initial_ah) = (model.capacity_ah, config.initial.capacity_ah);
+    (bounds::TRUSTED_CAPACITY.low * model_ah.min(initial_ah), bounds::TRUSTED_CAPACITY.high * model_ah.max(initial_ah))
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::downtime::update_after_downtime;
-use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
+use super::filter::{Filter, LearnedState, each, initial_state, is_possible, predict, update};
 use super::memory::{Memory, USED_PRIOR};
 use super::noise::VoltageReading;
 use super::slow_branch::SlowBranch;
@@ -18,6 +18,7 @@ use super::step::{CellStep, StepResult};
 use crate::cell::circuit;
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
+use crate::quantity::bounds;
 
 /// Usual load before a start under load, per rated capacity: C/2.
 const USUAL_LOAD_PER_H: f64 = 0.5;
@@ -59,7 +60,10 @@ impl CellEstimator {
     /// Predicts over the time since the last reading, then updates with the voltage.
     pub fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
         self.memory.temperature_c = Some(self.temperature(model, step));
-        let result = self.try_step(model, config, step);
+        let result = self.try_step(model, config, step).and_then(|update| match &self.filter {
+            Some(filter) if !each!(filter, x => is_possible(x)) => Err(FilterError::Impossible),
+            _ => Ok(update),
+        });
         let reset = result.is_err() || self.memory.has_lost_cell(config);
         if reset {
             self.start(model, config, step);
@@ -216,6 +220,7 @@ impl CellEstimator {
         let mut variance = [square(config.initial.branch_std_v).max(KNOWN_VARIANCE); MAX_BRANCHES];
         for (i, variance) in variance.iter_mut().enumerate().take(model.branches.len()) {
             *variance += square(model.branch_r_ohm(i, &position) * ratio * load_a);
+            *variance = variance.min(bounds::NUMBER.high);
         }
         variance
     }
@@ -403,6 +408,7 @@ impl CellEstimator {
 
     /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
+        let downtime_s = downtime_s.max(0.0);
         self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);
         self.memory.noted_s += downtime_s;
     }
@@ -415,5 +421,7 @@ pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_re
     let ohm = model.settled_ohm(&model.grid_position(soc, last_c)) * libm::exp(log_resistance);
     let loaded_c =
         circuit::temperature_after(thermal, last_c, step.ambient_c, square(mean_current_a) * ohm, step.measured_s);
-    circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s)
+    let predicted_c = circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s);
+    // A current that no cell survives says nothing of its temperature.
+    predicted_c.clamp(bounds::TEMPERATURE_C.low, bounds::TEMPERATURE_C.high)
 }

@@ -12,6 +12,7 @@ use super::step::CellStep;
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::{CONSTANT_ERRORS, FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
+use crate::quantity::bounds;
 
 /// One filter per number of branches: N = branches + 3.
 #[derive(Debug, Clone)]
@@ -63,6 +64,16 @@ pub(super) fn initial_state<const N: usize>(
     (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) =
         (kept.covariance, kept.covariance);
     Gaussian { mean, covariance, by_constant }
+}
+
+/// Whether the state is one that a cell can have; a filter that has left it starts again.
+pub(super) fn is_possible<const N: usize>(x: &Gaussian<N>) -> bool {
+    bounds::FILTER_SOC.has(x.mean[0])
+        && bounds::LOG_RESISTANCE.has(x.mean[LOG_RESISTANCE])
+        && bounds::CAPACITY_AH.has(x.mean[CAPACITY])
+        && (BRANCHES..N).all(|i| bounds::NUMBER.has(x.mean[i]))
+        && (0..N).all(|i| (1e-40..=bounds::NUMBER.high).contains(&x.covariance[(i, i)]))
+        && x.by_constant.iter().all(|error| bounds::NUMBER.has(*error))
 }
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {

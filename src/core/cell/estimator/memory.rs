@@ -6,11 +6,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::slow_branch::SlowBranch;
-use super::state_vector::{KNOWN_VARIANCE, square};
+use super::state_vector::{KNOWN_VARIANCE, bounded_sum, square};
 use super::step::CellStep;
 use crate::cell::{CapacityState, CellModel, EstimatorConfig};
 use crate::filter::{ScalarGaussian, Update};
 use crate::quantity::InvalidState;
+use crate::quantity::bounds::{self, Bounds};
 
 /// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
 pub(super) const REST_REPEATS_S: f64 = 1000.0;
@@ -231,8 +232,8 @@ impl Memory {
     #[inline]
     pub(super) fn note_offset(&mut self, offset_v: f64, update: &Update) {
         let per_variance = offset_v / (update.innovation_variance - square(offset_v));
-        self.offset_information += per_variance * offset_v;
-        self.offset_score += per_variance * update.innovation;
+        self.offset_information = bounded_sum(self.offset_information, per_variance * offset_v);
+        self.offset_score = bounded_sum(self.offset_score, per_variance * update.innovation);
     }
 
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
@@ -250,7 +251,7 @@ impl Memory {
             } else {
                 self.rejected_s += elapsed_s;
             }
-            self.rejected += 1;
+            self.rejected = self.rejected.saturating_add(1);
         }
     }
 
@@ -265,11 +266,13 @@ impl Memory {
     /// reading.
     pub(super) fn reset_unusable(&mut self, config: &EstimatorConfig) {
         let (capacity, log_resistance) = configured(config);
-        let is_usable = |x: &ScalarGaussian| x.mean.is_finite() && x.variance.is_finite() && x.variance > 0.0;
-        if !is_usable(&self.capacity) || self.capacity.mean <= 0.0 {
+        let is_usable = |x: &ScalarGaussian, bounds: Bounds| {
+            bounds.has(x.mean) && (KNOWN_VARIANCE * KNOWN_VARIANCE..=bounds::NUMBER.high).contains(&x.variance)
+        };
+        if !is_usable(&self.capacity, bounds::CAPACITY_AH) {
             self.capacity = capacity;
         }
-        if !is_usable(&self.log_resistance) {
+        if !is_usable(&self.log_resistance, bounds::LOG_RESISTANCE) {
             self.log_resistance = log_resistance;
         }
     }
@@ -285,6 +288,8 @@ impl Memory {
         }
         let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a, self.offset_score];
         InvalidState::unless_numbers("a cell's last temperature or current, or its offset", signed)?;
+        bounds::TEMPERATURE_C.check_all("a cell's last temperature", self.temperature_c)?;
+        bounds::CURRENT_A.check("a cell's last current", self.last_current_a)?;
         InvalidState::unless_natural("the information about a current's offset", self.offset_information)?;
         self.slow_branch.check()?;
         InvalidState::unless(
@@ -311,9 +316,9 @@ fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
     config.gap.silence_is_rest && step.unmeasured_s > SILENCE_S
 }
 
-/// No cell has a thousand times the resistance of a new one, or a thousandth.
+/// Checks a stored ln of a resistance ratio.
 pub(super) fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
-    InvalidState::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
+    bounds::LOG_RESISTANCE.check("ln of a cell's resistance ratio", log_resistance)
 }
 
 /// Configured initial capacity (Ah) and ln(resistance).

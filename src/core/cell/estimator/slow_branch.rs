@@ -10,7 +10,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::state_vector::square;
+use super::state_vector::{bounded_sum, square};
 use crate::filter::Update;
 use crate::quantity::InvalidState;
 
@@ -68,8 +68,8 @@ impl SlowBranch {
     #[inline]
     pub(super) fn note(&mut self, effect_v: f64, update: &Update) {
         let per_variance = effect_v / (update.innovation_variance - square(effect_v));
-        self.information += per_variance * effect_v;
-        self.score += per_variance * update.innovation;
+        self.information = bounded_sum(self.information, per_variance * effect_v);
+        self.score = bounded_sum(self.score, per_variance * update.innovation);
     }
 
     /// Corrects the ratio by the evidence, which is then used; `None` when there is none.

@@ -12,6 +12,7 @@ use super::memory::{Memory, check_log_resistance};
 use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
 use crate::filter::{CONSTANT_ERRORS, Gaussian};
 use crate::quantity::InvalidState;
+use crate::quantity::bounds;
 
 /// The estimator's state as a document.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,10 +48,12 @@ impl CellEstimator {
 
     /// Restores a stored state; `None` when it is for another number of branches.
     ///
-    /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances.
+    /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances. A filter whose SOC no
+    /// running one can have is left out: it starts from the next voltage.
     pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
         let filter = match (state.mean.len(), branches) {
             (0, _) => None,
+            _ if !state.mean.first().is_some_and(|soc| bounds::FILTER_SOC.has(*soc)) => None,
             (4, 1) => Some(Filter::One(gaussian(state)?)),
             (5, 2) => Some(Filter::Two(gaussian(state)?)),
             (6, 3) => Some(Filter::Three(gaussian(state)?)),
@@ -73,7 +76,8 @@ impl CellState {
         let size = self.mean.len();
         let variances = self.covariance.iter().step_by(size + 1);
         variances.copied().try_for_each(|x| InvalidState::unless_positive("a variance of a cell's filter", x))?;
-        let [.., log_resistance, capacity_ah] = self.mean[..] else { return Ok(()) };
+        let [soc, .., log_resistance, capacity_ah] = self.mean[..] else { return Ok(()) };
+        bounds::STORED_SOC.check("the SOC of a cell's filter", soc)?;
         check_log_resistance(log_resistance)?;
         InvalidState::unless_capacity("the capacity of a cell's filter", capacity_ah)
     }

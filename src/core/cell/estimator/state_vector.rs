@@ -3,6 +3,7 @@
 //! In and out: means and variances in the units of the states. Inputs are not checked.
 
 use crate::filter::ScalarGaussian;
+use crate::quantity::bounds;
 
 /// Variance of a known value: small against any noise, large against rounding.
 pub(super) const KNOWN_VARIANCE: f64 = 1e-12;
@@ -20,6 +21,12 @@ pub(super) const BRANCHES: usize = 3;
 #[inline]
 pub(super) fn square(x: f64) -> f64 {
     x * x
+}
+
+/// A sum that stays storable: evidence that is not a number adds nothing.
+#[inline]
+pub(super) fn bounded_sum(sum: f64, added: f64) -> f64 {
+    if added.is_nan() { sum } else { (sum + added).clamp(bounds::NUMBER.low, bounds::NUMBER.high) }
 }
 
 /// A SOC variance grown by `by`, at most to that of an unknown SOC.

@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::sample::ContactorConfig;
+use crate::sample::Limits;
 
 fn at(seconds: f64) -> Timestamp {
     Timestamp::from_secs(seconds)
@@ -15,6 +16,7 @@ fn limits(min: f64, max: f64, max_age_s: f64) -> Limits {
 
 fn config() -> SampleConfig {
     SampleConfig {
+        voltage_noise_v: 0.005,
         cells: 2,
         voltage_source: VoltageSource::Cells,
         strings: 1,

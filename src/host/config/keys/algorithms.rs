@@ -9,8 +9,10 @@ use crate::cell::{
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Any, Between};
+use crate::config::setting::within;
 use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
+use crate::quantity::bounds;
 
 /// A month of 365.25 / 12 days.
 const SECONDS_PER_MONTH: f64 = 2_629_800.0;
@@ -23,7 +25,7 @@ section! {
     /// The unscented Kalman filter of each cell. Noises are densities, per square root of a second, so that the sample rate does not change the result.
     Estimator at "estimator" {
         /// Spread of the sigma points.
-        alpha: f64, "", Above(0.0, 1.0), Default("1.0");
+        alpha: f64, "", within(bounds::SIGMA_POINT_SPREAD), Default("1.0");
         /// Prior knowledge of the distribution; 2 for a Gaussian one.
         beta: f64, "", Between(0.0, 10.0), Default("2.0");
         /// Secondary scaling of the sigma points.
@@ -59,7 +61,7 @@ section! {
         /// Whether a silent bus means zero current: in more than five seconds between two voltages of a cell without any current it rested, whatever the current before and after; its voltage must come more often. False: a load next to the gap may have continued through it, and a charger may have come.
         silence_is_rest: bool, "", Any, Default("false");
         /// Standard deviation of the voltage sensor's noise. Where the signals have coarser steps than this, their rounding is added: 5.8 mV for steps of 20 mV.
-        voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
+        voltage_noise_v: f64, "V", within(bounds::VOLTAGE_NOISE_V), Default("0.005");
         /// Standard deviation of the voltage sensor's offset, together with that of the cell's open-circuit curve against the model's. It never averages out. What a cell model states for its cells is added.
         voltage_offset_std_v: f64, "V", DEVIATION, Default("0.004");
         /// Standard deviation of the slowest branch's resistance in a cell, relative to the model's: diffusion varies between cells and ages apart from the other resistances. In a model with several branches it is learned. Without it: what the cell model states for its cells, else 0.2, and 0.1 in a model with one branch.

@@ -5,16 +5,17 @@ use crate::cell::CellModel;
 use crate::config::schema::Presence::{Default, Optional};
 use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Between};
+use crate::quantity::bounds;
 use crate::sample::Limits;
 
 section! {
     /// Plausible pack currents. A reading outside changes no estimate and is counted.
     CurrentLimits at "limits.current" gives Limits, |keys, found: (f64, f64)| {
         /// Largest plausible discharge current of the pack. Without it: the limit of the DBC.
-        max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional => max: keys.max_discharge_a.unwrap_or(found.1);
+        max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional => max: keys.max_discharge_a.unwrap_or(found.1.min(bounds::CURRENT_A.high));
         /// Largest plausible charge current of the pack, written positive. Without it: the limit of the DBC.
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional
-            => min: keys.max_charge_a.map_or(found.0, |limit| -limit);
+            => min: keys.max_charge_a.map_or(found.0.max(bounds::CURRENT_A.low), |limit| -limit);
         /// Fastest plausible change. Without it: not checked.
         max_rate_a_per_s: Option<f64>, "A/s", Above(0.0, 1e9), Optional => max_rate_per_s: keys.max_rate_a_per_s;
         /// A reading that has not changed at all for this long is stuck. Without it: not checked (the current of a parked pack may be constant).

@@ -35,7 +35,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         (
             "cells = 4",
             "cells = 4\nrated_capacity_ah = 0",
-            "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0 and at most 100000",
+            "pack.toml:3: pack.rated_capacity_ah = 0, must be 0.001 to 100000",
         ),
         ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
         ("\"cell.toml\"", "\"no\\ntoml\"", "no\\ntoml: cannot be read: entity not found"),

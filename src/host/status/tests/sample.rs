@@ -6,7 +6,7 @@ use crate::can::poll::PollSilence;
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
-use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
+use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, ModelState, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
@@ -78,6 +78,8 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         }],
         asleep_since: None,
         poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
+        intruders: Vec::new(),
+        current_frozen: false,
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
         store: Some(StoreStatus {
@@ -113,6 +115,8 @@ fn interface(name: &str, state: LinkState) -> InterfaceStatus {
 
 fn pack(cells: u16) -> PackStatus {
     PackStatus {
+        model_state: Some(ModelState::Learning),
+        model_fits_better: None,
         validity: Validity::Valid,
         mode: Mode::Discharge,
         soc: Some(0.632),

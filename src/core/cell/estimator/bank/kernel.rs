@@ -31,8 +31,9 @@ use update::update;
 
 use super::tables::{LineCache, Tables};
 use crate::cell::estimator::memory::REST_REPEATS_S;
-use crate::cell::estimator::state_vector::LOG_RESISTANCE;
-use crate::filter::simd::Lanes;
+use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
+use crate::filter::simd::{Lanes, Mask};
+use crate::quantity::bounds::{self, Bounds};
 
 /// One ordinary step.
 #[inline(always)]
@@ -64,8 +65,28 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
         sum = sum + x.memory[i];
     }
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
-    outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
+    outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0) & is_possible(&x);
     (x, outcome)
+}
+
+/// Whether the state is one that a cell can have, and its sums can be stored; see `filter::is_possible`.
+#[inline(always)]
+fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L, N, T>) -> Mask<L> {
+    let within = |value: Lanes<L>, bounds: Bounds| {
+        let (centre, reach) = (0.5 * (bounds.low + bounds.high), 0.5 * (bounds.high - bounds.low));
+        !(value - Lanes::splat(centre)).abs().above_number(reach)
+    };
+    let mut is_possible = within(x.mean[0], bounds::FILTER_SOC)
+        & within(x.mean[LOG_RESISTANCE], bounds::LOG_RESISTANCE)
+        & within(x.mean[CAPACITY], bounds::CAPACITY_AH)
+        & !Lanes::splat(bounds::CAPACITY_AH.low).above(x.mean[CAPACITY]);
+    for i in [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE] {
+        is_possible = is_possible & within(x.memory[i], bounds::NUMBER);
+    }
+    for i in 0..N {
+        is_possible = is_possible & !x.covariance[at(i, i)].above_number(bounds::NUMBER.high);
+    }
+    is_possible
 }
 
 /// Updates the load's low-pass and the time at rest; returns the time that the reading stands for, s.

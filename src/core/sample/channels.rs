@@ -1,0 +1,49 @@
+//! What the sampler knows of each channel: its limits, its place, and when its value should move.
+
+use super::charge::ChargeTotals;
+use super::config::{Limits, SampleConfig, VoltageSource};
+use crate::quantity::{CellIndex, Channel, SensorIndex};
+
+/// Limits of a channel's readings.
+pub(super) fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
+    match channel {
+        Channel::Current => &config.current,
+        Channel::Temperature(_) => &config.temperature,
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
+            &config.voltage
+        }
+        Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
+        Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
+        Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
+    }
+}
+
+/// Every channel in use, in the order of the signals.
+pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
+    let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
+    let mut channels = vec![Channel::Current];
+    channels.extend((0..sensors).map(|sensor| Channel::Temperature(SensorIndex(narrow(sensor)))));
+    match config.voltage_source {
+        VoltageSource::Cells => channels.extend((0..config.cells).map(|cell| Channel::CellVoltage(CellIndex(cell)))),
+        VoltageSource::PackTotal { .. } => channels.push(Channel::PackVoltage),
+    }
+    channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
+    channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
+    channels.extend(config.contactor.as_ref().map(|_| Channel::Contactor));
+    channels
+}
+
+/// Clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
+/// constant, so only discharging counts for a voltage; temperature and current should move while current flows.
+pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
+    match channel {
+        Channel::Current | Channel::Temperature(_) => totals.flowing_s,
+        Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
+        // No rule says when they should move.
+        Channel::ReportedSoc
+        | Channel::ReportedSoh
+        | Channel::SupplyVoltage
+        | Channel::PackIdentity
+        | Channel::Contactor => 0.0,
+    }
+}
