@@ -3,6 +3,9 @@
 //! In: a monitor between two inputs. Out: sequence counters, budgets, messages under way, shown values. A program that was
 //! restarted ([`Downtime::Seconds`](super::Downtime), [`Downtime::Unknown`](super::Downtime)) has missed frames and has another
 //! clock: it leaves this part out, waits for first frames again, and compares every value again.
+//!
+//! Deviation: with authenticated frames the freshness begins again in either case, because another run may have continued from
+//! the same state and accepted commands. All else is byte-identical.
 
 use serde::{Deserialize, Serialize};
 

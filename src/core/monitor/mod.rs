@@ -72,9 +72,6 @@ pub use snapshot::{RestoreError, Snapshot};
 pub use statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 pub use view::{CellView, PackView, ReportedState};
 
-/// Longest time between a state and the first input of a monitor that continues from it on the same clock with its freshness, s.
-const CONTINUED_S: f64 = 2.0;
-
 /// The pure core.
 #[derive(Debug)]
 pub struct Monitor {
@@ -302,9 +299,8 @@ impl Monitor {
         self.stages.sender.restart(time);
         let beginning = self.apply_pending(time, out);
         if beginning == Beginning::Continued {
-            // Only where no time passed is no freshness of another run possible.
-            let passed_s = time.since(self.clock.now);
-            if !self.config.authentications().is_empty() && !(0.0..=CONTINUED_S).contains(&passed_s) {
+            // Whether another run continued from the same state cannot be known: its commands must not be accepted again.
+            if !self.config.authentications().is_empty() {
                 self.begin_freshness(time);
             }
             self.find_due();
