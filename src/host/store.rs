@@ -9,6 +9,7 @@
 //! * The daemon keeps running whatever is wrong with disk, folder or file, and reports it to the core (`store_failed`).
 
 mod backlog;
+mod carve;
 mod chain;
 pub mod commit_barrier;
 mod database;
@@ -16,8 +17,10 @@ mod delta_encoder;
 mod document;
 mod folder;
 mod history_filter;
+mod learned;
 mod meta;
 mod packed;
+mod pages;
 mod parts;
 mod reader;
 mod recorder;
@@ -43,7 +46,7 @@ use tokio::sync::watch;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
-use crate::monitor::{Downtime, Event, Monitor, Snapshot};
+use crate::monitor::{Command, Downtime, Event, EventKind, LearnedCell, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::StateDocument;
@@ -77,6 +80,9 @@ pub fn standard_folder() -> (PathBuf, bool) {
 /// Source of the state that the next checkpoint overwrites.
 pub const DATABASE_SOURCE: &str = "database";
 
+/// Source of a state that begins with the capacities in the history.
+pub const HISTORY_SOURCE: &str = "learned values in the history";
+
 /// A stored state that may be restored.
 #[derive(Debug)]
 pub struct StateCandidate {
@@ -93,6 +99,8 @@ pub struct StateCandidate {
 pub struct StoredStates {
     /// Stored states, the newest first.
     pub states: Vec<StateCandidate>,
+    /// What the history knows of the cells of the connected pack, when the database has no good state.
+    pub learned: Vec<LearnedCell>,
     /// Whether the store could be read and can be written.
     pub works: bool,
 }
@@ -122,7 +130,7 @@ impl Store {
         config: &StoreConfig,
         vehicle: &VehicleIdentity,
     ) -> Result<(Option<Self>, StoredStates), String> {
-        let none = |works| (None, StoredStates { states: Vec::new(), works });
+        let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone(), config.max_half_cycles);
@@ -163,11 +171,12 @@ impl Store {
         let path = folder.path().to_owned();
         let runtime_file = first_folder("RUNTIME_DIRECTORY").map(|folder| folder.join(runtime::FILE_NAME));
         let mut retry = Retry::default();
-        let mut found =
-            StoredStates { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
+        let works = opening.as_ref().is_some_and(|opening| opening.is_sound);
+        let mut found = StoredStates { states: Vec::new(), learned: Vec::new(), works };
         let mut reset_ns = None;
         let (database, rows, state, aside, is_unreadable) = match opening {
-            Some(OpenedDatabase { database, rows, state, aside, is_unreadable, .. }) => {
+            Some(OpenedDatabase { database, rows, state, aside, learned, is_unreadable, .. }) => {
+                found.learned = learned;
                 let counts = database.counts();
                 tracing::info!(
                     folder = %path.display(),
@@ -250,7 +259,12 @@ impl Store {
     /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = self.history_filter.take(events)?;
+        let rows = match self.history_filter.take(events) {
+            Some(rows) => rows,
+            // Its sender is told that it is stored.
+            None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
+            None => return None,
+        };
         self.checkpointed = Some(now);
         Some(self.submit(rows, monitor, now, false))
     }
@@ -309,6 +323,11 @@ impl Store {
         let folder = self.folder.to_string_lossy().into_owned();
         StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot()) }
     }
+}
+
+/// Whether an event is a command that has changed alarms.
+fn is_command_with_effect(kind: &EventKind) -> bool {
+    matches!(kind, EventKind::Command { command: Command::Acknowledge(_) | Command::Clear(_), changed: 1.., .. })
 }
 
 /// Reads the state of a folder that cannot be written.

@@ -12,7 +12,7 @@ use super::folder::DATABASE;
 use super::meta;
 use super::rows::HistoryTable;
 use super::schema;
-use super::state_slots::{STATE, read_document};
+use super::state_slots::read_document;
 use super::verify::{self, ChainReport};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
@@ -126,7 +126,7 @@ impl HistoryReader {
 
     /// The stored state, if it is good.
     pub(super) fn state(&self) -> Option<StateDocument> {
-        read_document(&self.connection, STATE)
+        read_document(&self.connection)
     }
 
     /// The selected rows in the order in which they were written.

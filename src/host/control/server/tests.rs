@@ -16,7 +16,7 @@ fn block_on(test: impl Future<Output = ()>) {
 }
 
 fn done(changed: u32) -> Answer {
-    Answer::Outcome(CommandOutcome { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
+    Answer::Outcome(CommandOutcome { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new(), is_stored: None })
 }
 
 /// A server whose loop answers everything with the number of requests so far.
