@@ -90,7 +90,10 @@ pub(super) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Fail
         ));
     }
     let done: CommandOutcome = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
-    print(&format!("the learned values of the old pack are forgotten; alarms about it that ended: {}\n", done.changed))?;
+    print(&format!(
+        "the learned values of the old pack are forgotten; alarms about it that ended: {}\n",
+        done.changed
+    ))?;
     check_stored(&done)
 }
 

@@ -4,7 +4,8 @@
 //! * `/metrics`: each scrape reads the status socket, within [`STATUS_LIMIT`]; without a fresh document the answer is
 //!   `packwatch_up 0` alone. OpenMetrics 1.0 for clients that accept it, else Prometheus' text 0.0.4.
 //! * `/`: a short page; `/-/healthy`: a sign of life.
-//! * At most [`MAX_CONNECTIONS`]; further ones are closed immediately. Requests of at most [`MAX_REQUEST_BYTES`], with their
+//! * At most [`MAX_CONNECTIONS`], and [`MAX_PER_ADDRESS`] of one client; a further one takes the place of the one that has
+//!   been idle longest ([`crate::io::places`]). Requests of at most [`MAX_REQUEST_BYTES`], with their
 //!   head within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
 
 use std::cell::Cell;
@@ -14,7 +15,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::pin::pin;
 use std::rc::Rc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use http_body_util::Full;
 use hyper::body::{Bytes, Incoming};
@@ -29,6 +30,7 @@ use tokio::net::{TcpListener, TcpStream, UnixStream};
 use tokio::task::{JoinSet, LocalSet};
 use tokio::time::{sleep, timeout};
 
+use super::io::places::{Activity, PlaceLimits, Places};
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::client::{check_length, explain, parse};
@@ -37,6 +39,8 @@ use super::status::metrics::{openmetrics, prometheus_text};
 
 /// Connections at once: two servers and a browser, several times over.
 const MAX_CONNECTIONS: usize = 16;
+/// Connections of one address at once.
+const MAX_PER_ADDRESS: usize = 8;
 /// Longest head of a request, bytes: hyper's least.
 const MAX_REQUEST_BYTES: usize = 8192;
 /// Headers of a request.
@@ -87,6 +91,7 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
     tracing::info!(%address, socket = %source.path.display(), "exporter listens");
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
+    let mut places = Places::new(PlaceLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
@@ -95,9 +100,14 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
             accepted = listener.accept() => accepted,
         };
         match accepted {
-            // Closed: the connections that are served keep their places.
-            Ok(_) if connections.len() >= MAX_CONNECTIONS => tracing::debug!("connection closed: too many at once"),
-            Ok((stream, _)) => drop(connections.spawn_local(serve_connection(stream, Rc::clone(&source)))),
+            Ok((_, client)) if !places.make_room(&client.ip(), Instant::now()) => {
+                tracing::debug!(%client, "connection closed: too many at once");
+            }
+            Ok((stream, client)) => {
+                let activity = Activity::new();
+                let task = connections.spawn_local(serve_connection(stream, Rc::clone(&source), activity.clone()));
+                places.take(client.ip(), activity, task);
+            }
             Err(error) => {
                 tracing::warn!(%error, "connection not accepted");
                 sleep(ACCEPT_PAUSE).await;
@@ -113,10 +123,15 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
     Ok(())
 }
 
-async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>) {
+async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity: Activity) {
     let answer = service_fn(move |request| {
-        let source = Rc::clone(&source);
-        async move { Ok::<_, Infallible>(answer(&request, &source).await) }
+        let (source, activity) = (Rc::clone(&source), activity.clone());
+        async move {
+            activity.begin_request();
+            let answer = answer(&request, &source).await;
+            activity.end_request();
+            Ok::<_, Infallible>(answer)
+        }
     });
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);

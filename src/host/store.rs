@@ -5,6 +5,9 @@
 //!   everything that was announced.
 //! * The state is also checkpointed every `[store] checkpoint_s` and on stop, and every second in the runtime folder,
 //!   which is in memory.
+//! * The state has two copies, written in turn (`state_slots`). Without a good one, the capacities in the history are
+//!   used (`learned`). Damage of the file is healed from its pages (`carve`).
+//! * On a full disk a reserve makes room for learned results and alarms (`reserve`).
 //! * The loop never touches the disk: a separate thread does (`writer`).
 //! * The daemon keeps running whatever is wrong with disk, folder or file, and reports it to the core (`store_failed`).
 
@@ -25,6 +28,7 @@ mod parts;
 mod reader;
 mod recorder;
 mod replace;
+mod reserve;
 mod retention;
 mod row_sql;
 mod rows;
@@ -53,6 +57,7 @@ use document::StateDocument;
 use folder::{Folder, OpenedDatabase, SET_ASIDE};
 use history_filter::HistoryFilter;
 use reader::MAX_DAEMON_COPY_BYTES;
+use reserve::Reserve;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
 use stamp::{BootId, Stamp, WallClock};
@@ -62,7 +67,7 @@ pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
 pub use rows::HistoryTable;
-pub use verify::{BrokenRow, ChainReport};
+pub use verify::{BrokenRow, ChainReport, NotedHead};
 pub use writer::StoreProgress;
 
 /// State folder of a daemon that systemd did not start.
@@ -212,6 +217,8 @@ impl Store {
             write_queue: Arc::clone(&write_queue),
             vehicle: vehicle.clone(),
             is_vehicle_noted: false,
+            reserve: Reserve::new(&path),
+            head_day: None,
             keep_years: config.keep_years,
             folder,
             database,

@@ -255,9 +255,8 @@ impl Label {
             let settled_ohm: f64 = branches.iter().fold(r0_ohm.values[t][s], |sum, it| sum + it.r_ohm.values[t][s]);
             USUAL_LOAD_PER_H * self.rated_ah * settled_ohm
         };
-        let error_v = |t: usize| {
-            (0..SOC.len()).map(|s| curve.rest_v[s].hypot(drop_std[t] * drop_v(t, s))).collect::<Vec<f64>>()
-        };
+        let error_v =
+            |t: usize| (0..SOC.len()).map(|s| curve.rest_v[s].hypot(drop_std[t] * drop_v(t, s))).collect::<Vec<f64>>();
         CellModel {
             name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
             rated_capacity_ah: self.rated_ah,

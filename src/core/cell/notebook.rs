@@ -294,7 +294,12 @@ impl Notebook {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        InvalidState::unless(self.rows.len() <= MAX_ROWS, "the rows of the notebook", self.rows.len() as f64, "at most 120")?;
+        InvalidState::unless(
+            self.rows.len() <= MAX_ROWS,
+            "the rows of the notebook",
+            self.rows.len() as f64,
+            "at most 120",
+        )?;
         for row in &self.rows {
             let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
             let [a, b, c] = row.filtered_a;

@@ -78,7 +78,12 @@ impl OwnModel {
         InvalidState::unless(rises, "the curve of a learned model", self.curve_v[0], "rising over SOC")?;
         let factors = self.factors.ln.iter().flatten().chain(&self.factors.by_temperature);
         for &factor in factors {
-            InvalidState::unless(factor.abs() <= 5.0, "a resistance of a learned model", factor, "-5 to 5 (ln of a ratio)")?;
+            InvalidState::unless(
+                factor.abs() <= 5.0,
+                "a resistance of a learned model",
+                factor,
+                "-5 to 5 (ln of a ratio)",
+            )?;
         }
         let numbers = self.curve_v.iter().chain(self.modes_v.iter().flatten());
         InvalidState::unless_numbers("the curve of a learned model", numbers.copied())?;

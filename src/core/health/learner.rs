@@ -127,7 +127,13 @@ impl Learner {
     }
 
     /// Continues from a capacity that was measured in an earlier run and is already in the cell's filter.
-    pub fn relearn(&mut self, config: &CapacityConfig, cell: usize, capacity: ScalarGaussian, estimator: &CellEstimator) {
+    pub fn relearn(
+        &mut self,
+        config: &CapacityConfig,
+        cell: usize,
+        capacity: ScalarGaussian,
+        estimator: &CellEstimator,
+    ) {
         self.drift[cell] = DriftFilter::new(config, capacity);
         self.capacity[cell] = capacity;
         self.prior[cell] = estimator.capacity();

@@ -27,7 +27,8 @@ impl Monitor {
     /// is impossible: then the history is of another pack.
     pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
         let Stages { estimation, learning, .. } = &mut self.stages;
-        let is_valid = |x: ScalarGaussian| x.mean.is_finite() && x.mean > 0.0 && x.variance.is_finite() && x.variance > 0.0;
+        let is_valid =
+            |x: ScalarGaussian| x.mean.is_finite() && x.mean > 0.0 && x.variance.is_finite() && x.variance > 0.0;
         let fits = |cell: &LearnedCell| {
             cell.cell.index() < learning.cells.len()
                 && [Some(cell.capacity), cell.usable, cell.resistance].into_iter().flatten().all(is_valid)

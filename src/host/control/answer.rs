@@ -185,11 +185,11 @@ mod tests {
         let command = Command::Clear(Selector::default());
         let kind = EventKind::Command { source: Source::Local, command, changed: 0, refused: 1 };
         let events = [Event { time: Timestamp::ZERO, kind }];
-        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Ok(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!((done.changed, done.refused, done.refused_alarms.len()), (0, 1, 1));
         assert_eq!(refusal(&done.refused_alarms[0]), "still beyond its threshold");
         see(&mut engine, Rule::TemperatureHigh, None, None);
-        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Ok(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!(refusal(&done.refused_alarms[0]), "its value is not known");
     }
 }

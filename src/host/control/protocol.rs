@@ -280,14 +280,13 @@ mod tests {
 
     #[test]
     fn an_answer_is_its_contents_or_its_error() {
-        let done =
-            CommandOutcome {
-                time: Timestamp::from_secs(1.5),
-                changed: 2,
-                refused: 1,
-                refused_alarms: Vec::new(),
-                is_stored: Some(true),
-            };
+        let done = CommandOutcome {
+            time: Timestamp::from_secs(1.5),
+            changed: 2,
+            refused: 1,
+            refused_alarms: Vec::new(),
+            is_stored: Some(true),
+        };
         assert_eq!(contents::<CommandOutcome>(&Answer::Outcome(done.clone()).to_line()), Ok(done.clone()));
         assert_eq!(
             contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()),

@@ -9,8 +9,8 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
-use super::reload::{Reload, ReloadStep, log_outcome};
 use super::pending_answers::PendingAnswers;
+use super::reload::{Reload, ReloadStep, log_outcome};
 use super::status_publisher::StatusPublisher;
 use super::{INBOX, ServiceError, notify};
 use crate::control::protocol::{Answer, CommandOutcome, Request};

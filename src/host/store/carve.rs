@@ -56,7 +56,8 @@ pub(super) fn carve(damaged: &Path, path: &Path) -> rusqlite::Result<Carved> {
     let mut lost = 0;
     let mut states = StateRecords::default();
     if let Ok(file) = PageFile::open(damaged) {
-        let mut tables = TABLES.map(|table| TableTarget::new(&connection, table)).into_iter().collect::<Result<Vec<_>, _>>()?;
+        let mut tables =
+            TABLES.map(|table| TableTarget::new(&connection, table)).into_iter().collect::<Result<Vec<_>, _>>()?;
         for page in 1..=file.pages() {
             let Some((kind, records, unreadable)) = file.records(page) else { continue };
             lost += unreadable;
@@ -170,7 +171,9 @@ struct StateRecords {
 impl StateRecords {
     /// Keeps a record that is a row of the state: number in the chain of states, length, bytes.
     fn note(&mut self, record: &PageRecord) {
-        let [Value::Null, Value::Integer(number), Value::Integer(length), Value::Blob(bytes)] = record.values.as_slice() else {
+        let [Value::Null, Value::Integer(number), Value::Integer(length), Value::Blob(bytes)] =
+            record.values.as_slice()
+        else {
             return;
         };
         let Some(bytes) = usize::try_from(*length).ok().and_then(|length| bytes.get(..length)) else { return };

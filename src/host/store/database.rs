@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use rusqlite::{Connection, ErrorCode, MAIN_DB, OpenFlags, OptionalExtension, TransactionBehavior};
 
+use super::chain::hex;
 use super::document::StateDocument;
 use super::learned;
 use super::meta::{self, Meta};
@@ -162,6 +163,11 @@ impl Database {
     pub(super) fn counts(&self) -> Counts {
         let Meta { head, half_cycles, pack, .. } = self.meta;
         Counts { chained: head.count, half_cycles, packs: pack }
+    }
+
+    /// The chain's end: number of rows, hash of the last.
+    pub(super) fn head(&self) -> (i64, String) {
+        (self.meta.head.count, hex(&self.meta.head.hash))
     }
 
     /// Sets the wall clock before which checkpoints delete half-cycles, ns since 1970; `None` = they delete none.

@@ -4,11 +4,12 @@
 //! cannot be checked and is not used.
 
 use rusqlite::types::Value;
-use rusqlite::{Connection, OptionalExtension, Row};
+use rusqlite::{Connection, Row};
 
 use super::chain::{self, Hash};
-use super::row_sql::{MOMENT_COLUMNS, rows_sql};
+use super::row_sql::{MOMENT_COLUMNS, hash_of, rows_sql};
 use super::rows::HistoryTable;
+use super::schema;
 use crate::filter::ScalarGaussian;
 use crate::monitor::LearnedCell;
 use crate::quantity::{CellIndex, MAX_CELLS};
@@ -18,8 +19,10 @@ const MAX_ROWS: usize = 16 * MAX_CELLS;
 
 /// What was learned of the cells of pack `pack`, in their order.
 pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<LearnedCell>> {
-    let mut statement = connection
-        .prepare(&rows_sql(HistoryTable::Capacity, &format!("WHERE m.pack = ?1 ORDER BY r.seq DESC LIMIT {MAX_ROWS}")))?;
+    let mut statement = connection.prepare(&rows_sql(
+        HistoryTable::Capacity,
+        &format!("WHERE m.pack = ?1 ORDER BY r.seq DESC LIMIT {MAX_ROWS}"),
+    ))?;
     let mut rows = statement.query([pack])?;
     let mut cells: Vec<LearnedCell> = Vec::new();
     while let Some(row) = rows.next()? {
@@ -39,7 +42,7 @@ fn learned(connection: &Connection, row: &Row<'_>) -> rusqlite::Result<Option<Le
     let first = 2 + MOMENT_COLUMNS;
     let (seq, hash): (i64, Hash) = (row.get(0)?, row.get(1)?);
     let values: Vec<Value> = (2..first + columns.len()).map(|at| row.get(at)).collect::<rusqlite::Result<_>>()?;
-    let before = hash_of(connection, seq - 1)?;
+    let before = hash_of(connection, seq - 1, schema::known(schema::MIGRATIONS))?;
     if before.is_none_or(|before| chain::link(&before, HistoryTable::Capacity, seq, &values) != hash) {
         return Ok(None);
     }
@@ -56,19 +59,4 @@ fn learned(connection: &Connection, row: &Row<'_>) -> rusqlite::Result<Option<Le
         usable: belief("usable_capacity_ah", "usable_capacity_std_ah")?,
         resistance: belief("resistance_ratio", "resistance_ratio_std")?,
     }))
-}
-
-/// The hash of the row before; of none before the first.
-fn hash_of(connection: &Connection, seq: i64) -> rusqlite::Result<Option<Hash>> {
-    if seq == 0 {
-        return Ok(Some([0; 32]));
-    }
-    for table in HistoryTable::CHAINED {
-        let sql = format!("SELECT hash FROM {} WHERE seq = ?1", table.name());
-        let hash = connection.prepare_cached(&sql)?.query_row([seq], |row| row.get(0)).optional()?;
-        if hash.is_some() {
-            return Ok(hash);
-        }
-    }
-    Ok(None)
 }

@@ -58,7 +58,8 @@ impl Meta {
             last = last.max(row.unwrap_or(last));
         }
         let ChainHead { count, hash } = self.head;
-        Ok((last != (count, hash)).then(|| format!("the history ends with row {}, not with row {count} as noted", last.0)))
+        Ok((last != (count, hash))
+            .then(|| format!("the history ends with row {}, not with row {count} as noted", last.0)))
     }
 
     /// Writes it, without the pack.

@@ -186,7 +186,9 @@ fn value(serial_type: u64, body: &mut &[u8]) -> Option<Value> {
         0 => Value::Null,
         1..=6 => {
             let is_negative = bytes.first().is_some_and(|byte| byte & 0x80 != 0);
-            Value::Integer(bytes.iter().fold(if is_negative { -1 } else { 0 }, |whole: i64, &byte| whole << 8 | i64::from(byte)))
+            Value::Integer(
+                bytes.iter().fold(if is_negative { -1 } else { 0 }, |whole: i64, &byte| whole << 8 | i64::from(byte)),
+            )
         }
         7 => Value::Real(f64::from_be_bytes(bytes.try_into().ok()?)),
         8 => Value::Integer(0),

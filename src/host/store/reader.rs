@@ -13,7 +13,7 @@ use super::meta;
 use super::rows::HistoryTable;
 use super::schema;
 use super::state_slots::read_document;
-use super::verify::{self, ChainReport};
+use super::verify::{self, ChainReport, NotedHead};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 
@@ -122,6 +122,22 @@ impl HistoryReader {
     /// When the file cannot be read to the end.
     pub fn verify(&self) -> Result<ChainReport, String> {
         verify::verify(&self.connection).map_err(|error| self.named(&error))
+    }
+
+    /// What contradicts the chain's end as it was noted elsewhere; `None` = nothing.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
+        let found = verify::hash_at(&self.connection, noted).map_err(|error| self.named(&error))?;
+        let NotedHead { rows, hash } = noted;
+        Ok(match found {
+            Some(found) if found == *hash => None,
+            Some(found) => {
+                Some(format!("row {rows} has the hash {found}, noted was {hash}: the history was written again"))
+            }
+            None => Some(format!("there is no row {rows}, which was noted: the history was written again or cut off")),
+        })
     }
 
     /// The stored state, if it is good.

@@ -1,6 +1,6 @@
 //! Copies the readable rows of a damaged database.
 //!
-//! The rows are those that [`carve`](super::carve) finds on the pages of the file, whatever its schema and its inner pages
+//! The rows are those that `carve` finds on the pages of the file, whatever its schema and its inner pages
 //! look like. They are copied in their order, a few at a time: a history of any length needs the same memory. A chained row whose hash does not match its contents was changed by the damage; it is rejected
 //! and counted. The copies get numbers and hashes of the new chain.
 //!

@@ -162,9 +162,10 @@ pub(super) fn read_aside(connection: &Connection) -> Option<StateDocument> {
 
 /// Forgets the state that was set aside.
 pub(super) fn forget_aside(connection: &Connection) -> rusqlite::Result<()> {
-    COPIES.into_iter().filter(|table| has_table(connection, table)).try_for_each(|table| {
-        connection.execute(&format!("DELETE FROM {table} WHERE slot >= ?1"), [ASIDE]).map(drop)
-    })
+    COPIES
+        .into_iter()
+        .filter(|table| has_table(connection, table))
+        .try_for_each(|table| connection.execute(&format!("DELETE FROM {table} WHERE slot >= ?1"), [ASIDE]).map(drop))
 }
 
 /// Forgets all states.
@@ -193,7 +194,9 @@ fn read_copy(connection: &Connection, table: &str, first: i64) -> rusqlite::Resu
     let delta = delta.filter(|delta| delta.number != NO_NUMBER);
     let mut contents = CopyContents::default();
     let Some(full) = full else {
-        contents.faults.extend(delta.map(|delta| (delta.number, "the full record of a stored state is missing".to_owned())));
+        contents
+            .faults
+            .extend(delta.map(|delta| (delta.number, "the full record of a stored state is missing".to_owned())));
         return Ok(contents);
     };
     match DeltaEncoder::with_base(full.number, &full.record, room) {

@@ -187,11 +187,8 @@ impl Basis<'_> {
         let position = self.model.grid_position(soc, temperature_c);
         let (node, along) = interval(&SOC, soc);
         let own_v = theta[node] + along * (theta[node + 1] - theta[node]);
-        let own_slope_v = if (0.0..1.0).contains(&soc) {
-            (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node])
-        } else {
-            0.0
-        };
+        let own_slope_v =
+            if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
         let slope_v = self.model.ocv_slope_v(&position, capacity_ah) + own_slope_v;
         let (per_ah_v, _) = self.model.aged_ocv_changes_v(&position, capacity_ah);
         let mut index = vec![node, node + 1, LOG_CAPACITY, beginning];
@@ -202,7 +199,8 @@ impl Basis<'_> {
         let mut drop_v = 0.0;
         let ohm: [f64; RESISTANCES] = std::array::from_fn(|j| {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln = theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm = match j {
                 0 => self.model.r0_ohm(&position),
                 j => self.model.branch_r_ohm(j - 1, &position),
@@ -337,7 +335,8 @@ impl Basis<'_> {
         let mut settled_ohm = 0.0;
         for j in 0..RESISTANCES {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln = theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm =
                 if j == 0 { self.model.r0_ohm(&position) } else { self.model.branch_r_ohm(j - 1, &position) };
             let ohm = label_ohm * libm::exp(ln);

@@ -33,6 +33,9 @@ struct Reference {
     /// The stored state and the one before.
     states: Vec<Vec<u8>>,
     learned: Vec<LearnedCell>,
+    now: Stamp,
+    /// The state that is written after each flip.
+    next: StateDocument,
 }
 
 /// Memory where the system has a folder for it: a flip costs several syncs.
@@ -48,19 +51,20 @@ impl Reference {
     fn of(bytes: Vec<u8>) -> Self {
         let place = place();
         std::fs::write(place.path().join(DATABASE), &bytes).unwrap();
-        let opening = Folder::new(place.path().to_owned(), 1000).open(&now()).unwrap();
+        let now = document(2, 200, 1_900_000_100).stamp;
+        let opening = Folder::new(place.path().to_owned(), 1000).open(&now).unwrap();
         assert!(opening.is_sound);
         let mut states = vec![json(&opening.state.unwrap())];
         let learned = opening.database.learned().unwrap();
         // Without the newest, the one before is read.
         for table in state_slots::COPIES {
             std::fs::write(place.path().join(DATABASE), &bytes).unwrap();
-            let opening = Folder::new(place.path().to_owned(), 1000).open(&now()).unwrap();
+            let opening = Folder::new(place.path().to_owned(), 1000).open(&now).unwrap();
             opening.database.connection().execute(&format!("DELETE FROM {table}"), []).unwrap();
             let other = opening.database.state().unwrap().unwrap();
             states.extend(other.map(|other| json(&StateDocument::parse(&other.json).unwrap())));
         }
-        Self { bytes, states, learned }
+        Self { bytes, states, learned, now, next: document(2, 100, 1_900_000_000) }
     }
 
     fn flip(&self, bit: usize, place: &Path, counts: &mut FlipCounts) {
@@ -80,7 +84,7 @@ impl Reference {
     /// Starts with the damaged store, writes, and starts again.
     fn start(&self, place: &Path, counts: &mut FlipCounts) -> Result<(), String> {
         let mut folder = Folder::new(place.to_owned(), 1000);
-        let opening = folder.open(&now()).map_err(|error| error.to_string())?;
+        let opening = folder.open(&self.now).map_err(|error| error.to_string())?;
         let is_alive = |learned: &[LearnedCell]| learned == self.learned && !learned.is_empty();
         match &opening.state {
             Some(state) if self.states.contains(&json(state)) => {}
@@ -90,29 +94,25 @@ impl Reference {
                 counts.forgotten += usize::from(!is_alive(&opening.learned));
             }
         }
-        let state = document(2, 100, 1_900_000_000);
-        let record = || StateRecord::new(&state, true, false).unwrap();
+        let record = || StateRecord::new(&self.next, true, false).unwrap();
         let rows = vec![HistoryRow::Event(capacity(0, Some(2.0), 1.9))];
-        let batch = RowBatch { stamp: now(), rows };
+        let batch = RowBatch { stamp: self.now, rows };
         let mut database = opening.database;
         if let Err(error) = database.commit(std::slice::from_ref(&batch), Some(record())) {
             // As the writer: the next attempt replaces it.
             drop(database);
             folder.mark_damaged(&error.to_string());
-            database = folder.open(&now()).map_err(|again| format!("{error}, then {again}"))?.database;
+            database = folder.open(&self.now).map_err(|again| format!("{error}, then {again}"))?.database;
             database.commit(&[batch], Some(record())).map_err(|again| format!("{error}, then {again}"))?;
         }
-        drop(database);
-        let opening = Folder::new(place.to_owned(), 1000).open(&now()).map_err(|error| format!("again: {error}"))?;
+        drop((database, folder));
+        let again = Folder::new(place.to_owned(), 1000).open(&self.now);
+        let opening = again.map_err(|error| format!("again: {error}"))?;
         match opening.state {
-            Some(found) if json(&found) == json(&state) => Ok(()),
+            Some(found) if json(&found) == json(&self.next) => Ok(()),
             _ => Err("what was written is not there".to_owned()),
         }
     }
-}
-
-fn now() -> Stamp {
-    document(2, 200, 1_900_000_100).stamp
 }
 
 /// A small store as a daemon leaves it: a replayed day of one cell.
@@ -139,7 +139,9 @@ fn after_any_flipped_bit_the_store_is_written_and_the_learned_capacity_is_alive(
     let FlipCounts { flips, rebuilt, stateless, forgotten, never_written } = &counts;
     let bytes = reference.bytes.len();
     let never = never_written.len();
-    eprintln!("{bytes} bytes, {flips} flips: {never} never written, {forgotten} forgotten, {stateless} without a state, {rebuilt} rebuilt");
+    eprintln!(
+        "{bytes} bytes, {flips} flips: {never} never written, {forgotten} forgotten, {stateless} without a state, {rebuilt} rebuilt"
+    );
     assert!(never_written.is_empty(), "{never_written:?}");
     assert!(*forgotten as f64 <= (1.0 - MIN_ALIVE) * *flips as f64, "{counts:?}");
 }
