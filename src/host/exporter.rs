@@ -80,13 +80,13 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
     let source = Rc::new(StatusSource { path: socket, is_up: Cell::new(None) });
-    let served = LocalSet::new().block_on(&runtime, serve(listen, source));
+    let served = async { serve(TcpListener::bind(listen).await?, source).await };
+    let served = LocalSet::new().block_on(&runtime, served);
     served.map_err(|error| format!("{listen}: {error}"))
 }
 
-async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
+async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()> {
     let mut stop = Stop::new(None)?;
-    let listener = TcpListener::bind(listen).await?;
     let address = listener.local_addr()?;
     tracing::info!(%address, socket = %source.path.display(), "exporter listens");
     let status = format!("listening on {address}");
@@ -227,6 +227,34 @@ impl StatusSource {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn slow_clients_give_way_to_a_scrape() {
+        use tokio::io::AsyncWriteExt as _;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let address = listener.local_addr().unwrap();
+            let source = StatusSource { path: PathBuf::from("/nonexistent/status.sock"), is_up: Cell::new(None) };
+            let server = tokio::task::spawn_local(serve(listener, Rc::new(source)));
+            let mut slow = Vec::new();
+            for _ in 0..2 * MAX_CONNECTIONS {
+                let mut client = TcpStream::connect(address).await.unwrap();
+                // It may be refused already.
+                let _ = client.write_all(b"GET /met").await;
+                slow.push(client);
+            }
+            sleep(crate::io::places::GRACE).await;
+            let began = Instant::now();
+            let mut scrape = TcpStream::connect(address).await.unwrap();
+            scrape.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").await.unwrap();
+            let mut answer = String::new();
+            scrape.read_to_string(&mut answer).await.unwrap();
+            assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("packwatch_up 0"), "{answer}");
+            assert!(began.elapsed() < STATUS_LIMIT, "{:?}", began.elapsed());
+            server.abort();
+        });
+    }
 
     #[test]
     fn openmetrics_is_for_clients_that_accept_version_1() {

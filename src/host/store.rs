@@ -206,7 +206,7 @@ impl Store {
         let wall = WallClock::assess(now);
         found.states = candidates(running, state, now, wall);
         found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
-        let (sender, progress) = watch::channel(StoreProgress { works: found.works, ..StoreProgress::default() });
+        let (sender, progress) = watch::channel(StoreProgress { works: found.works, has_room: true, ..StoreProgress::default() });
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
             // They are written with the first state.

@@ -41,6 +41,8 @@ pub(super) struct Engine {
     store: Option<Store>,
     /// Whether the store can be written.
     store_works: bool,
+    /// Whether the disk has room for more than what is urgent.
+    has_room: bool,
     /// Whether files can be written, as last reported to the core.
     reported_works: Option<bool>,
     barrier: CommitBarrier,
@@ -106,6 +108,7 @@ impl Engine {
             has_lost_file,
             store,
             store_works: found.works && unfit.is_none(),
+            has_room: true,
             reported_works: None,
             barrier: CommitBarrier::default(),
             is_fresh: false,
@@ -177,7 +180,7 @@ impl Engine {
     /// Handles progress or failure of the store.
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
         self.barrier.release(progress.ticket, |transmit| send(&self.links, transmit));
-        self.store_works = progress.works;
+        (self.store_works, self.has_room) = (progress.works, progress.has_room);
         self.progress = Some(progress);
         self.report_store_health(time);
     }
@@ -226,7 +229,7 @@ impl Engine {
     /// Reports to the core whether files can be written, when that has changed.
     pub(super) fn report_store_health(&mut self, time: Timestamp) {
         // The lost file may be the journal; the core gets the input anyway.
-        let works = self.store_works && !self.has_lost_file;
+        let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
             self.handle(&Input::Store { time, works });

@@ -16,7 +16,7 @@ const BYTES: usize = 1 << 20;
 const PROBE_NAME: &str = "packwatch.probe";
 const PROBE_BYTES: usize = 128 << 10;
 /// Least time between two attempts to make it.
-const PAUSE: Duration = Duration::from_secs(60);
+const PAUSE: Duration = Duration::from_secs(15);
 
 /// The reserve of a folder.
 #[derive(Debug)]
@@ -44,6 +44,14 @@ impl Reserve {
             return;
         }
         self.tried = Some(Instant::now());
+        self.make();
+    }
+
+    /// Makes the file where it is missing.
+    pub(super) fn make(&mut self) {
+        if self.is_there {
+            return;
+        }
         let path = self.folder.join(FILE_NAME);
         match write(&path, BYTES) {
             Ok(()) => self.is_there = true,

@@ -1,6 +1,7 @@
 //! A real state through the store and back.
 
 mod flips;
+mod healing;
 mod rounding;
 
 use std::fmt::Write as _;

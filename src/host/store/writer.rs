@@ -34,6 +34,8 @@ pub struct StoreProgress {
     pub ticket: u64,
     /// The last attempt succeeded.
     pub works: bool,
+    /// The disk has room: the reserve is there.
+    pub has_room: bool,
     /// Size of the database and its log after the last success, bytes; `None` = none so far.
     pub file_bytes: Option<u64>,
     /// Commits done.
@@ -188,7 +190,7 @@ impl Retry {
 impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
-        self.reserve.restore();
+        self.reserve.make();
         loop {
             let work = self.write_queue.take(self.retry.at);
             let PendingWrite { batches, state, exact, sets_aside, ticket, stop } = work;
@@ -203,7 +205,9 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let progress = StoreProgress { ticket, works, file_bytes, commits: self.commits, failures: self.failures };
+            let has_room = self.reserve.is_there();
+            let (commits, failures) = (self.commits, self.failures);
+            let progress = StoreProgress { ticket, works, has_room, file_bytes, commits, failures };
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;

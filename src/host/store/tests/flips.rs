@@ -30,7 +30,7 @@ struct FlipCounts {
 /// The undamaged store.
 struct Reference {
     bytes: Vec<u8>,
-    /// The stored state and the one before.
+    /// The stored state, and those that are read when a record is damaged.
     states: Vec<Vec<u8>>,
     learned: Vec<LearnedCell>,
     now: Stamp,
@@ -56,11 +56,14 @@ impl Reference {
         assert!(opening.is_sound);
         let mut states = vec![json(&opening.state.unwrap())];
         let learned = opening.database.learned().unwrap();
-        // Without the newest, the one before is read.
-        for table in state_slots::COPIES {
+        // Without a copy the other is read, and without the deltas the full records.
+        let delta_lost = "UPDATE state SET serial = -1 WHERE slot = 1";
+        let both_lost = format!("DELETE FROM state_b; {delta_lost}");
+        let other_lost = format!("DELETE FROM state; {}", delta_lost.replace("state", "state_b"));
+        for change in ["DELETE FROM state", "DELETE FROM state_b", &both_lost, &other_lost] {
             std::fs::write(place.path().join(DATABASE), &bytes).unwrap();
             let opening = Folder::new(place.path().to_owned(), 1000).open(&now).unwrap();
-            opening.database.connection().execute(&format!("DELETE FROM {table}"), []).unwrap();
+            opening.database.connection().execute_batch(change).unwrap();
             let other = opening.database.state().unwrap().unwrap();
             states.extend(other.map(|other| json(&StateDocument::parse(&other.json).unwrap())));
         }
@@ -121,6 +124,31 @@ fn small_store() -> Vec<u8> {
     let state = folder.path().join("state");
     snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
     std::fs::read(state.join(DATABASE)).unwrap()
+}
+
+/// Stores that earlier programs never wrote again, took for a newer program's or rebuilt with nothing.
+#[test]
+fn damaged_stores_of_earlier_programs_are_written_again_with_what_was_learned() {
+    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    let data = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from);
+    let folder = data.join("../more-data/hardening");
+    let Ok(base) = std::fs::read(folder.join("store-base.db")) else {
+        return eprintln!("not run: no {}", folder.display());
+    };
+    let reference = Reference::of(base);
+    for entry in std::fs::read_dir(&folder).unwrap() {
+        let file = entry.unwrap().path();
+        let name = file.file_name().unwrap().to_string_lossy().into_owned();
+        if name.starts_with("store-") {
+            let (place, mut counts) = (place(), FlipCounts::default());
+            std::fs::copy(&file, place.path().join(DATABASE)).unwrap();
+            std::fs::set_permissions(place.path().join(DATABASE), std::os::unix::fs::PermissionsExt::from_mode(0o600))
+                .unwrap();
+            reference.start(place.path(), &mut counts).unwrap_or_else(|why| panic!("{name}: {why}"));
+            assert_eq!(counts.forgotten, 0, "{name}");
+            eprintln!("{name}: {}", if counts.stateless > 0 { "capacities of the history" } else { "state" });
+        }
+    }
 }
 
 #[test]
