@@ -17,7 +17,8 @@ use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
 /// Materials of both electrodes, by what is on the label or in a data sheet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Chemistry {
     /// Nickel-rich NMC (811).
     Nmc811Graphite,
@@ -89,7 +90,8 @@ impl Chemistry {
 const NEGATIVES: [Negative; 3] = [Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged];
 
 /// What is on the label of a cell.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Label {
     /// Chemistry.
     pub chemistry: Chemistry,
@@ -100,6 +102,9 @@ pub struct Label {
     /// Highest voltage, V.
     pub voltage_max_v: f64,
 }
+
+/// Distance of a highest voltage from the usual one of a chemistry within which it is one of that chemistry, V.
+const USUAL_WITHIN_V: f64 = 0.2;
 
 /// SOC breakpoints of a model from a label.
 pub(super) const SOC: [f64; 21] =
@@ -187,6 +192,15 @@ impl Label {
     pub fn usual(chemistry: Chemistry, rated_ah: f64) -> Self {
         let (voltage_min_v, voltage_max_v) = chemistry.usual_voltages_v();
         Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
+    }
+
+    /// The label with another chemistry: between the same voltages where these are usual of it, else between its usual ones.
+    pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
+        let (low_v, high_v) = chemistry.usual_voltages_v();
+        let is_usual = (self.voltage_max_v - high_v).abs() <= USUAL_WITHIN_V;
+        let (voltage_min_v, voltage_max_v) =
+            if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
+        Self { chemistry, voltage_min_v, voltage_max_v, ..*self }
     }
 
     /// Mean and spread of the open-circuit curves of such cells; `None` when no cell of this chemistry has these cut-offs.
