@@ -206,7 +206,8 @@ impl Store {
         let wall = WallClock::assess(now);
         found.states = candidates(running, state, now, wall);
         found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
-        let (sender, progress) = watch::channel(StoreProgress { works: found.works, has_room: true, ..StoreProgress::default() });
+        let (sender, progress) =
+            watch::channel(StoreProgress { works: found.works, has_room: true, ..StoreProgress::default() });
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
             // They are written with the first state.
@@ -268,7 +269,7 @@ impl Store {
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
         let rows = match self.history_filter.take(events) {
             Some(rows) => rows,
-            // Its sender is told that it is stored.
+            // Its sender gets an answer when it is stored.
             None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
             None => return None,
         };
