@@ -56,6 +56,7 @@ impl Reference {
         assert!(opening.is_sound);
         let mut states = vec![json(&opening.state.unwrap())];
         let learned = opening.database.learned().unwrap();
+        drop(opening.database);
         // Without a copy the other is read, and without the deltas the full records.
         let delta_lost = "UPDATE state SET serial = -1 WHERE slot = 1";
         let both_lost = format!("DELETE FROM state_b; {delta_lost}");
