@@ -63,7 +63,7 @@ impl Reserve {
         }
     }
 
-    /// Frees the space if the disk has none; `false` = the disk has room, or there is no reserve. SQLite's errors do not say
+    /// Frees the space if the disk has none; `false` = the disk has room, or there is no reserve to free. SQLite's errors do not say
     /// it: a full disk also fails to open or to enlarge a file.
     pub(super) fn release_if_full(&mut self) -> bool {
         self.is_there && self.is_disk_full() && self.release()

@@ -221,9 +221,11 @@ impl Writer {
         let begun = Instant::now();
         let written = match &state {
             Some(document) => self.commit(&batches, document, exact).or_else(|error| {
-                if batches.is_empty() || !self.reserve.release_if_full() {
+                if batches.is_empty() {
                     return Err(error);
                 }
+                // What is learned is tried again at once: with the reserve's space, or because space has come back.
+                self.reserve.release_if_full();
                 self.commit(&batches, document, exact)
             }),
             None if self.retry.pause.is_none() => return true,
