@@ -196,7 +196,7 @@ impl Writer {
             let PendingWrite { batches, state, exact, sets_aside, ticket, stop } = work;
             self.sets_aside |= sets_aside;
             // The last attempt before the end does not wait for the pause, nor does one that the reserve may help.
-            let is_urgent = stop || (!batches.is_empty() && self.reserve.is_there());
+            let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
             let works = if self.retry.is_due() || is_urgent {
                 self.write(batches, state, exact)
             } else {
@@ -205,7 +205,7 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let has_room = self.reserve.is_there();
+            let has_room = self.reserve.is_whole();
             let (commits, failures) = (self.commits, self.failures);
             let progress = StoreProgress { ticket, works, has_room, file_bytes, commits, failures };
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
