@@ -16,6 +16,7 @@ use super::state_slots::read_document;
 use super::verify::{self, ChainReport, NotedHead};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
+use crate::monitor::Snapshot;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
@@ -138,6 +139,11 @@ impl HistoryReader {
             }
             None => Some(format!("there is no row {rows}, which was noted: the history was written again or cut off")),
         })
+    }
+
+    /// The stored snapshot; `None` = there is none, or it is damaged.
+    pub fn snapshot(&self) -> Option<Snapshot> {
+        self.state().map(|document| *document.snapshot)
     }
 
     /// The stored state, if it is good.
