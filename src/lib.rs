@@ -42,12 +42,14 @@
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
 //! | which alarm is sent when, how often it is repeated | `core/monitor/alarm_queue.rs`; the promise to receivers: `/docs/src/ecu/contract.md` |
 //! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
+//! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/command_gate.rs`; `host/io/can_key.rs` |
 //! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/diagnostic.rs`; `core/can/poll.rs` |
 //! | when the buses sleep | `core/monitor/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
+//! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs` |
 //! | a configuration key | its table in `host/config/keys/` (`input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
 //! | how drop-ins are found and merged | `host/config/source.rs`, `host/config/document.rs` |

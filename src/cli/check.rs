@@ -144,9 +144,11 @@ fn sent(output: &OutputUse) -> Vec<String> {
         output.interfaces.join(" "),
         output.period_ms.map_or("on a command".to_owned(), |period_ms| format!("every {period_ms} ms")),
         output.kind.to_owned(),
-        match output.protection.as_str() {
-            "none" => "no end-to-end protection".to_owned(),
-            protection => format!("end-to-end {protection}"),
+        match (output.protection.as_str(), output.authentication.as_str()) {
+            ("none", "none") => "no end-to-end protection".to_owned(),
+            (protection, "none") => format!("end-to-end {protection}"),
+            ("none", authentication) => format!("authenticated, {authentication}"),
+            (protection, authentication) => format!("end-to-end {protection}; authenticated, {authentication}"),
         },
     ]
 }

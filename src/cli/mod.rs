@@ -147,6 +147,11 @@ impl Failure {
     pub fn new(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: 1 }
     }
+
+    /// A failure that another start does not repair: exit code 78.
+    pub fn config(message: impl Into<String>) -> Self {
+        Self { message: message.into(), code: EXIT_CONFIG }
+    }
 }
 
 impl From<crate::config::ConfigFaults> for Failure {

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::Failure;
 use super::numbers::{between, bytes, whole};
 use crate::config;
+use crate::io::can_key::CanKey;
 use crate::io::place::PlaceSetting;
 use crate::io::segments::{DEFAULT_SEGMENT_BYTES, SegmentLimits};
 use crate::io::snapshot_file;
@@ -91,8 +92,11 @@ pub(crate) fn away(text: &str) -> Result<Downtime, String> {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
     let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();
+    let config = config::load(&args.config)?;
+    let key = config.key.as_ref().map(|key| CanKey::load(key, std::env::var_os("CREDENTIALS_DIRECTORY"))).transpose();
     let service = Service {
-        config: config::load(&args.config)?,
+        key: key.map_err(Failure::config)?,
+        config,
         record: args.record.clone(),
         record_limits: record_limits.map_err(|why| Failure::new(format!("--record-limit: {why}")))?,
         frames: args.frames.clone(),

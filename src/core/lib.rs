@@ -1,5 +1,6 @@
 //! The pure core: frames in, estimates, alarms and frames out. Never reads a clock, a file or a socket, and never logs: the
-//! same inputs give the same outputs, byte for byte. The crate has no dependency that could do otherwise.
+//! same inputs give the same outputs, byte for byte. Keys of authenticated frames stay outside: the driver checks and makes
+//! authenticators, and passes the outcome in. The crate has no dependency that could do otherwise.
 //!
 //! # Data path
 //! [`monitor::Monitor`] takes every input. One file under `monitor/` is one stage; `stages.rs` alone knows their order.
@@ -26,6 +27,8 @@
 //! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
 //! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
+//! | authentication of frames; which commands are executed | `can/secoc.rs`; `monitor/command_gate.rs` |
+//! | what is kept of exchanged packs | `monitor/pack_memory.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |

@@ -89,7 +89,7 @@ impl Session {
     fn feed(&mut self, record: &Record) {
         let Some(input) = record.input() else { return };
         let bus = match input {
-            Input::Frame { time, bus, frame } => {
+            Input::Frame { time, bus, frame } | Input::SecuredFrame { time, bus, frame, .. } => {
                 self.doctor.handle_frame(time, bus, frame);
                 Some(bus)
             }

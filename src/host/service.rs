@@ -27,6 +27,7 @@ use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
 use crate::config::{Config, VehicleIdentity};
+use crate::io::can_key::CanKey;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
 use crate::io::record::Record;
@@ -80,6 +81,8 @@ pub struct Service {
     pub status: PlaceSetting,
     /// The configuration file, for the status document.
     pub config_file: Option<ConfigFile>,
+    /// Key of authenticated frames; `None` = none is configured.
+    pub key: Option<CanKey>,
 }
 
 /// Why the service could not start or stop.
@@ -152,6 +155,7 @@ impl Service {
         self.config.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
         let VehicleIdentity { name: vehicle, id, pack } = &self.config.vehicle;
         tracing::info!(interfaces = self.config.interfaces.len(), vehicle, id, pack, "started");
+        log_commands(&self.config);
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::log_kernel_stack();
         }
@@ -185,6 +189,15 @@ impl Service {
             outputs.push(output);
         }
         (links, outputs)
+    }
+}
+
+/// Logs whether commands from the bus are authenticated.
+fn log_commands(config: &Config) {
+    match (&config.monitor.commands, config.command_words()) {
+        (None, _) => {}
+        (Some(commands), words) if commands.plan.authentication().is_some() => tracing::info!("{words}"),
+        (Some(_), words) => tracing::warn!("{words}"),
     }
 }
 

@@ -12,6 +12,7 @@
 
 mod alarm_noise;
 mod alarm_tradeoff;
+mod authentication;
 mod bus_sleep;
 mod can_data;
 mod capacity_peers;
@@ -52,6 +53,7 @@ mod monitor_statistics;
 mod on_board_model;
 mod other_cell;
 mod output_dbc;
+mod pack_memory;
 mod paper_scenario;
 mod protected_input;
 mod recharge_fleet;

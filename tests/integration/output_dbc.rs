@@ -74,7 +74,7 @@ impl Case {
         let e2e = self
             .profile
             .map_or(E2eSetting::Off, |profile| E2eSetting::On(Protection { profile, data_id: 0x0A50 + number }));
-        MessageSettings { id: Some(id), fd: Some(self.fd), brs: Some(self.fd), period_ms: Some(250), e2e }
+        MessageSettings { id: Some(id), fd: Some(self.fd), brs: Some(self.fd), period_ms: Some(250), e2e, secoc: None }
     }
 
     fn layout(&self) -> Database {
@@ -85,6 +85,7 @@ impl Case {
             command: Some(self.message(4)),
             digest: self.message(5),
             reply: self.message(6),
+            freshness: MessageSettings::default(),
         };
         layout(LayoutBase::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
     }

@@ -143,6 +143,9 @@ fn interfaces(text: &mut String, document: &StatusDocument) {
         readings.accepted, service.missed_deadlines,
     );
     let _ = writeln!(text, "store      {}", store(document));
+    if let Some(commands) = &document.commands {
+        let _ = writeln!(text, "commands   {} {}: {}", commands.interface, commands.id, commands.words());
+    }
     if let Some(poll) = document.poll {
         let _ = writeln!(text, "requests   {}", poll.words());
     }

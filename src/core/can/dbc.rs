@@ -13,6 +13,7 @@ use std::collections::{HashMap, HashSet};
 
 use crate::can::CanId;
 use crate::can::e2e::Protection;
+use crate::can::secoc::Authentication;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 
 mod attributes;
@@ -84,6 +85,8 @@ pub struct Message {
     pub format: FrameFormat,
     /// `E2EProfile` and `E2EDataId`, packwatch's own attributes.
     pub e2e: Option<Protection>,
+    /// `SecOCProfile` and `SecOCDataId`, packwatch's own attributes.
+    pub secoc: Option<Authentication>,
     /// In the file's order.
     pub signals: Vec<Signal>,
     /// `GenMsgCycleTime` (or its default), when above 0.
@@ -347,6 +350,7 @@ fn read_message<'a>(
         sender: message.transmitter.clone(),
         format: attributes::format(dbc, message.id),
         e2e: attributes::e2e(dbc, message.id),
+        secoc: attributes::secoc(dbc, message.id),
         signals: signals?,
         cycle_time_ms: attributes::positive(dbc, message.id, attributes::CYCLE_TIME),
         repetition: attributes::repetition(dbc, message.id),

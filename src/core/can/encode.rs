@@ -17,8 +17,8 @@ pub use command::{Command, CommandFault, CommandFields, CommandPlan};
 pub use digest::{DigestFields, RuleState, TableChecksum, ThresholdFields};
 pub use input::InputEncoder;
 pub use layout::{
-    ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS, DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage,
-    LayoutSettings, MessageSettings, REPLY_DELAY_MS, SettingFault, default_database, layout,
+    ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS, DEFAULT_PERIOD_MS, E2eSetting, FRESHNESS_PERIOD_MS,
+    LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, REPLY_DELAY_MS, SettingFault, default_database, layout,
 };
 pub use output::{AlarmFields, HealthFields, OutputPlan, PlanFaults, SendCounters, SentMessage, StatusFields};
 pub use protector::InputProtector;

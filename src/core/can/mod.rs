@@ -1,5 +1,5 @@
 //! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames, end-to-end
-//! protection, diagnostic requests and answers over ISO-TP, J1939.
+//! protection and authentication, diagnostic requests and answers over ISO-TP, J1939.
 //!
 //! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are accepted:
 //! bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
@@ -16,6 +16,7 @@ mod id_table;
 pub mod isotp;
 pub mod j1939;
 pub mod poll;
+pub mod secoc;
 pub mod signal;
 pub mod unit;
 

@@ -143,6 +143,19 @@ impl Learner {
         self.learned[cell] = true;
     }
 
+    /// What is learned, without the half-cycle under way.
+    pub fn learned_only(&self) -> Self {
+        Self {
+            totals: vec![CellMark::default(); self.totals.len()],
+            prior: self.prior.clone(),
+            capacity: self.capacity.clone(),
+            learned: self.learned.clone(),
+            drift: self.drift.clone(),
+            offset: self.offset,
+            ..Self::default()
+        }
+    }
+
     /// Adds a cell's sample to its totals.
     ///
     /// `measured_s` and `gap_s` are the times since the sample before with and without a measured current, s; the gap is

@@ -7,10 +7,12 @@ use crate::alarm::RuleConfig;
 use crate::can::CanId;
 use crate::can::decode::InputMap;
 use crate::can::diagnostic::{self, Answer};
+use crate::can::encode::LayoutMessage;
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
+use crate::can::secoc::Authentication;
 use crate::cell::{CellModel, EstimatorConfig, Label};
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
@@ -88,6 +90,14 @@ impl MonitorConfig {
         node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
     }
 
+    /// Authentication of the command frame and of all sent frames.
+    pub fn authentications(&self) -> Vec<(LayoutMessage, Authentication)> {
+        let sent = self.output.iter().flat_map(|output| output.plan.messages());
+        let sent = sent.filter_map(|sent| Some((sent.message, sent.secoc?)));
+        let command = self.commands.as_ref().and_then(|commands| commands.plan.authentication());
+        command.map(|secoc| (LayoutMessage::Command, secoc)).into_iter().chain(sent).collect()
+    }
+
     /// Checks whether a monitor of this configuration can continue with `new`.
     pub(super) fn check_fits(&self, new: &Self) -> Result<(), ReconfigureError> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
@@ -112,6 +122,7 @@ impl MonitorConfig {
             ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
             ("[input]", self.input == new.input && self.answers == new.answers),
             ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
+            ("[commands] and [output]: secoc", self.authentications() == new.authentications()),
             ("[poll]", self.poll == new.poll && self.supply == new.supply),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
             ("pack.cell_model", self.model == same_model),

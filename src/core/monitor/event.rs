@@ -172,6 +172,15 @@ pub enum EventKind {
         /// Its standard deviation, Ah.
         capacity_std_ah: Option<f64>,
     },
+    /// A pack that was connected before came back: what was learned of it is restored.
+    PackReturned {
+        /// Its number.
+        identity: f64,
+        /// Capacity of its weakest cell, Ah; `None` = not of every cell known.
+        capacity_ah: Option<f64>,
+        /// Its standard deviation, Ah.
+        capacity_std_ah: Option<f64>,
+    },
     /// Another configuration holds from here on.
     Reconfigured {
         /// Alarms, raised or past, that ended because no threshold watches them any more.

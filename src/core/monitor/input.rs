@@ -47,6 +47,18 @@ pub enum Input<'a> {
         /// The frame.
         frame: &'a Frame,
     },
+    /// A frame of an authenticated message was received, and its authenticator was checked
+    /// ([`Monitor::mac_check`](super::Monitor::mac_check)).
+    SecuredFrame {
+        /// When the kernel received it.
+        time: Timestamp,
+        /// Interface it came on.
+        bus: BusIndex,
+        /// The frame.
+        frame: &'a Frame,
+        /// The freshness with which the authenticator is right; `None` = with none.
+        freshness: Option<u64>,
+    },
     /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs follow from ticks.
     Tick {
         /// Now.
@@ -167,6 +179,7 @@ impl Input<'_> {
     pub fn time(&self) -> Timestamp {
         match *self {
             Input::Frame { time, .. }
+            | Input::SecuredFrame { time, .. }
             | Input::Tick { time }
             | Input::Bus { time, .. }
             | Input::UnknownGap { time }

@@ -7,6 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::buses::Buses;
+use super::command_gate::CommandGate;
 use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
@@ -27,7 +28,7 @@ const BAD_COMMAND_S: f64 = 1.0;
 pub struct CommandConfig {
     /// Interface of the command frames.
     pub bus: BusIndex,
-    /// Their layout; their protection is checked by one of the guards.
+    /// Their layout. Authenticated frames are judged by the command gate; protection is checked by one of the guards.
     pub plan: CommandPlan,
 }
 
@@ -37,6 +38,8 @@ pub(super) struct Intake {
     gate: FloodGate,
     guards: Guards,
     buses: Buses,
+    /// Authenticated commands.
+    pub(super) gate_of_commands: CommandGate,
     /// Controllers in the listener's order.
     pub(super) controllers: Vec<Controller>,
     /// Diagnostic answers.
@@ -45,6 +48,15 @@ pub(super) struct Intake {
     pub(super) moments: Vec<Option<Moment>>,
     /// When a rejected command frame was last reported.
     pub(super) bad_command_at: Option<Timestamp>,
+}
+
+/// A frame as it came.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ReceivedFrame<'a> {
+    pub(super) bus: BusIndex,
+    pub(super) frame: &'a Frame,
+    /// The freshness with which its authenticator is right; `None` = with none, or not checked.
+    pub(super) freshness: Option<u64>,
 }
 
 /// Result of an admitted frame's end-to-end check; `None` = its message is not protected.
@@ -59,7 +71,7 @@ impl Admission {
     }
 }
 
-/// Counts that are kept over a restart.
+/// Counts, and the freshness of commands, that are kept over a restart.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct IntakeState {
@@ -67,6 +79,8 @@ pub(super) struct IntakeState {
     dropped: Vec<FloodCount>,
     #[serde(default)]
     controllers: Vec<ControllerCount>,
+    #[serde(default)]
+    pub(super) commands: CommandGate,
 }
 
 /// What came from a controller that answers diagnostic requests.
@@ -89,6 +103,7 @@ impl Intake {
             gate: FloodGate::new(&config.flood, config.input.messages().chain(commands).chain(answers)),
             guards: Guards::new(config.guards.clone()),
             buses: Buses::default(),
+            gate_of_commands: CommandGate::default(),
             moments: vec![None; listener.counts().count()],
             controllers: listener.counts().map(|(controller, _)| controller).collect(),
             listener,
@@ -128,11 +143,15 @@ impl Intake {
         &mut self,
         now: Timestamp,
         config: &CommandConfig,
-        frame: &Frame,
+        received: &ReceivedFrame<'_>,
         admission: Admission,
         out: &mut Outputs,
     ) -> (Option<CommandFields>, Result<Command, CommandRefusal>) {
-        let refusal = admission.0.and_then(CommandRefusal::of);
+        let frame = received.frame;
+        let refusal = match config.plan.authentication() {
+            Some(secoc) => self.gate_of_commands.judge(now, secoc, frame.data(), received.freshness).err(),
+            None => admission.0.and_then(CommandRefusal::of),
+        };
         let is_intact = refusal.is_none_or(CommandRefusal::is_intact);
         let fields = config.plan.decode(frame).ok().filter(|_| is_intact);
         let command = fields.as_ref().and_then(command_of).ok_or(CommandRefusal::NoMeaning);
@@ -177,6 +196,7 @@ impl Intake {
         self.guards.restart();
         self.gate.restart();
         self.listener.restart();
+        self.gate_of_commands.restart(now);
         self.moments.fill(None);
         self.report(now, out);
     }
@@ -202,6 +222,7 @@ impl Intake {
             protected: self.guards.counts().collect(),
             dropped: self.gate.counts().collect(),
             controllers: self.controllers().collect(),
+            commands: self.gate_of_commands.clone(),
         };
         (state, self.buses.clone())
     }
@@ -210,6 +231,7 @@ impl Intake {
         self.guards.restore(&state.protected);
         self.gate.restore(&state.dropped);
         self.listener.restore(state.controllers.iter().map(|of| (of.controller, of.counts)));
+        self.gate_of_commands = state.commands.clone();
         self.buses = buses;
     }
 

@@ -116,7 +116,7 @@ impl J1939 {
 
     fn dispatch_outputs(&mut self, now: Timestamp, out: &mut Outputs) {
         let bus = self.config.bus;
-        let transmit = |frame| Transmit { time: now, bus, frame, announces: true };
+        let transmit = |frame| Transmit { time: now, bus, frame, announces: true, secured: None };
         out.frames.extend(self.out.frames.drain(..).map(transmit));
         let event = |what| Event { time: now, kind: EventKind::J1939 { what } };
         out.events.extend(self.out.events.drain(..).map(event));

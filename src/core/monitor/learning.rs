@@ -79,6 +79,16 @@ impl LearningState {
         Self { learner: Learner::new(&config.capacity, cells, initial_capacity), ..Self::default() }
     }
 
+    /// What is learned, without what is under way and without stamps.
+    pub(super) fn learned_only(&self) -> Self {
+        Self {
+            learner: self.learner.learned_only(),
+            recharge_period_s: self.recharge_period_s,
+            normalised_recharge: self.normalised_recharge,
+            ..Self::default()
+        }
+    }
+
     /// Moves every stamp by `by_nanos`, onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.detector.rebase(by_nanos);

@@ -8,7 +8,7 @@
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * `intake`: flood limit, end-to-end check, commands, interfaces; `sampling`: signals, pack identity;
+//! * `intake`, `command_gate`: flood limit, end-to-end check, commands and their authentication, interfaces; `sampling`, `pack_memory`: signals, pack identity;
 //! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
 //! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
 //! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
@@ -19,6 +19,7 @@ mod alarming;
 mod batch;
 mod buses;
 mod clock;
+mod command_gate;
 mod config;
 mod digest;
 mod estimation;
@@ -30,6 +31,7 @@ mod learning;
 mod life;
 mod modelling;
 mod outputs;
+mod pack_memory;
 mod publisher;
 mod reconfigure;
 mod relearn;
@@ -43,7 +45,7 @@ mod view;
 mod watch;
 
 use clock::{ASLEEP_S, Clock, HOUSEKEEPING_S, TimeJump};
-use intake::Intake;
+use intake::{Intake, ReceivedFrame};
 use sleep::Silence;
 use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
@@ -53,15 +55,17 @@ use crate::can::Frame;
 use crate::can::diagnostic::Heard;
 use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
+use crate::can::secoc::MacCheck;
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
 
+pub use command_gate::CommandCounts;
 pub use config::{MonitorConfig, SupplyConfig};
 pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
 pub use intake::{CommandConfig, ControllerCount};
 pub use j1939::{AlarmCode, J1939Config};
 pub use modelling::{ModelState, ModelView};
-pub use outputs::{Estimate, MeasuredValues, Outputs, Transmit, Validity};
+pub use outputs::{Estimate, MeasuredValues, Outputs, Secured, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use relearn::LearnedCell;
 pub use sender::{MAX_TEST_S, OutputConfig};
@@ -107,9 +111,13 @@ impl Monitor {
             self.start(time, out);
         }
         match input {
-            Input::Frame { bus, frame, .. } => {
+            Input::Frame { bus, frame, .. } | Input::SecuredFrame { bus, frame, .. } => {
                 self.advance(time, out);
-                self.handle_frame(bus, frame, out);
+                let freshness = match input {
+                    Input::SecuredFrame { freshness, .. } => freshness,
+                    _ => None,
+                };
+                self.handle_frame(ReceivedFrame { bus, frame, freshness }, out);
                 if self.stages.sender.take_rescheduled() {
                     self.find_due();
                 }
@@ -141,13 +149,14 @@ impl Monitor {
     }
 
     /// Takes a frame: its readings to the stages, or its command.
-    fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+    fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
+        let ReceivedFrame { bus, frame, .. } = received;
         let now = clock.now;
         let Some(admission) = intake.admit(now, bus, frame, out) else { return };
         let is_command = |commands: &&CommandConfig| commands.bus == bus && commands.plan.id() == frame.id();
         if let Some(commands) = config.commands.as_ref().filter(is_command) {
-            let (command, result) = intake.command(now, commands, frame, admission, out);
+            let (command, result) = intake.command(now, commands, &received, admission, out);
             let outcome = result.map(|command| {
                 let CommandOutcome { changed, refused } = stages.handle_command(now, Source::Bus(bus), command, out);
                 (changed, refused)
@@ -213,7 +222,7 @@ impl Monitor {
         let Self { config, intake, stages, .. } = self;
         let now = self.clock.now;
         match input {
-            Input::Frame { .. } | Input::UnknownGap { .. } => {}
+            Input::Frame { .. } | Input::SecuredFrame { .. } | Input::UnknownGap { .. } => {}
             Input::Tick { .. } => {
                 if stages.sender.take_housekeeping_due(now, HOUSEKEEPING_S) {
                     intake.poll(now, out);
@@ -223,6 +232,10 @@ impl Monitor {
                         stages.begin_bus_sleep(now, out);
                     }
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
+                }
+                if stages.sender.take_freshness_due(now) {
+                    let freshness = intake.gate_of_commands.announce(now);
+                    stages.sender.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
                 }
                 stages.send_due(now, out);
             }
@@ -241,6 +254,16 @@ impl Monitor {
                 }
             }
         }
+    }
+
+    /// How the authenticator of a frame is checked; `None` = the frame is not of an authenticated message. The driver, who has
+    /// the key, passes such a frame as [`Input::SecuredFrame`] instead of [`Input::Frame`], which counts as forged.
+    #[inline]
+    pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
+        let commands = self.config.commands.as_ref()?;
+        let secoc = commands.plan.authentication()?;
+        let is_command = commands.bus == bus && commands.plan.id() == frame.id();
+        is_command.then(|| self.intake.gate_of_commands.mac_check(secoc, frame.data()))
     }
 
     /// Steps the cells with a waiting sample, without waiting for the others. The core does so itself before anything that
@@ -278,8 +301,11 @@ impl Monitor {
             let config = *stages.estimation.bank.config();
             stages.estimation.bank.change_all(|estimator| estimator.note_downtime(&config, away_s));
         }
-        if beginning != Beginning::New {
-            stages.restate_known(taken, was_brief, out);
+        self.intake.gate_of_commands.begin(time);
+        if beginning == Beginning::New {
+            stages.sender.begin_freshness(time);
+        } else {
+            stages.restate_known(taken, was_brief, false, out);
         }
         if beginning == Beginning::RestoredAgeless {
             // Claims the address, too.

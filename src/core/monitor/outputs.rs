@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::event::Event;
 use crate::alarm::AlarmInput;
 use crate::can::Frame;
+use crate::can::secoc::{Authentication, Mac};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// A frame to send.
@@ -19,6 +20,28 @@ pub struct Transmit {
     /// It announces a learned value or a change of an alarm: true for all health, alarm and J1939 frames, so that frames of
     /// one identifier, and the parts of one transfer, are all of one kind.
     pub announces: bool,
+    /// Authentication: the frame carries its freshness, and zeros in place of the authenticator. `None` = there is none.
+    pub secured: Option<Secured>,
+}
+
+/// What the authenticator of a sent frame is made from, besides its data and the key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Secured {
+    /// Lengths and data id.
+    pub authentication: Authentication,
+    /// The whole freshness.
+    pub freshness: u64,
+}
+
+impl Secured {
+    /// The frame with its authenticator; `mac` is AES-128-CMAC.
+    pub fn seal(&self, frame: &Frame, mac: impl FnOnce(&[u8]) -> Mac) -> Frame {
+        let mut sealed = *frame;
+        if let Some(input) = self.authentication.mac_input(frame.data(), self.freshness) {
+            self.authentication.write_mac(sealed.data_mut(), mac(input.bytes()));
+        }
+        sealed
+    }
 }
 
 /// Validity of the published estimates, as on the wire.

@@ -90,8 +90,9 @@ impl Monitor {
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
         let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();
+        let new = self.stages.learning.config;
+        self.stages.packs.forget_measures(old.recharge != new.recharge, old.usable != new.usable);
         let (learning, mut publisher) = self.stages.learning_and_publisher(now, out);
-        let new = learning.config;
         if old.recharge != new.recharge {
             publisher.observe(Rule::RechargePeriodLow, None, Observation::default());
             learning.restate_recharge(&old.recharge);

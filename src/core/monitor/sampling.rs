@@ -49,6 +49,14 @@ impl Identity {
     }
 }
 
+impl Identity {
+    /// Whether a reading gives another number than that of the connected pack.
+    pub(super) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
+        let value = reading.ok().filter(|value| value.is_finite())?;
+        Some(self.known? != value)
+    }
+}
+
 impl Sampling {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         Self {

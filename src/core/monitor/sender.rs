@@ -8,11 +8,12 @@ use serde::{Deserialize, Serialize};
 use super::alarm_queue::{AlarmKey, AlarmQueue};
 use super::digest;
 use super::j1939::J1939;
-use super::{Event, EventKind, MonitorConfig, Outputs, SupplyConfig, Transmit};
+use super::{Event, EventKind, MonitorConfig, Outputs, Secured, SupplyConfig, Transmit};
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule};
 use crate::can::Frame;
 use crate::can::encode::{
-    AlarmFields, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields, SendCounters, StatusFields,
+    AlarmFields, FRESHNESS_PERIOD_MS, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields,
+    SendCounters, StatusFields,
 };
 use crate::can::poll::{PollOutputs, Poller};
 use crate::quantity::{BusIndex, Fault, Timestamp};
@@ -25,6 +26,11 @@ pub const MAX_TEST_S: f64 = 600.0;
 /// Replies at once after a pause; then one each [`REPLY_DELAY_MS`]. A sender of commands waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
+
+/// Freshness values skipped at a start: three hours of the most frames, sent since the state was stored.
+const RESTART_FRESHNESS: u64 = 1 << 20;
+/// Least freshness per second of the clock: more than the frames of a second.
+const FRESHNESS_PER_S: u64 = 256;
 
 /// The daemon's sent frames.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,6 +95,12 @@ pub(super) struct Schedule {
     /// Counters of the frames' end-to-end protection.
     #[serde(default)]
     counters: SendCounters,
+    /// When the freshness of commands is announced next.
+    #[serde(default)]
+    freshness: Timestamp,
+    /// Freshness of the last authenticated frame; one row for all messages.
+    #[serde(default)]
+    sent_freshness: u64,
 }
 
 impl Schedule {
@@ -102,8 +114,9 @@ impl Schedule {
     }
 
     /// When each piece of work is due.
-    fn dues(&mut self) -> [&mut Timestamp; 5] {
-        [&mut self.housekeeping, &mut self.status, &mut self.health, &mut self.alarm, &mut self.digest]
+    fn dues(&mut self) -> [&mut Timestamp; 6] {
+        let Self { housekeeping, status, health, alarm, digest, freshness, .. } = self;
+        [housekeeping, status, health, alarm, digest, freshness]
     }
 
     /// Other periods; a shorter one begins now, not when the longer one is over.
@@ -117,6 +130,12 @@ impl Schedule {
             }
         }
     }
+}
+
+/// The interfaces of a frame: all, or that of `bus` alone where something is sent on it.
+fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item = BusIndex> + '_ {
+    let only = bus.filter(|bus| output.buses.contains(bus));
+    output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
 }
 
 /// Whether work is due; if so, its next time is set, with missed periods skipped.
@@ -189,6 +208,14 @@ impl Sender {
         self.schedule.alarms.restart(now);
     }
 
+    /// Begins the freshness of authenticated frames beyond all that an earlier process can have sent: a receiver accepts none
+    /// twice. The clock counts where the stored state was lost.
+    pub(super) fn begin_freshness(&mut self, now: Timestamp) {
+        let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
+        let sent = &mut self.schedule.sent_freshness;
+        *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
+    }
+
     /// Skips the counters of the frames that an earlier process has sent since its state was stored, or would have sent by
     /// `now`: for a receiver the frames of the downtime are lost ones, and no counter comes twice.
     pub(super) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
@@ -223,7 +250,8 @@ impl Sender {
         let schedule = &self.schedule;
         let sending = self.config.as_ref().map(|config| {
             let digest = (config.plan.digest_pages() > 0).then_some(schedule.digest);
-            let changing = digest.into_iter().chain(schedule.alarms.next_due());
+            let freshness = config.plan.authentication(LayoutMessage::Freshness).map(|_| schedule.freshness);
+            let changing = digest.into_iter().chain(schedule.alarms.next_due()).chain(freshness);
             changing.fold(schedule.status.min(schedule.health).min(schedule.alarm), Timestamp::min)
         });
         let test = self.test.map(|test| test.next.min(test.end));
@@ -248,16 +276,34 @@ impl Sender {
         ])
     }
 
+    /// Whether the freshness of commands is to be announced.
+    pub(super) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
+        let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
+        let due = &mut self.schedule.freshness;
+        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
+    }
+
+    /// Announces the freshness of commands that come on `bus`.
+    pub(super) fn send_freshness(&mut self, time: Timestamp, bus: Option<BusIndex>, freshness: u64, out: &mut Outputs) {
+        let Some(output) = &self.config else { return };
+        let secoc = output.plan.authentication(LayoutMessage::Freshness);
+        let (Some(mut frame), Some(authentication)) = (output.plan.freshness(), secoc) else { return };
+        authentication.write_freshness(frame.data_mut(), freshness);
+        let secured = Some(Secured { authentication, freshness });
+        let transmit = |bus| Transmit { time, bus, frame, announces: false, secured };
+        out.frames.extend(buses_of(output, bus).map(transmit));
+    }
+
     /// Sends the status frame.
     pub(super) fn send_status(&mut self, now: Timestamp, fields: &StatusFields, out: &mut Outputs) {
-        self.send(now, false, out, |plan, counters| plan.status(fields, counters));
+        self.send(now, LayoutMessage::Status, out, |plan, counters| Some(plan.status(fields, counters)));
     }
 
     /// Sends all pages of the health frame.
     pub(super) fn send_health(&mut self, now: Timestamp, fields: &HealthFields, out: &mut Outputs) {
         let pages = self.config.as_ref().map_or(0, |output| output.plan.health_pages());
         for page in 0..pages {
-            self.send(now, true, out, |plan, counters| plan.health(page, fields, counters));
+            self.send(now, LayoutMessage::Health, out, |plan, counters| Some(plan.health(page, fields, counters)));
         }
     }
 
@@ -336,51 +382,55 @@ impl Sender {
         self.schedule.threshold_turn = turn.wrapping_add(1);
         let fields = digest::fields(engine, period_s, turn);
         for page in 0..pages {
-            self.send_if(now, out, |plan, counters| plan.digest(page, &fields, counters));
+            self.send(now, LayoutMessage::Digest, out, |plan, counters| plan.digest(page, &fields, counters));
         }
     }
 
     /// Sends the reply to a command that came on `bus`, on that interface or, where nothing else is sent on it, on all.
     pub(super) fn send_reply(&mut self, now: Timestamp, bus: BusIndex, fields: &ReplyFields, out: &mut Outputs) {
-        let Some(output) = &self.config else { return };
-        if self.schedule.reply > now {
+        if self.schedule.reply > now || self.config.as_ref().is_none_or(|output| !output.plan.has_reply()) {
             return;
         }
-        let Some(frame) = output.plan.reply(fields, &mut self.schedule.counters) else { return };
         let earliest = now.plus_nanos(-(REPLY_BURST - 1) * REPLY_DELAY_NS);
         self.schedule.reply = self.schedule.reply.max(earliest).plus_nanos(REPLY_DELAY_NS);
-        let has_bus = output.buses.contains(&bus);
-        let buses = output.buses.iter().filter(|other| !has_bus || **other == bus);
-        out.frames.extend(buses.map(|&bus| Transmit { time: now, bus, frame, announces: true }));
+        self.send_on(now, LayoutMessage::Reply, Some(bus), out, |plan, counters| plan.reply(fields, counters));
     }
 
     fn send_alarm_fields(&mut self, now: Timestamp, fields: &AlarmFields, out: &mut Outputs) {
-        self.send(now, true, out, |plan, counters| plan.alarm(fields, counters));
+        self.send(now, LayoutMessage::Alarm, out, |plan, counters| Some(plan.alarm(fields, counters)));
     }
 
-    /// Sends an announcing frame, if there is one, on every interface.
-    fn send_if(
+    /// Sends a frame, if there is one, on every interface.
+    fn send(
         &mut self,
         time: Timestamp,
+        message: LayoutMessage,
+        out: &mut Outputs,
+        encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Option<Frame>,
+    ) {
+        self.send_on(time, message, None, out, encode);
+    }
+
+    /// Sends a frame, if there is one, as an answer to what came on `bus`; `None` = it is no answer.
+    fn send_on(
+        &mut self,
+        time: Timestamp,
+        message: LayoutMessage,
+        bus: Option<BusIndex>,
         out: &mut Outputs,
         encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Option<Frame>,
     ) {
         let Some(output) = &self.config else { return };
-        let Some(frame) = encode(&output.plan, &mut self.schedule.counters) else { return };
-        out.frames.extend(output.buses.iter().map(|&bus| Transmit { time, bus, frame, announces: true }));
-    }
-
-    /// Sends a frame on every interface.
-    fn send(
-        &mut self,
-        time: Timestamp,
-        announces: bool,
-        out: &mut Outputs,
-        encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Frame,
-    ) {
-        let Some(output) = &self.config else { return };
-        let frame = encode(&output.plan, &mut self.schedule.counters);
-        out.frames.extend(output.buses.iter().map(|&bus| Transmit { time, bus, frame, announces }));
+        let Some(mut frame) = encode(&output.plan, &mut self.schedule.counters) else { return };
+        let secured = output.plan.authentication(message).map(|authentication| {
+            let freshness = self.schedule.sent_freshness.saturating_add(1);
+            self.schedule.sent_freshness = freshness;
+            authentication.write_freshness(frame.data_mut(), freshness);
+            Secured { authentication, freshness }
+        });
+        let announces = message != LayoutMessage::Status;
+        let transmit = |bus| Transmit { time, bus, frame, announces, secured };
+        out.frames.extend(buses_of(output, bus).map(transmit));
     }
 
     /// Begins to send a rule's alarm frame marked as a test, in place of a running one; of 0 s, only ends that one.
@@ -443,7 +493,7 @@ impl Sender {
     ) {
         let Some(poller) = &mut self.poller else { return };
         act(poller, &mut self.polled);
-        let transmit = |(bus, frame)| Transmit { time: now, bus, frame, announces: false };
+        let transmit = |(bus, frame)| Transmit { time: now, bus, frame, announces: false, secured: None };
         out.frames.extend(self.polled.frames.drain(..).map(transmit));
         let event = |change| Event { time: now, kind: EventKind::Poll(change) };
         out.events.extend(self.polled.changes.drain(..).map(event));

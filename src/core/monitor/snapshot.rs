@@ -13,6 +13,7 @@ use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
 use super::modelling::{ModelView, ModellingState};
+use super::pack_memory::{PackMemory, StoredPack};
 use super::sampling::Identity;
 use super::sender::Schedule;
 use super::stages::Stages;
@@ -60,12 +61,15 @@ pub struct Snapshot {
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
+    /// Packs that were connected before.
+    #[serde(default, skip_serializing_if = "PackMemory::is_empty")]
+    packs: PackMemory,
 }
 
 /// One cell of a snapshot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct StoredCell {
+pub(super) struct StoredCell {
     estimator: CellState,
     consumed: Option<Consumed>,
     trusted: bool,
@@ -73,7 +77,7 @@ struct StoredCell {
     #[serde(default = "ModelCheck::ended")]
     model_check: ModelCheck,
     #[serde(flatten)]
-    health: CellHealth,
+    pub(super) health: CellHealth,
     /// `None` in states of programs without forecasts: it begins with the next reading.
     #[serde(default)]
     forecast: Option<Forecast>,
@@ -130,7 +134,8 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
-        let Stages { sampling, estimation, modelling, learning, alarming, sender, statistics, sleep } = &self.stages;
+        let Stages { sampling, estimation, modelling, learning, alarming, sender, statistics, sleep, packs } =
+            &self.stages;
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
@@ -149,6 +154,7 @@ impl Monitor {
             statistics: statistics.clone(),
             modelling: modelling.stored(),
             asleep_since: sleep.since,
+            packs: packs.clone(),
         }
     }
 
@@ -218,33 +224,78 @@ impl Stages {
 
     /// Continues from a checked and rebased snapshot.
     fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
-        let Self { sampling, estimation, modelling, learning, .. } = self;
-        if let Some(stored) = snapshot.modelling {
+        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
+        let batch = CellBatch::restore(has_reported, snapshot.waiting);
+        self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
+        // Its shape is checked in `Monitor::restore`.
+        self.sampling.sampler.restore(snapshot.sampler);
+        self.sampling.identity = snapshot.identity;
+        self.packs = snapshot.packs;
+        let (cells, branches) = (self.estimation.cells(), self.estimation.bank.model().branches.len());
+        self.packs.retain(|pack| pack.fits(cells, branches));
+        self.sender.schedule = snapshot.schedule;
+        self.sender.begin_freshness(now);
+        self.sleep.since = snapshot.asleep_since;
+        self.restore_alarms(now, &snapshot.alarms, out);
+        self.statistics = snapshot.statistics;
+        self.statistics.restores += 1;
+    }
+
+    /// Restores the cells' model, filters and learned values of all cells.
+    fn restore_learned(
+        &mut self,
+        cells: &[StoredCell],
+        model: Option<ModellingState>,
+        state: LearningState,
+        batch: CellBatch,
+    ) {
+        let Self { estimation, modelling, learning, .. } = self;
+        if let Some(stored) = model {
             modelling.restore(stored);
-            estimation.use_model(modelling, &snapshot.learning.learner);
+            estimation.use_model(modelling, &state.learner);
         }
         let branches = estimation.bank.model().branches.len();
-        for (index, cell) in snapshot.cells.iter().enumerate() {
+        for (index, cell) in cells.iter().enumerate() {
             learning.cells[index] = cell.health;
             learning.lives.cells[index] = cell.life(estimation.bank.model(), &learning.config);
             if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
                 estimation.bank.put(index, &estimator);
             }
         }
-        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
-        let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
-        estimation.restore(cells, CellBatch::restore(has_reported, snapshot.waiting));
-        // Its shape is checked in `Monitor::restore`.
-        sampling.sampler.restore(snapshot.sampler);
-        sampling.identity = snapshot.identity;
-        learning.state = snapshot.learning;
+        estimation.restore(cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check)), batch);
+        learning.state = state;
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
-        self.sender.schedule = snapshot.schedule;
-        self.sleep.since = snapshot.asleep_since;
-        self.restore_alarms(now, &snapshot.alarms, out);
-        self.statistics = snapshot.statistics;
-        self.statistics.restores += 1;
+    }
+
+    /// What is learned of the connected pack, under its number.
+    pub(super) fn stored_pack(&self) -> StoredPack {
+        let cells = 0..self.estimation.cells();
+        let cells = cells.map(|cell| StoredCell { consumed: None, updated_in_round: false, ..self.stored_cell(cell) });
+        StoredPack {
+            number: self.sampling.identity.known.unwrap_or(0.0),
+            cells: cells.collect(),
+            modelling: self.modelling.stored(),
+            learning: self.learning.state.learned_only(),
+        }
+    }
+
+    /// Continues with a pack that was connected before, after a time of unknown length.
+    pub(super) fn restore_pack(&mut self, now: Timestamp, pack: StoredPack, out: &mut Outputs) {
+        let batch = CellBatch::new(pack.cells.len());
+        self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
+        self.modelling.end_stretch();
+        self.estimation.handle_unknown_gap();
+        let capacity = self.learning.weakest_capacity();
+        let kind = EventKind::PackReturned {
+            identity: pack.number,
+            capacity_ah: capacity.map(|capacity| capacity.mean),
+            capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
+        };
+        out.events.push(Event { time: now, kind });
+        // The alarms of the pack that was here ended: these values are new to the rules.
+        self.restate_known(now, false, true, out);
+        self.publisher(now, out).publish_alarms();
     }
 
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
@@ -260,6 +311,15 @@ impl Stages {
             self.sender.note_change(time, AlarmKey::new(rule, severity, cell));
         }
         self.sender.send_changed_alarms(time, &self.alarming.engine, out);
+    }
+}
+
+impl StoredPack {
+    /// Whether it is a pack of so many cells, each of so many branches.
+    fn fits(&self, cells: usize, branches: usize) -> bool {
+        self.cells.len() == cells
+            && self.learning.learner.fits(cells)
+            && self.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some())
     }
 }
 
@@ -292,6 +352,8 @@ impl Snapshot {
         self.waiting.iter().try_for_each(CellSample::check)?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
         self.sampler.check()?;
+        self.intake.commands.check_state()?;
+        self.packs.check()?;
         Ok(self.learning.check()?)
     }
 
@@ -307,12 +369,13 @@ impl Snapshot {
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
         self.buses.rebase(by_nanos);
+        self.intake.commands.rebase(by_nanos);
         self.asleep_since = self.asleep_since.map(|since| since.plus_nanos(by_nanos));
     }
 }
 
 impl LearningState {
-    fn check(&self) -> Result<(), InvalidState> {
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.learner.check()?;
         self.recharge.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
@@ -322,7 +385,7 @@ impl LearningState {
 }
 
 impl StoredCell {
-    fn check(&self) -> Result<(), InvalidState> {
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
         self.model_check.check()?;
         InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;

@@ -7,6 +7,7 @@ use super::alarming::Alarming;
 use super::estimation::Estimation;
 use super::learning::Learning;
 use super::modelling::Modelling;
+use super::pack_memory::PackMemory;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
@@ -32,6 +33,7 @@ pub(super) struct Stages {
     pub(super) sender: Sender,
     pub(super) statistics: Statistics,
     pub(super) sleep: BusSleep,
+    pub(super) packs: PackMemory,
 }
 
 impl Stages {
@@ -45,6 +47,7 @@ impl Stages {
             sender: Sender::new(config),
             statistics: Statistics::default(),
             sleep: BusSleep::new(config),
+            packs: PackMemory::default(),
         }
     }
 
@@ -127,9 +130,22 @@ impl Stages {
     }
 
     fn handle_identity(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
+        match self.sampling.identity.is_other(reading.value) {
+            Some(true) if !self.packs.has_aside() => {
+                self.step_waiting(now, true, out);
+                let pack = self.stored_pack();
+                self.packs.put_aside(pack);
+            }
+            Some(false) => self.packs.drop_aside(),
+            _ => {}
+        }
         let Some((identity, is_replacement)) = self.sampling.handle_identity(reading.value) else { return };
         if is_replacement {
+            let before = self.packs.exchange(identity);
             self.handle_command(now, Source::Bus(bus), Command::PackReplaced, out);
+            if let Some(pack) = before {
+                self.restore_pack(now, pack, out);
+            }
         }
         out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
@@ -241,6 +257,10 @@ impl Stages {
         out: &mut Outputs,
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
+        if command == Command::PackReplaced {
+            // Whatever its number is: what was learned is not of the pack that is connected.
+            self.packs.drop_aside();
+        }
         let CommandOutcome { changed, refused } = match command {
             Command::Acknowledge(which) => self.publisher(now, out).apply(AlarmInput::Acknowledge(which)),
             Command::Clear(which) => self.publisher(now, out).apply(AlarmInput::Clear(which)),

@@ -173,7 +173,7 @@ impl Statistics {
     /// Counts an input and its events.
     pub(super) fn note(&mut self, input: &Input<'_>, events: &[Event]) {
         match *input {
-            Input::Frame { bus, .. } => self.bus(bus).frames += 1,
+            Input::Frame { bus, .. } | Input::SecuredFrame { bus, .. } => self.bus(bus).frames += 1,
             Input::Bus { bus, event: BusEvent::ErrorFrame { class }, .. } => {
                 let counts = self.bus(bus);
                 counts.error_frames += 1;

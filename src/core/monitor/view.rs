@@ -1,15 +1,16 @@
 //! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
 
 use super::stages::Stages;
-use super::{ControllerCount, Estimate, ModelView, Monitor, Statistics, Validity};
+use super::{CommandConfig, CommandCounts, ControllerCount, Estimate, ModelView, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
+use crate::can::CanId;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
-use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 
 /// One cell.
@@ -95,6 +96,17 @@ impl Monitor {
     /// Per protected input message: the count of each status of its check.
     pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.intake.protected()
+    }
+
+    /// How commands from the bus are read; `None` = none are executed.
+    pub fn commands(&self) -> Option<&CommandConfig> {
+        self.config.commands.as_ref()
+    }
+
+    /// The authenticated command message, and how its frames were judged; `None` = commands are not authenticated.
+    pub fn authenticated_commands(&self) -> Option<(BusIndex, CanId, CommandCounts)> {
+        let commands = self.config.commands.as_ref().filter(|commands| commands.plan.authentication().is_some())?;
+        Some((commands.bus, commands.plan.id(), self.intake.gate_of_commands.counts))
     }
 
     /// Input messages with dropped frames, because more came than the limit allows.

@@ -274,10 +274,10 @@ impl Stages {
         }
     }
 
-    /// Passes known values to their rules after a restart, as old ones. `was_brief`: the time away was so short that
-    /// measured values still hold, too.
-    pub(super) fn restate_known(&mut self, now: Timestamp, was_brief: bool, out: &mut Outputs) {
-        let old = |value: ScalarGaussian| Observation { is_new: false, ..learned(value) };
+    /// Passes known values to their rules, after a restart as old ones. `was_brief`: the time away was so short that
+    /// measured values still hold, too. `is_new`: the rules have not seen them, those of a pack that came back.
+    pub(super) fn restate_known(&mut self, now: Timestamp, was_brief: bool, is_new: bool, out: &mut Outputs) {
+        let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
             let (cell, index) = (Some(index), index.index());
             let capacity = self.learning.state.learner.has_learned(index).then(|| self.learning.capacity(index));
@@ -303,8 +303,8 @@ impl Stages {
         let period = self.learning.known_recharge_period();
         let (learning, mut publisher) = self.learning_and_publisher(now, out);
         if let Some(period) = period {
-            publisher.observe(Rule::RechargePeriodLow, None, Observation { is_new: false, ..period });
+            publisher.observe(Rule::RechargePeriodLow, None, Observation { is_new, ..period });
         }
-        learning.lives.observe(false, &mut publisher);
+        learning.lives.observe(is_new, &mut publisher);
     }
 }

@@ -103,7 +103,7 @@ pub struct SignalUse {
 /// A frame that is sent.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct OutputUse {
-    /// `status`, `health`, `alarm`, `digest`, `reply`.
+    /// `status`, `health`, `alarm`, `digest`, `reply`, `freshness`.
     pub frame: &'static str,
     /// Identifier as candump writes it.
     pub id: String,
@@ -115,6 +115,8 @@ pub struct OutputUse {
     pub kind: &'static str,
     /// End-to-end protection: `profile 1A, data id 0x123`, or `none`.
     pub protection: String,
+    /// Authentication: `SecOC fd, data id 0x123`, or `none`.
+    pub authentication: String,
 }
 
 /// Describes a checked configuration and the signals found for it.

@@ -208,6 +208,7 @@ fn definition(keys: &DiagnosticInput, faults: &mut Faults) -> Option<AnswerDefin
         sender: None,
         format: FrameFormat::Classic,
         e2e: None,
+        secoc: None,
         signals,
         cycle_time_ms: None,
         repetition: Default::default(),

@@ -18,6 +18,7 @@ use super::{StoreConfig, VehicleIdentity};
 
 use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
+use crate::can::secoc;
 use crate::cell::{CapacityState, Chemistry, Discretisation};
 use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
@@ -30,7 +31,8 @@ pub(crate) use input::{
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
 pub(crate) use traffic::{
-    Commands, FrameKeys, J1939, Output, OutputAlarm, OutputDigest, OutputHealth, OutputReply, OutputStatus, Poll,
+    Authentication, Commands, FrameKeys, J1939, Output, OutputAlarm, OutputDigest, OutputFreshness, OutputHealth,
+    OutputReply, OutputStatus, Poll,
 };
 
 /// Coldest and hottest temperature that may be configured, degrees C.
@@ -78,6 +80,7 @@ choice!(E2eKey {
     "1C" => Self(Some(Profile::P01C)),
     "5" => Self(Some(Profile::P05)),
 });
+choice!(secoc::Profile { "1" => Self::P1, "3" => Self::P3, "fd" => Self::Fd });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(Chemistry {
     "nmc811-graphite" => Self::Nmc811Graphite,

@@ -101,12 +101,37 @@ pub struct Config {
     pub warnings: Vec<String>,
     /// Which vehicle and pack this is.
     pub vehicle: VehicleIdentity,
+    /// Where the key of authenticated frames is; `None` = no frame is authenticated.
+    pub key: Option<KeySource>,
+}
+
+/// Where the key of authenticated frames is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum KeySource {
+    /// The credential of this name that the service manager passes.
+    Credential(String),
+    /// A file.
+    File(PathBuf),
+}
+
+impl std::fmt::Display for KeySource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Credential(name) => write!(f, "credential {name}"),
+            Self::File(path) => write!(f, "file {}", path.display()),
+        }
+    }
 }
 
 impl Config {
     /// Names of the interfaces, in the order in which they are numbered.
     pub fn interface_names(&self) -> Vec<String> {
         self.interfaces.iter().map(|interface| interface.name.clone()).collect()
+    }
+
+    /// How commands from the bus are checked, in a sentence.
+    pub fn command_words(&self) -> String {
+        protect::command_words(self)
     }
 }
 
@@ -218,7 +243,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let mut guards = protect::guards(checks, inputs_whole);
     let laid_out = output::output(checks, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
-    guards.extend(guard);
+    guards.extend(guard.flatten());
     let poll = diagnostic::poll(&raw, &found, checks.faults);
     let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
@@ -238,6 +263,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?.config();
+    let key = commands::key_source(&raw, path, !monitor.authentications().is_empty(), faults);
     let config = Config {
         path: path.to_owned(),
         interfaces,
@@ -247,6 +273,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
         store,
         warnings,
         vehicle,
+        key,
     };
     let description = describe::describe(files, &raw, &config, &found, outputs);
     Some((config, description))

@@ -16,13 +16,20 @@ use crate::can::encode::{
     DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, SentMessage,
     layout,
 };
+use crate::can::secoc::{self, Authentication};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
 
 /// The messages that are sent.
-const SENT: [LayoutMessage; 5] =
-    [LayoutMessage::Status, LayoutMessage::Health, LayoutMessage::Alarm, LayoutMessage::Digest, LayoutMessage::Reply];
+const SENT: [LayoutMessage; 6] = [
+    LayoutMessage::Status,
+    LayoutMessage::Health,
+    LayoutMessage::Alarm,
+    LayoutMessage::Digest,
+    LayoutMessage::Reply,
+    LayoutMessage::Freshness,
+];
 
 /// The sent frames and their layout; `None` = none (not configured, or faults noted).
 pub(super) fn output(
@@ -40,8 +47,10 @@ pub(super) fn output(
         raw.output_alarm.as_ref()?.config(),
         raw.output_digest.as_ref()?.config(),
         raw.output_reply.as_ref()?.config(),
+        raw.output_freshness.as_ref()?.config(),
     ];
-    let [status, health, alarm, digest, reply] = frames.map(|frame| message_settings(&frame, checks.faults));
+    let [status, health, alarm, digest, reply] =
+        [0, 1, 2, 3, 4].map(|place| message_settings(&frames[place], checks.faults));
     let command_settings = match command {
         Some(keys) => Some(message_settings(&keys.config(), checks.faults)?),
         None => None,
@@ -49,8 +58,10 @@ pub(super) fn output(
     if frames[4].period_ms.is_some() {
         frames[4].place.fault(checks.faults, "period_ms", "must not be given: a reply is sent on a command only");
     }
-    let (status, health, alarm, digest, reply) = (status?, health?, alarm?, digest?, reply?);
-    let settings = LayoutSettings { status, health, alarm, command: command_settings, digest, reply };
+    frames[..5].iter().for_each(|frame| check_sent_secoc(frame, checks.faults));
+    let freshness = freshness_settings(&frames[5], command_settings.as_ref(), checks.faults);
+    let (status, health, alarm, digest, reply, freshness) = (status?, health?, alarm?, digest?, reply?, freshness?);
+    let settings = LayoutSettings { status, health, alarm, command: command_settings, digest, reply, freshness };
     let frames: Vec<_> = SENT.into_iter().zip(frames).collect();
     let laid_out: Vec<_> =
         frames.iter().copied().chain(command.map(|keys| (LayoutMessage::Command, keys.config()))).collect();
@@ -99,7 +110,8 @@ pub(super) fn message_settings(keys: &FrameKeys<'_>, faults: &mut Faults) -> Opt
         None => None,
     };
     let e2e = protection(keys, faults)?;
-    Some(MessageSettings { id, fd: keys.fd, brs: keys.brs, period_ms: keys.period_ms, e2e })
+    let secoc = authentication(keys, faults)?;
+    Some(MessageSettings { id, fd: keys.fd, brs: keys.brs, period_ms: keys.period_ms, e2e, secoc })
 }
 
 fn configured_id(keys: &FrameKeys<'_>, id: u32, faults: &mut Faults) -> Option<CanId> {
@@ -112,8 +124,8 @@ fn configured_id(keys: &FrameKeys<'_>, id: u32, faults: &mut Faults) -> Option<C
 
 fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
     let profile = match keys.e2e {
-        None if keys.data_id.is_some() => {
-            keys.place.fault(faults, "data_id", "must have e2e beside it");
+        None if keys.data_id.is_some() && keys.secoc.is_none() => {
+            keys.place.fault(faults, "data_id", "must have e2e or secoc beside it");
             return None;
         }
         None => return Some(E2eSetting::AsBase),
@@ -126,6 +138,62 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
         return None;
     };
     Some(E2eSetting::On(Protection { profile, data_id }))
+}
+
+/// The authentication of a frame; `None` = faults noted.
+fn authentication(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<Option<Authentication>> {
+    let Some(profile) = keys.secoc else { return Some(None) };
+    let Some(data_id) = keys.data_id else {
+        keys.place.fault(
+            faults,
+            "data_id",
+            &format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()),
+        );
+        return None;
+    };
+    Some(Some(Authentication { profile, data_id }))
+}
+
+/// Notes a profile that only commands may have: its few bits of freshness do not reach beyond a restart of the sender.
+fn check_sent_secoc(keys: &FrameKeys<'_>, faults: &mut Faults) {
+    if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
+        keys.place.fault(faults, "secoc", "must be \"fd\" for a frame that is sent");
+    }
+}
+
+/// The settings of the announcement of freshness; `None` = faults noted.
+fn freshness_settings(
+    keys: &FrameKeys<'_>,
+    command: Option<&MessageSettings>,
+    faults: &mut Faults,
+) -> Option<MessageSettings> {
+    let is_sent = command.is_some_and(|command| command.secoc.is_some());
+    let unused = [
+        ("e2e", keys.e2e.is_some()),
+        ("secoc", keys.secoc.is_some()),
+        ("period_ms", keys.period_ms.is_some()),
+        ("data_id", keys.data_id.is_some() && !is_sent),
+    ];
+    let mut is_good = true;
+    for (key, _) in unused.into_iter().filter(|(_, is_given)| *is_given) {
+        is_good = false;
+        let what = if key == "data_id" {
+            "must not be given without commands.secoc: nothing is announced"
+        } else {
+            "must not be given: the announcement is authenticated in its own way, once a second"
+        };
+        keys.place.fault(faults, key, what);
+    }
+    let Some(data_id) = keys.data_id.filter(|_| is_sent) else {
+        if is_sent {
+            keys.place.fault(faults, "data_id", "must be given, 0 to 0xFFFF, with commands.secoc");
+        }
+        return (is_good && !is_sent).then(MessageSettings::default);
+    };
+    let id = keys.id.and_then(|id| configured_id(keys, id, faults));
+    let secoc = Some(Authentication { profile: secoc::Profile::Announcement, data_id });
+    let settings = MessageSettings { id, fd: keys.fd, brs: keys.brs, secoc, ..MessageSettings::default() };
+    is_good.then_some(settings)
 }
 
 /// The layout; a setting that does not fit it is noted at its key.
@@ -174,7 +242,7 @@ fn check_ids(
 /// Notes a data id that is used twice: one frame could be accepted as another.
 fn check_data_ids(frames: &[(LayoutMessage, FrameKeys<'_>)], plan: &OutputPlan, faults: &mut Faults) {
     let sent: Vec<_> = plan.messages().collect();
-    let data_id = |message: &SentMessage| message.protection.map(|protection| protection.data_id);
+    let data_id = SentMessage::data_id;
     for (index, message) in sent.iter().enumerate() {
         let (Some(keys), Some(found)) = (keys_of(frames, message.message), data_id(message)) else { continue };
         if let Some(other) = sent[..index].iter().find(|other| data_id(other) == Some(found)) {
@@ -190,6 +258,11 @@ fn buses(raw: &RawTables, keys: &Output) -> Vec<BusIndex> {
     let wanted = |name: &str| keys.interfaces.as_ref().is_none_or(|names| names.iter().any(|n| n == name));
     let indexed = (0..).zip(&raw.interfaces).filter(|(_, interface)| wanted(&interface.name));
     indexed.map(|(index, _)| BusIndex(index)).collect()
+}
+
+/// An authentication in words.
+pub(super) fn authentication_words(Authentication { profile, data_id }: Authentication) -> String {
+    format!("SecOC {}, data id {data_id:#X}", profile.name())
 }
 
 /// Describes the sent frames.
@@ -210,6 +283,7 @@ pub(super) fn uses(raw: &RawTables, output: Option<&OutputConfig>) -> Vec<Output
         protection: sent.protection.map_or("none".to_owned(), |Protection { profile, data_id }| {
             format!("profile {}, data id {data_id:#X}", profile.name())
         }),
+        authentication: sent.secoc.map_or("none".to_owned(), authentication_words),
     });
     used.collect()
 }

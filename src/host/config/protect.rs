@@ -3,6 +3,7 @@
 use super::Config;
 use super::document::Faults;
 use super::keys::ProtectedInput;
+use super::output::authentication_words;
 use super::resolve::{Checks, ResolvedSignal};
 use super::schema::did_you_mean;
 use crate::can::dbc::{Message, Signal};
@@ -58,7 +59,7 @@ fn check_identity(checks: &mut Checks<'_>, guards: &[GuardConfig]) {
     if let Some(input) = open {
         let what = format!(
             "must be a signal of a message in [[input.protected]], or have accept_unprotected = true beside it: forged \
-             frames of {} would discard everything learned",
+             frames of {} would put aside everything learned",
             input.message.name
         );
         keys.place.fault(checks.faults, "signal", &what);
@@ -143,6 +144,17 @@ fn header_words(mask: [u8; 3]) -> &'static str {
     }
 }
 
+/// How commands of other ECUs are checked.
+pub(super) fn command_words(config: &Config) -> String {
+    let Some(commands) = &config.monitor.commands else { return "commands of other ECUs are not executed".to_owned() };
+    match (commands.plan.authentication(), &config.key) {
+        (Some(secoc), Some(key)) => {
+            format!("commands of other ECUs are authenticated, {}, key in {key}", authentication_words(secoc))
+        }
+        _ => "commands of other ECUs are unauthenticated: every node of the bus can make one".to_owned(),
+    }
+}
+
 /// Describes how frames are checked before they are read.
 pub(super) fn describe(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<String> {
     let monitor = &config.monitor;
@@ -154,12 +166,10 @@ pub(super) fn describe(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Str
                 .to_owned(),
         );
     }
-    if monitor.commands.is_none() {
-        words.push("commands of other ECUs are not executed".to_owned());
-    }
+    words.push(command_words(config));
     for guard in &monitor.guards {
         let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));
-        let name = input.map_or("commands", |input| input.message.name.as_str());
+        let name = input.map_or("unauthenticated commands", |input| input.message.name.as_str());
         let interface = config.interfaces.get(guard.bus.index()).map_or("", |interface| interface.name.as_str());
         let Protection { profile, data_id } = guard.check.protection;
         let missed = match guard.cycle_time_s {

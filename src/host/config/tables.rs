@@ -2,11 +2,11 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, AnswerSignalKeys, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput, CurrentLimits,
-    DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest, OutputHealth, OutputReply,
-    OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput,
-    ReportedSohInput, SignalSource, Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable,
-    Vehicle, VoltageLimits,
+    Alarm, AnswerSignalKeys, Authentication, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput,
+    CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest,
+    OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll,
+    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, SupplyVoltageInput,
+    TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -46,7 +46,9 @@ tables! {
         output_alarm: one OutputAlarm,
         output_digest: one OutputDigest,
         output_reply: one OutputReply,
+        output_freshness: one OutputFreshness,
         commands: one Commands,
+        authentication: one Authentication,
         store: one Store,
     }
 }

@@ -136,6 +136,17 @@ pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
     Ok((time, &text[cursor.at..]))
 }
 
+/// Reads an interface's name and a frame at the start of `text`; the rest of the text with them. `None` = they are not there.
+pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
+    let mut cursor = Cursor { text, at: 0 };
+    let interface = cursor.word();
+    cursor.spaces("").ok()?;
+    match cursor.frame().ok()? {
+        Body::Frame(frame) => Some((interface, frame, &text[cursor.at..])),
+        Body::Error(_) | Body::Xl => None,
+    }
+}
+
 fn parse_drop_count(line: &[u8]) -> Option<Line<'_>> {
     let rest = line.strip_prefix(b"DROPCOUNT: dropped ")?;
     let digits = rest.iter().take_while(|b| b.is_ascii_digit()).count();
@@ -418,6 +429,13 @@ pub fn write_line(
     text.frame(frame);
     text.push(b'\n');
     out.write_all(&text.bytes[..text.len])
+}
+
+/// A frame as [`write_line`] writes it.
+pub fn frame_text(frame: &Frame) -> String {
+    let mut text = FrameText { bytes: [0; 8 + 3 + 2 * MAX_DATA + 1], len: 0 };
+    text.frame(frame);
+    String::from_utf8_lossy(&text.bytes[..text.len]).into_owned()
 }
 
 /// Writes `(seconds.fraction)`.

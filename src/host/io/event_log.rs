@@ -143,7 +143,16 @@ impl EventLog {
                 tracing::warn!(
                     capacity_ah,
                     capacity_std_ah,
-                    "another pack: learned values of the old one are discarded"
+                    "another pack: learned values of the old one no longer apply"
+                );
+            }
+            EventKind::PackReturned { identity, capacity_ah, capacity_std_ah } => {
+                let (capacity_ah, capacity_std_ah) = (capacity_ah.map(rounded), capacity_std_ah.map(rounded));
+                tracing::info!(
+                    identity,
+                    capacity_ah,
+                    capacity_std_ah,
+                    "a known pack is back: its learned values are restored"
                 );
             }
             EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),

@@ -5,6 +5,7 @@
 //!
 //! ```text
 //! (1700000000.123456789) can0 123#1122
+//! SECURED (1700000000.125000000) can0 6B3#1122334455667788 27200000016|-
 //! TICK (1700000000.130000000)
 //! BUS (1700000000.200000000) can0 up|down|missing|dropped N|error_frame CLASS|send_failed N
 //! GAP (1700000000.300000000)
@@ -14,7 +15,8 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `RELOAD`: from here on another configuration is in force, which the journal does not contain.
+//! `SECURED`: a frame of an authenticated message, with the freshness with which its authenticator was right (`-`: with none),
+//! so that a replay needs no key. `RELOAD`: from here on another configuration is in force, which the journal does not contain.
 //! `RESTORE` is the first line of a run that restored a stored state, with the time it did not run (`-`: as the stamps
 //! say).
 //! A last line without line feed was torn by a power cut and is a bad line, even where it could be read.
@@ -23,6 +25,7 @@ use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
 use super::record::Record;
+use crate::can::Frame;
 use crate::monitor::{BusEvent, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
@@ -30,7 +33,7 @@ use crate::quantity::{BusIndex, Timestamp};
 pub const HEADER: &str = "PACKWATCH-JOURNAL 1";
 
 /// Words that lines other than frames begin with.
-const KEYWORDS: [&[u8]; 7] = [b"TICK", b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"];
+const KEYWORDS: [&[u8]; 8] = [b"SECURED", b"TICK", b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"];
 
 /// Whether a line that does not begin with `(` is one of the journal's.
 pub fn is_mark(line: &[u8]) -> bool {
@@ -61,6 +64,12 @@ pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> R
             let works = [(&b"works"[..], true), (b"fails", false)].into_iter().find(|(word, _)| *word == rest_text);
             (works.map(|(_, works)| Record::Store { time, works }), "works or fails")
         }
+        b"SECURED" => match parse_secured(rest_text) {
+            Some((interface, frame, freshness)) => {
+                return Ok(bus(interface).map(|bus| Record::SecuredFrame { time, bus, frame, freshness }));
+            }
+            None => (None, "an interface, a frame, and its freshness or -"),
+        },
         _ => match parse_bus(rest_text) {
             Some((interface, event)) => return Ok(bus(interface).map(|bus| Record::Bus { time, bus, event })),
             None => (
@@ -75,6 +84,15 @@ pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> R
 
 fn parse_away(text: &[u8]) -> Option<Downtime> {
     std::str::from_utf8(text).ok()?.parse().ok()
+}
+
+fn parse_secured(text: &[u8]) -> Option<(&[u8], Frame, Option<u64>)> {
+    let (interface, frame, rest) = candump::parse_frame(text)?;
+    let freshness = match rest.strip_prefix(b" ")? {
+        b"-" => None,
+        digits => Some(std::str::from_utf8(digits).ok()?.parse().ok()?),
+    };
+    Some((interface, frame, freshness))
 }
 
 fn parse_bus(text: &[u8]) -> Option<(&[u8], BusEvent)> {
@@ -135,6 +153,12 @@ impl<W: Write> JournalWriter<W> {
             Input::Frame { time, bus, frame } => {
                 let interface = name(&self.interfaces, bus.index())?;
                 candump::write_line(&mut self.out, time, StampDigits::Nanos, interface, frame)
+            }
+            Input::SecuredFrame { time, bus, frame, freshness } => {
+                let interface = name(&self.interfaces, bus.index())?;
+                let frame = candump::frame_text(frame);
+                let freshness = freshness.map_or("-".to_owned(), |freshness| freshness.to_string());
+                write_mark(&mut self.out, "SECURED", time, format_args!(" {interface} {frame} {freshness}"))
             }
             Input::Tick { time } => write_mark(&mut self.out, "TICK", time, ""),
             Input::UnknownGap { time } => write_mark(&mut self.out, "GAP", time, ""),

@@ -341,6 +341,7 @@ impl ReadState {
                 Ok(line) => Ok(self.line_record(&line)),
                 Err(error) => Err(error),
             };
+            self.counts.frames += u64::from(matches!(record, Ok(Some(Record::SecuredFrame { .. }))));
             match record {
                 Ok(Some(record)) => return Ok(Some(record)),
                 Ok(None) => {}

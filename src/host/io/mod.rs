@@ -1,6 +1,7 @@
 //! Files and sockets: logs in every form, journals, result files, CAN interfaces.
 
 pub mod background_file;
+pub mod can_key;
 pub mod candump;
 pub mod clock;
 pub mod csv_log;

@@ -16,6 +16,17 @@ pub enum Record {
         /// Content.
         frame: Frame,
     },
+    /// A frame of an authenticated message; only in journals.
+    SecuredFrame {
+        /// Time.
+        time: Timestamp,
+        /// Interface.
+        bus: BusIndex,
+        /// Content.
+        frame: Frame,
+        /// The freshness with which its authenticator was right; `None` = with none.
+        freshness: Option<u64>,
+    },
     /// Only in journals.
     Tick {
         /// Time.
@@ -71,6 +82,9 @@ impl Record {
     pub fn input(&self) -> Option<Input<'_>> {
         Some(match self {
             Self::Frame { time, bus, frame } => Input::Frame { time: *time, bus: *bus, frame },
+            Self::SecuredFrame { time, bus, frame, freshness } => {
+                Input::SecuredFrame { time: *time, bus: *bus, frame, freshness: *freshness }
+            }
             Self::Tick { time } => Input::Tick { time: *time },
             Self::Bus { time, bus, event } => Input::Bus { time: *time, bus: *bus, event: *event },
             Self::UnknownGap { time } => Input::UnknownGap { time: *time },
@@ -84,6 +98,7 @@ impl Record {
     pub fn time(&self) -> Timestamp {
         match *self {
             Self::Frame { time, .. }
+            | Self::SecuredFrame { time, .. }
             | Self::Tick { time }
             | Self::Bus { time, .. }
             | Self::UnknownGap { time }
@@ -97,6 +112,7 @@ impl Record {
     pub(super) fn at(mut self, placed: Timestamp) -> Self {
         match &mut self {
             Self::Frame { time, .. }
+            | Self::SecuredFrame { time, .. }
             | Self::Tick { time }
             | Self::Bus { time, .. }
             | Self::UnknownGap { time }

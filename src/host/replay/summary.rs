@@ -126,6 +126,7 @@ pub(super) fn note_event(
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
         EventKind::PackIdentity { .. } => "pack_identity",
+        EventKind::PackReturned { .. } => "pack_returned",
         EventKind::Reconfigured { .. } => "reconfigured",
         EventKind::AlarmDropped { .. } => "alarm_dropped",
         EventKind::Store { .. } => "store",

@@ -9,6 +9,7 @@ use tokio::time::Instant;
 use super::readiness::{Readiness, describe_restored};
 use super::{Service, ServiceError};
 use crate::io::background_file::BackgroundFile;
+use crate::io::can_key::CanKey;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
@@ -30,6 +31,8 @@ pub(super) struct Engine {
     pub(super) outputs: Outputs,
     /// Where its frames go; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
+    /// Key of authenticated frames.
+    key: Option<CanKey>,
     record: Option<JournalWriter<BackgroundFile>>,
     frames: Option<BackgroundFile>,
     events: Option<BackgroundFile>,
@@ -99,6 +102,7 @@ impl Engine {
             monitor,
             outputs: Outputs::default(),
             links: Vec::new(),
+            key: service.key.take(),
             record,
             frames,
             events,
@@ -118,13 +122,24 @@ impl Engine {
         })
     }
 
-    /// Journals one input, passes it to the core and dispatches its outputs. Returns the ticket of the commit of what it
-    /// changed; `None` = nothing that is stored, or nothing is stored.
+    /// Takes one input; checks the authenticator of a frame first, where it has one. Returns the ticket of the commit of what
+    /// it changed; `None` = nothing that is stored, or nothing is stored.
     pub(super) fn handle(&mut self, input: &Input<'_>) -> Option<u64> {
+        if let Input::Frame { time, bus, frame } = *input
+            && let Some(check) = self.monitor.mac_check(bus, frame)
+        {
+            let verified = self.key.as_ref().and_then(|key| check.verify(frame.data(), |bytes| key.mac(bytes)));
+            return self.take(&Input::SecuredFrame { time, bus, frame, freshness: verified });
+        }
+        self.take(input)
+    }
+
+    /// Journals one input, passes it to the core and dispatches its outputs.
+    fn take(&mut self, input: &Input<'_>) -> Option<u64> {
         self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(input));
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
-        self.is_fresh |= matches!(input, Input::Frame { .. });
+        self.is_fresh |= matches!(input, Input::Frame { .. } | Input::SecuredFrame { .. });
         self.dispatch_outputs(input.time())
     }
 
@@ -147,7 +162,7 @@ impl Engine {
         let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {
             if !self.barrier.hold(transmit) {
-                send(&self.links, transmit);
+                send(&self.links, self.key.as_ref(), transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -179,7 +194,7 @@ impl Engine {
 
     /// Handles progress or failure of the store.
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
-        self.barrier.release(progress.ticket, |transmit| send(&self.links, transmit));
+        self.barrier.release(progress.ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
         (self.store_works, self.has_room) = (progress.works, progress.has_room);
         self.progress = Some(progress);
         self.report_store_health(time);
@@ -207,13 +222,13 @@ impl Engine {
 
     /// Sends all held frames: the daemon stops.
     pub(super) fn release_all(&mut self) {
-        self.barrier.release(u64::MAX, |transmit| send(&self.links, transmit));
+        self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }
 
     /// Sends frames that have waited too long, and gives the store its checkpoints; called with every tick.
     pub(super) fn poll_store(&mut self, time: Timestamp) {
         if let Some(ticket) = self.barrier.overdue(Instant::now()) {
-            self.barrier.release(ticket, |transmit| send(&self.links, transmit));
+            self.barrier.release(ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
             self.late += 1;
             self.store_works = false;
@@ -261,9 +276,14 @@ impl Engine {
     }
 }
 
-fn send(links: &[LinkOutput], transmit: &Transmit) {
-    if let Some(link) = links.get(transmit.bus.index()) {
-        link.send(transmit.frame);
+/// Sends a frame, with its authenticator where it has one.
+fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
+    let Some(link) = links.get(transmit.bus.index()) else { return };
+    match (transmit.secured, key) {
+        (None, _) => link.send(transmit.frame),
+        (Some(secured), Some(key)) => link.send(secured.seal(&transmit.frame, |bytes| key.mac(bytes))),
+        // Cannot be: the start fails without a key. A frame without its authenticator is never sent.
+        (Some(_), None) => {}
     }
 }
 

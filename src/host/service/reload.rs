@@ -15,7 +15,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
-use crate::config::{self, Config, InterfaceConfig, StoreConfig, VehicleIdentity};
+use crate::config::{self, Config, InterfaceConfig, KeySource, StoreConfig, VehicleIdentity};
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
@@ -122,11 +122,17 @@ struct FixedSettings {
     interfaces: Vec<InterfaceConfig>,
     store: StoreConfig,
     vehicle: VehicleIdentity,
+    key: Option<KeySource>,
 }
 
 impl FixedSettings {
     fn of(config: &Config) -> Self {
-        Self { interfaces: config.interfaces.clone(), store: config.store, vehicle: config.vehicle.clone() }
+        Self {
+            interfaces: config.interfaces.clone(),
+            store: config.store,
+            vehicle: config.vehicle.clone(),
+            key: config.key.clone(),
+        }
     }
 
     /// Checks whether `new` can be applied.
@@ -144,6 +150,9 @@ impl FixedSettings {
         }
         if self.store != new.store {
             return Err("[store]: other settings than it was started with: needs a restart".to_owned());
+        }
+        if self.key != new.key {
+            return Err("[authentication]: another key than it was started with: needs a restart".to_owned());
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
+    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
     MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
     StoreStatus, VERSION,
 };
@@ -18,7 +18,7 @@ use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkHealth, LinkOutput};
-use crate::monitor::{BusStatistics, CellView, ControllerCount, Event, EventKind, Monitor, Statistics};
+use crate::monitor::{BusStatistics, CellView, CommandCounts, ControllerCount, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
@@ -62,6 +62,7 @@ pub struct CounterBaseline {
     readings: ReadingCounts,
     time_backwards: u64,
     protected: Vec<GuardCounts>,
+    commands: CommandCounts,
     floods: Vec<FloodCount>,
     controllers: Vec<ControllerCount>,
 }
@@ -81,6 +82,7 @@ impl CounterBaseline {
             readings: monitor.reading_counts(),
             time_backwards: monitor.time_backwards(),
             protected: monitor.protected().collect(),
+            commands: monitor.authenticated_commands().map(|(_, _, counts)| counts).unwrap_or_default(),
             floods: monitor.dropped().collect(),
             controllers: monitor.controllers().collect(),
         }
@@ -136,6 +138,7 @@ impl Sources<'_> {
                 clients: self.clients,
             },
             protection: self.protection(),
+            commands: self.commands(),
             controllers: self.controllers(),
             asleep_since: self.monitor.asleep_since(),
             poll: self.monitor.poll().map(|(silent, refused)| PollStatus { silent, refused }),
@@ -165,7 +168,30 @@ impl Sources<'_> {
             });
             MessageProtection { interface: self.name(guard.bus), id: guard.id.to_string(), checks: checks.collect() }
         });
-        each.collect()
+        each.chain(self.authentication()).collect()
+    }
+
+    /// The authenticated command message, by outcome.
+    fn authentication(&self) -> Option<MessageProtection> {
+        let (bus, id, counts) = self.monitor.authenticated_commands()?;
+        let counts = counts.since(&self.before.commands);
+        let checks = [
+            ("authentic", counts.authentic),
+            ("forged", counts.forged),
+            ("old", counts.old),
+            ("unconfirmed", counts.unconfirmed),
+        ];
+        let checks = checks.map(|(status, count)| StatusCount { status: status.to_owned(), count });
+        Some(MessageProtection { interface: self.name(bus), id: id.to_string(), checks: checks.to_vec() })
+    }
+
+    fn commands(&self) -> Option<CommandStatus> {
+        let commands = self.monitor.commands()?;
+        Some(CommandStatus {
+            interface: self.name(commands.bus),
+            id: commands.plan.id().to_string(),
+            secoc: commands.plan.authentication().map(|secoc| secoc.profile.name().to_owned()),
+        })
     }
 
     fn controllers(&self) -> Vec<ControllerStatus> {

@@ -61,8 +61,11 @@ pub struct StatusDocument {
     pub alarms: AlarmStatus,
     /// Counts.
     pub counters: StatusCounters,
-    /// Protected input messages.
+    /// Protected input messages, and the authenticated command message.
     pub protection: Vec<MessageProtection>,
+    /// Commands from the bus; `None` = none are executed.
+    #[serde(default)]
+    pub commands: Option<CommandStatus>,
     /// Controllers that answer diagnostic requests.
     #[serde(default)]
     pub controllers: Vec<ControllerStatus>,
@@ -306,6 +309,26 @@ pub struct StatusCount {
     pub status: String,
     /// Number of checks.
     pub count: u64,
+}
+
+/// Commands from the bus.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CommandStatus {
+    /// Interface they come on.
+    pub interface: String,
+    /// Their identifier, as in [`MessageProtection`].
+    pub id: String,
+    /// Profile of SecOC; `None` = they are unauthenticated.
+    pub secoc: Option<String>,
+}
+
+impl CommandStatus {
+    /// In words: `authenticated (SecOC 1)`, `unauthenticated`.
+    pub fn words(&self) -> String {
+        self.secoc
+            .as_ref()
+            .map_or_else(|| "unauthenticated".to_owned(), |profile| format!("authenticated (SecOC {profile})"))
+    }
 }
 
 /// Diagnostic requests of this program.

@@ -72,7 +72,7 @@ mod tests {
 
     fn frame(id: u32, data: u8) -> Transmit {
         let frame = Frame::classic(CanId::standard(id).unwrap(), &[data]).unwrap();
-        Transmit { time: Timestamp::ZERO, bus: BusIndex(0), frame, announces: true }
+        Transmit { time: Timestamp::ZERO, bus: BusIndex(0), frame, announces: true, secured: None }
     }
 
     fn sent(barrier: &mut CommitBarrier, ticket: u64) -> Vec<u8> {

@@ -384,6 +384,7 @@ fn empty_message(field: &MessageField) -> Message {
         sender: None,
         format: FrameFormat::Classic,
         e2e: None,
+        secoc: None,
         signals: field.page.map(|_| page).into_iter().collect(),
         cycle_time_ms: None,
         repetition: Default::default(),

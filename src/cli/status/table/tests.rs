@@ -18,6 +18,7 @@ interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 
 interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
 counted    123456 readings used, 7 not; 3 late ticks; 99 % of estimates within 5.00 ms
 store      works, 21 commits, 0.1 MB
+commands   can0 6B3: unauthenticated
 requests   silent: another tester is at work; 1 refused for good
 answers    can0 7EC: 120 answers, 3 refused (latest code 31), 2 lost: wrong sequence
 alarms     1 raised of 4 thresholds, not known for 1

@@ -228,6 +228,8 @@ fn interfaces(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
         checks.map(|check| count_line(&format!("{} {} {}", it.interface, it.id, check.status), check.count))
     });
     text.extend(protected);
+    let commands = document.commands.iter();
+    text.extend(commands.map(|it| Line::from(format!("commands {} {}: {}", it.interface, it.id, it.words()))));
     text.extend(document.poll.iter().map(|poll| Line::from(format!("diagnostic requests: {}", poll.words()))));
     text.extend(document.controllers.iter().map(|it| Line::from(format!("{} {} {}", it.interface, it.id, it.words()))));
     text.extend(document.floods.iter().map(|it| count_line(&format!("{} {} flood", it.interface, it.id), it.dropped)));

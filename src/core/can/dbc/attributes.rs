@@ -1,12 +1,13 @@
-//! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection.
+//! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection, authentication.
 //!
-//! The names and the order of `VFrameFormat`'s words are those of DBC editors; the two about end-to-end protection are
-//! packwatch's own. An invalid attribute counts as missing.
+//! The names and the order of `VFrameFormat`'s words are those of DBC editors; those about end-to-end protection and
+//! authentication are packwatch's own. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 
 use super::{FrameFormat, Repetition};
 use crate::can::e2e::{Profile, Protection};
+use crate::can::secoc::{self, Authentication};
 
 /// Cycle time, ms.
 pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
@@ -37,10 +38,21 @@ pub(super) const E2E_PROFILE: &str = "E2EProfile";
 pub(super) const E2E_PROFILES: [&str; 4] = ["off", "1A", "1C", "5"];
 /// End-to-end protection: data id.
 pub(super) const E2E_DATA_ID: &str = "E2EDataId";
+/// Authentication: profile.
+pub(super) const SECOC_PROFILE: &str = "SecOCProfile";
+/// The words of [`SECOC_PROFILE`].
+pub(super) const SECOC_PROFILES: [&str; 5] = ["off", "1", "3", "fd", "announcement"];
+/// Authentication: data id.
+pub(super) const SECOC_DATA_ID: &str = "SecOCDataId";
 
 /// The profile's place among the words of [`E2E_PROFILE`].
 pub(super) fn profile_index(profile: Profile) -> usize {
     E2E_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
+}
+
+/// The profile's place among the words of [`SECOC_PROFILE`].
+pub(super) fn secoc_index(profile: secoc::Profile) -> usize {
+    SECOC_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
 /// How the message is repeated.
@@ -75,11 +87,21 @@ pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
 pub(super) fn e2e(dbc: &Dbc, id: MessageId) -> Option<Protection> {
     let name = word(dbc, id, E2E_PROFILE)?;
     let profile = [Profile::P01A, Profile::P01C, Profile::P05].into_iter().find(|profile| profile.name() == name)?;
-    let data_id = match dbc.resolved_message_attribute(id, E2E_DATA_ID)? {
-        AttributeValue::Uint(id) => u16::try_from(*id).ok()?,
-        AttributeValue::Int(_) | AttributeValue::Double(_) | AttributeValue::String(_) => return None,
-    };
-    Some(Protection { profile, data_id })
+    Some(Protection { profile, data_id: data_id(dbc, id, E2E_DATA_ID)? })
+}
+
+/// The authentication, when both attributes are valid.
+pub(super) fn secoc(dbc: &Dbc, id: MessageId) -> Option<Authentication> {
+    let name = word(dbc, id, SECOC_PROFILE)?;
+    let profile = secoc::Profile::ALL.into_iter().find(|profile| profile.name() == name)?;
+    Some(Authentication { profile, data_id: data_id(dbc, id, SECOC_DATA_ID)? })
+}
+
+fn data_id(dbc: &Dbc, id: MessageId, name: &str) -> Option<u16> {
+    match dbc.resolved_message_attribute(id, name)? {
+        AttributeValue::Uint(id) => u16::try_from(*id).ok(),
+        AttributeValue::Int(_) | AttributeValue::Double(_) | AttributeValue::String(_) => None,
+    }
 }
 
 /// The value of an attribute that is a choice between words: written as the word or as its place among them.

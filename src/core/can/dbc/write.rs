@@ -7,7 +7,8 @@ use std::fmt::Write as _;
 
 use super::attributes::{
     BIT_RATE_SWITCH, CYCLE_TIME, DELAY_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FAST_CYCLE_TIME, FIRST_FD_FORMAT,
-    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, profile_index,
+    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, SECOC_DATA_ID, SECOC_PROFILE, SECOC_PROFILES, profile_index,
+    secoc_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
@@ -96,6 +97,8 @@ impl Database {
         self.choice(BIT_RATE_SWITCH, &NO_YES, rate, text);
         self.choice(E2E_PROFILE, &E2E_PROFILES, |m| Some(profile_index(m.e2e?.profile).to_string()), text);
         self.attribute(E2E_DATA_ID, "INT 0 65535", "0", |m| Some(m.e2e?.data_id.to_string()), text);
+        self.choice(SECOC_PROFILE, &SECOC_PROFILES, |m| Some(secoc_index(m.secoc?.profile).to_string()), text);
+        self.attribute(SECOC_DATA_ID, "INT 0 65535", "0", |m| Some(m.secoc?.data_id.to_string()), text);
         if self.messages.iter().any(is_fd) {
             text.push_str(
                 "BA_DEF_ \"BusType\" STRING ;\nBA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_ \"BusType\" \"CAN FD\";\n",

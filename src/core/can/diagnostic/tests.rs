@@ -53,6 +53,7 @@ fn cells(identifier: u16, first: u16, count: u16) -> Answer {
         sender: None,
         format: FrameFormat::Classic,
         e2e: None,
+        secoc: None,
         signals: vec![],
         cycle_time_ms: None,
         repetition: Default::default(),

@@ -7,6 +7,7 @@ use super::layout::LayoutMessage;
 use super::output::{PlanFaults, RULES};
 use crate::can::dbc::{Database, Message};
 use crate::can::e2e::Protection;
+use crate::can::secoc::Authentication;
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{CellIndex, MAX_CELLS};
@@ -46,6 +47,7 @@ pub struct CommandPlan {
     id: CanId,
     len: usize,
     protection: Option<Protection>,
+    secoc: Option<Authentication>,
     command: SignalPlan,
     rule: SelectorSignal,
     severity: SelectorSignal,
@@ -81,7 +83,7 @@ impl CommandPlan {
         match (command, rule, severity, cell) {
             (Some(command), Some(rule), Some(severity), Some(cell)) => {
                 let (id, len) = (message.id, usize::from(message.len_bytes));
-                Ok(Self { id, len, protection: message.e2e, command, rule, severity, cell })
+                Ok(Self { id, len, protection: message.e2e, secoc: message.secoc, command, rule, severity, cell })
             }
             _ => Err(PlanFaults(faults)),
         }
@@ -97,7 +99,12 @@ impl CommandPlan {
         self.protection
     }
 
-    /// Reads a command. The protection is not checked.
+    /// Authentication the frame must have.
+    pub fn authentication(&self) -> Option<Authentication> {
+        self.secoc
+    }
+
+    /// Reads a command. Neither protection nor authenticator is checked.
     ///
     /// # Errors
     /// When it is another message, too short, or has a code without meaning.

@@ -1,21 +1,23 @@
 //! The layout of the sent frames, of the command frame and its reply: one [`Database`] for encoder and consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
-//! messages with identifiers, frame formats, cycle times and end-to-end protection as set, the header's signals
-//! included. The encoder is made from it and `packwatch dbc` writes it, so that the two always agree.
+//! messages with identifiers, frame formats, cycle times, end-to-end protection and authentication as set, the signals of
+//! header and trailer included. The encoder is made from it and `packwatch dbc` writes it, so that the two always agree.
 //!
 //! The built-in base is fitted: steps of Ah signals grow with the cell, and profile 5, whose header is a byte longer
-//! than the free space, moves the signals up by that byte. The user's own DBC is not moved: its signals must leave the
-//! header free. All settings that do not fit are reported together.
+//! than the free space, moves the signals up by that byte. An authenticated message grows by its trailer; a command gives up
+//! the bytes of the header instead. The user's own DBC is not moved: its signals must leave header and trailer free. All
+//! settings that do not fit are reported together.
 
 use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Repetition, Signal};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::frame::is_frame_length;
+use crate::can::secoc::{self, Authentication};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-/// Names of the signals that the protection writes; no value of the daemon has one of these.
-pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble"];
+/// Names of the signals that protection and authentication write; no value of the daemon has one of these.
+pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
 /// Length of a built-in message whose signals were moved for profile 5: the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
@@ -29,6 +31,12 @@ pub const CHANGE_REPETITION_MS: u32 = 100;
 pub const ALARM_DELAY_MS: u32 = 10;
 /// Mean time between two replies, at least, ms.
 pub const REPLY_DELAY_MS: u32 = 100;
+
+/// Bytes of the built-in command before its first signal, and with the last one, where they are not for end-to-end protection.
+const COMMAND_HEADER_BYTES: u16 = 2;
+const COMMAND_DATA_BYTES: u16 = 4;
+/// Period of the announcements of freshness, ms. With it a command is good for two seconds at most.
+pub const FRESHNESS_PERIOD_MS: u32 = 1000;
 
 /// Cycle time of a sent message without one in the settings or the base, ms.
 pub const DEFAULT_PERIOD_MS: u32 = 1000;
@@ -56,11 +64,14 @@ pub enum LayoutMessage {
     Digest,
     /// Reply to a command frame.
     Reply,
+    /// Announcement of the freshness of authenticated commands.
+    Freshness,
 }
 
 impl LayoutMessage {
     /// All of them, in the order of the layout.
-    pub const ALL: [Self; 6] = [Self::Status, Self::Health, Self::Alarm, Self::Command, Self::Digest, Self::Reply];
+    pub const ALL: [Self; 7] =
+        [Self::Status, Self::Health, Self::Alarm, Self::Command, Self::Digest, Self::Reply, Self::Freshness];
 
     /// Name of the message in the DBC.
     pub const fn message(self) -> &'static str {
@@ -71,6 +82,7 @@ impl LayoutMessage {
             Self::Command => "PACKWATCH_Command",
             Self::Digest => "PACKWATCH_Digest",
             Self::Reply => "PACKWATCH_Reply",
+            Self::Freshness => "PACKWATCH_Freshness",
         }
     }
 
@@ -83,6 +95,7 @@ impl LayoutMessage {
             Self::Command => "command",
             Self::Digest => "digest",
             Self::Reply => "reply",
+            Self::Freshness => "freshness",
         }
     }
 
@@ -95,7 +108,7 @@ impl LayoutMessage {
                 delay_ms: Some(ALARM_DELAY_MS),
             },
             Self::Reply => Repetition { count: None, period_ms: None, delay_ms: Some(REPLY_DELAY_MS) },
-            Self::Status | Self::Health | Self::Command | Self::Digest => {
+            Self::Status | Self::Health | Self::Command | Self::Digest | Self::Freshness => {
                 Repetition { count: None, period_ms: None, delay_ms: None }
             }
         }
@@ -103,7 +116,7 @@ impl LayoutMessage {
 
     /// Whether it is sent periodically.
     const fn is_cyclic(self) -> bool {
-        matches!(self, Self::Status | Self::Health | Self::Alarm | Self::Digest)
+        matches!(self, Self::Status | Self::Health | Self::Alarm | Self::Digest | Self::Freshness)
     }
 }
 
@@ -132,6 +145,8 @@ pub struct MessageSettings {
     pub period_ms: Option<u32>,
     /// Protection.
     pub e2e: E2eSetting,
+    /// Authentication; `None` = none.
+    pub secoc: Option<Authentication>,
 }
 
 /// Base of a layout.
@@ -161,6 +176,8 @@ pub struct LayoutSettings {
     pub digest: MessageSettings,
     /// Reply to a command frame; sent only where commands are accepted.
     pub reply: MessageSettings,
+    /// Announcement of freshness; sent only where commands are authenticated.
+    pub freshness: MessageSettings,
 }
 
 impl LayoutSettings {
@@ -172,6 +189,7 @@ impl LayoutSettings {
             LayoutMessage::Command => self.command.as_ref(),
             LayoutMessage::Digest => Some(&self.digest),
             LayoutMessage::Reply => self.command.as_ref().map(|_| &self.reply),
+            LayoutMessage::Freshness => self.command.and_then(|command| command.secoc).map(|_| &self.freshness),
         }
     }
 }
@@ -182,7 +200,7 @@ impl LayoutSettings {
 pub struct SettingFault {
     /// Message.
     pub message: LayoutMessage,
-    /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`.
+    /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`, `secoc`.
     pub key: &'static str,
     /// The fault: found and allowed.
     pub what: String,
@@ -211,6 +229,9 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
                 fit_steps(&mut laid_out, rated_capacity_ah);
             }
             let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
+            if rated_capacity_ah.is_some() && settings.secoc.is_some() && which == LayoutMessage::Command {
+                move_down(&mut laid_out);
+            }
             apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
             if which.is_cyclic() {
                 laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(DEFAULT_PERIOD_MS));
@@ -244,16 +265,30 @@ fn apply(
         E2eSetting::Off => None,
         E2eSetting::On(protection) => Some(protection),
     };
+    message.secoc = settings.secoc;
     let is_moved = movable && message.e2e.is_some_and(|e2e| e2e.profile == Profile::P05);
     if is_moved {
         move_up(message);
+    }
+    if let Some(authentication) = message.secoc.filter(|secoc| movable && secoc.profile != secoc::Profile::Announcement)
+    {
+        message.len_bytes += u16::try_from(authentication.profile.trailer_bytes()).unwrap_or(0);
     }
     set_header(message);
     if let Some(protection) = message.e2e {
         check_header(message, protection, fault);
     }
+    if let Some(authentication) = message.secoc {
+        check_trailer(message, authentication, fault);
+    }
     if message.len_bytes > 8 && !is_fd {
-        if is_moved {
+        if movable && message.secoc.is_some() {
+            let what = format!(
+                "must have fd = true here and on the interface: freshness and authenticator make the message {} bytes long",
+                message.len_bytes
+            );
+            fault("secoc", what);
+        } else if is_moved {
             let what = format!(
                 "must have fd = true here and on the interface: the header of profile 5 makes the message \
                  {MOVED_LEN_BYTES} bytes long; 1A and 1C fit classic frames"
@@ -285,9 +320,19 @@ fn move_up(message: &mut Message) {
     message.len_bytes = MOVED_LEN_BYTES;
 }
 
-/// Replaces the header's signals.
+/// Moves the signals of a command to its beginning: an authenticated command has no header.
+fn move_down(message: &mut Message) {
+    for signal in &mut message.signals {
+        signal.layout.start_bit = signal.layout.start_bit.saturating_sub(8 * COMMAND_HEADER_BYTES);
+    }
+    message.len_bytes = COMMAND_DATA_BYTES;
+    message.comment = Some("What packwatch takes from another ECU, authenticated: see PACKWATCH_Freshness.".to_owned());
+}
+
+/// Replaces the signals of header and trailer.
 fn set_header(message: &mut Message) {
-    let header = message.e2e.map(header_signals).unwrap_or_default();
+    let mut header = message.e2e.map(header_signals).unwrap_or_default();
+    header.extend(message.secoc.into_iter().flat_map(|secoc| trailer_signals(message.len_bytes, secoc)));
     let is_kept = |signal: &Signal| !HEADER_SIGNALS.contains(&signal.name.as_str());
     // Conditions name multiplexors by their index, which changes.
     let mut next = header.len();
@@ -322,6 +367,28 @@ fn header_signals(protection: Protection) -> Vec<Signal> {
     }
 }
 
+/// Freshness and authenticator at the end of a message of this length.
+fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal> {
+    let Authentication { profile, data_id } = authentication;
+    let length = |bits: u32| u16::try_from(bits).unwrap_or(0);
+    let (freshness, mac) = (length(profile.freshness_bits()), length(profile.mac_bits()));
+    let first = 8 * len_bytes.saturating_sub(length(u32::from(freshness + mac) / 8));
+    // The DBC's place of a big-endian signal is that of its most significant bit; bits of a byte count from the least.
+    let place = |bit: u16| bit / 8 * 8 + 7 - bit % 8;
+    let signal = |name, bit, length_bits, comment: &str| {
+        let mut signal = header_signal(name, place(bit), length_bits, comment);
+        signal.layout.byte_order = ByteOrder::BigEndian;
+        signal
+    };
+    let covered = format!(
+        "AES-128-CMAC over data id {data_id}, the bytes before the freshness, and the whole freshness; big-endian."
+    );
+    vec![
+        signal("SecOCFreshness", first, freshness, "Low bits of the freshness (64 bits)."),
+        signal("SecOCMac", first + freshness, mac, &format!("First bits of {covered}")),
+    ]
+}
+
 fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) -> Signal {
     Signal {
         name: name.to_owned(),
@@ -333,7 +400,8 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
             factor: 1.0,
             offset: 0.0,
             minimum: 0.0,
-            maximum: f64::from((1_u32 << length_bits) - 1),
+            // A number that a float holds exactly; 0 = not stated.
+            maximum: if length_bits < 53 { ((1_u64 << length_bits) - 1) as f64 } else { 0.0 },
         },
         unit: String::new(),
         receivers: Vec::new(),
@@ -371,6 +439,26 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
             profile.header_mask().iter().map(|byte| byte.count_ones()).sum::<u32>(),
         );
         fault("e2e", what);
+    }
+}
+
+/// The trailer must fit into the message, and no other signal may lie in it.
+fn check_trailer(message: &Message, authentication: Authentication, fault: &mut impl FnMut(&'static str, String)) {
+    let (name, len, trailer) = (&message.name, usize::from(message.len_bytes), authentication.profile.trailer_bytes());
+    let word = authentication.profile.name();
+    if len < trailer || !is_frame_length(len) {
+        let what = format!(
+            "message {name} has {len} bytes, must have a frame's length of {trailer} or more for profile {word}"
+        );
+        return fault("secoc", what);
+    }
+    let is_own = |signal: &&Signal| HEADER_SIGNALS.contains(&signal.name.as_str());
+    for signal in message.signals.iter().filter(|signal| !is_own(signal)) {
+        if signal.layout.plan().is_ok_and(|plan| plan.bytes_needed() > len - trailer) {
+            let what =
+                format!("signal {name}.{} must leave the last {trailer} bytes free for profile {word}", signal.name);
+            fault("secoc", what);
+        }
     }
 }
 

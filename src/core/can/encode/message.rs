@@ -5,6 +5,7 @@
 use crate::can::dbc::{Database, FrameFormat, Message, Signal};
 use crate::can::e2e::Protection;
 use crate::can::frame::is_frame_length;
+use crate::can::secoc::Authentication;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
@@ -16,6 +17,7 @@ pub(super) struct OutputMessage {
     pub(super) id: CanId,
     pub(super) format: FrameFormat,
     pub(super) protection: Option<Protection>,
+    pub(super) secoc: Option<Authentication>,
     pub(super) cycle_time_ms: u32,
     len: usize,
     fields: Vec<OutputField>,
@@ -56,6 +58,7 @@ impl OutputMessage {
             id: message.id,
             format: message.format,
             protection: message.e2e,
+            secoc: message.secoc,
             cycle_time_ms: message.cycle_time_ms.unwrap_or(DEFAULT_PERIOD_MS),
             len: usize::from(message.len_bytes),
             fields,
@@ -96,7 +99,13 @@ impl OutputMessage {
         if codes.is_empty() { vec![0] } else { codes }
     }
 
-    /// A frame of the page with `value` of each signal's name. `counter` is the protection's next; it is advanced.
+    /// Bytes before the trailer of an authenticated message.
+    fn data_len(&self) -> usize {
+        self.len.saturating_sub(self.secoc.map_or(0, |secoc| secoc.profile.trailer_bytes()))
+    }
+
+    /// A frame of the page with `value` of each signal's name. `counter` is the protection's next; it is advanced. The trailer of
+    /// an authenticated message is 0: it is written when the freshness is known.
     pub(super) fn frame(&self, page: u64, counter: &mut u8, value: impl Fn(&str) -> Option<f64>) -> Frame {
         let mut payload = [0; MAX_DATA];
         for field in self.fields.iter().filter(|field| field.is_on(page)) {
@@ -105,7 +114,7 @@ impl OutputMessage {
             // Cannot fail: the message was checked against the message's length, and the code fits the signal.
             let _ = field.plan.encode_raw(&mut payload, code);
         }
-        if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.len)) {
+        if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.data_len())) {
             // A counter restored from another profile may be beyond this one's last.
             let now = (*counter).min(protection.profile.max_counter());
             // Cannot fail: length and data id were checked when the plan was made.

@@ -16,6 +16,7 @@ use super::message::OutputMessage;
 use super::reply::{ReplyFields, reply_frame, reply_message};
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
+use crate::can::secoc::{Authentication, Profile};
 use crate::can::{CanId, Frame};
 use crate::quantity::{CellIndex, Mode};
 
@@ -187,6 +188,8 @@ pub struct OutputPlan {
     /// `None` = the layout has none.
     digest: Option<DigestPlan>,
     reply: Option<OutputMessage>,
+    /// The announcement of the freshness of commands.
+    freshness: Option<OutputMessage>,
 }
 
 /// What a layout says of one sent message.
@@ -200,8 +203,17 @@ pub struct SentMessage {
     pub format: FrameFormat,
     /// End-to-end protection.
     pub protection: Option<Protection>,
+    /// Authentication.
+    pub secoc: Option<Authentication>,
     /// Cycle time, ms; `None` = it is sent on an event only.
     pub cycle_time_ms: Option<u32>,
+}
+
+impl SentMessage {
+    /// Data id of protection and authentication; `None` = it has neither.
+    pub fn data_id(&self) -> Option<u16> {
+        self.protection.map(|protection| protection.data_id).or(self.secoc.map(|secoc| secoc.data_id))
+    }
 }
 
 impl OutputPlan {
@@ -222,16 +234,17 @@ impl OutputPlan {
         }
         let digest = alarm.as_ref().and_then(|alarm| DigestPlan::new(database, alarm, &mut faults));
         let reply = reply_message(database, &mut faults);
+        let freshness = freshness_message(database, &mut faults);
         match (status, health, alarm) {
             (Some(status), Some(health), Some(alarm)) if faults.is_empty() => {
                 let pages = health.page_codes();
-                Ok(Self { status, health, alarm, pages, digest, reply })
+                Ok(Self { status, health, alarm, pages, digest, reply, freshness })
             }
             _ => Err(PlanFaults(faults)),
         }
     }
 
-    /// The sent messages: status, health, alarm, then digest and reply where the layout has them.
+    /// The sent messages: status, health, alarm, then digest, reply and freshness where the layout has them.
     pub fn messages(&self) -> impl Iterator<Item = SentMessage> + '_ {
         let always = [
             (LayoutMessage::Status, &self.status),
@@ -240,11 +253,13 @@ impl OutputPlan {
         ];
         let digest = self.digest.iter().map(|digest| (LayoutMessage::Digest, &digest.message));
         let reply = self.reply.iter().map(|reply| (LayoutMessage::Reply, reply));
-        always.into_iter().chain(digest).chain(reply).map(|(message, plan)| SentMessage {
+        let freshness = self.freshness.iter().map(|message| (LayoutMessage::Freshness, message));
+        always.into_iter().chain(digest).chain(reply).chain(freshness).map(|(message, plan)| SentMessage {
             message,
             id: plan.id,
             format: plan.format,
             protection: plan.protection,
+            secoc: plan.secoc,
             cycle_time_ms: (message != LayoutMessage::Reply).then_some(plan.cycle_time_ms),
         })
     }
@@ -266,11 +281,24 @@ impl OutputPlan {
             LayoutMessage::Alarm => &mut counters.alarm,
             LayoutMessage::Digest => &mut counters.digest,
             LayoutMessage::Reply => &mut counters.reply,
-            LayoutMessage::Command => return,
+            LayoutMessage::Command | LayoutMessage::Freshness => return,
         };
         let codes = u64::from(protection.profile.max_counter()) + 1;
         let skipped = (u64::from(*counter) + frames % codes) % codes;
         *counter = u8::try_from(skipped).unwrap_or(0);
+    }
+
+    /// Authentication of a sent message.
+    pub fn authentication(&self, message: LayoutMessage) -> Option<Authentication> {
+        match message {
+            LayoutMessage::Status => self.status.secoc,
+            LayoutMessage::Health => self.health.secoc,
+            LayoutMessage::Alarm => self.alarm.secoc,
+            LayoutMessage::Digest => self.digest.as_ref()?.message.secoc,
+            LayoutMessage::Reply => self.reply.as_ref()?.secoc,
+            LayoutMessage::Freshness => self.freshness.as_ref()?.secoc,
+            LayoutMessage::Command => None,
+        }
     }
 
     /// Whether replies are sent.
@@ -321,10 +349,22 @@ impl OutputPlan {
         self.digest.as_ref()?.frame(page, fields, &mut counters.digest)
     }
 
+    /// The announcement of a freshness, still without it; `None` = the layout has none.
+    pub fn freshness(&self) -> Option<Frame> {
+        self.freshness.as_ref().map(|message| message.frame(0, &mut 0, |_| None))
+    }
+
     /// The reply to a command; `None` = the layout has none.
     pub fn reply(&self, fields: &ReplyFields, counters: &mut SendCounters) -> Option<Frame> {
         self.reply.as_ref().map(|message| reply_frame(message, fields, &mut counters.reply))
     }
+}
+
+/// The message that announces the freshness of commands; `None` = the database has none.
+fn freshness_message(database: &Database, faults: &mut Vec<String>) -> Option<OutputMessage> {
+    let name = LayoutMessage::Freshness.message();
+    database.message(name)?.secoc.filter(|secoc| secoc.profile == Profile::Announcement)?;
+    OutputMessage::new(database, name, &[], faults)
 }
 
 /// Name of a signal and how its value is taken from the fields of a message.

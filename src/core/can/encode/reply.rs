@@ -38,6 +38,12 @@ pub enum CommandRefusal {
     WrongCounter = 4,
     /// A code without a meaning.
     NoMeaning = 5,
+    /// The authenticator is wrong: forged, or made with another key.
+    NotAuthentic = 8,
+    /// The freshness was used before, is older than the announcement before the last, or was not announced yet.
+    OldFreshness = 9,
+    /// Authentic, but many forged frames came: the command is executed when it comes again with another freshness.
+    RepeatNeeded = 10,
 }
 
 impl CommandRefusal {
@@ -52,9 +58,9 @@ impl CommandRefusal {
         }
     }
 
-    /// Whether the frame's checksum was right.
+    /// Whether the frame's checksum or authenticator was right.
     pub const fn is_intact(self) -> bool {
-        !matches!(self, Self::WrongChecksum)
+        !matches!(self, Self::WrongChecksum | Self::NotAuthentic | Self::OldFreshness)
     }
 
     /// Words for a log.
@@ -65,6 +71,9 @@ impl CommandRefusal {
             Self::RepeatedCounter => "repeated counter",
             Self::WrongCounter => "wrong counter",
             Self::NoMeaning => "no meaning",
+            Self::NotAuthentic => "not authentic",
+            Self::OldFreshness => "old freshness",
+            Self::RepeatNeeded => "many forged frames came: to be repeated",
         }
     }
 }

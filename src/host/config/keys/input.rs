@@ -205,11 +205,11 @@ signal_section! {
 }
 
 signal_section! {
-    /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, also when the pack was exchanged while the program did not run. Everything learned of the old pack is reported once more and discarded, as with the command `pack-replaced`.
+    /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, also when the pack was exchanged while the program did not run. What was learned of the old pack is kept under its number, for up to eight packs (384 cells together), and restored when its number comes back.
     PackIdentityInput at "input.pack_identity", "any unit" {
         /// Readings in a row that must show the same new value.
         readings: u32, "", Between(1.0, 10000.0), Default("10") =>;
-        /// Whether a signal without end-to-end protection is accepted. Three forged or damaged frames of one discard everything learned; diagnostic answers have no such protection. Without it the message must be in `[[input.protected]]`.
+        /// Whether a signal without end-to-end protection is accepted. Three forged or damaged frames of one put aside everything learned until the number is right again, and end the half-cycle under way; diagnostic answers have no such protection. Without it the message must be in `[[input.protected]]`.
         accept_unprotected: bool, "", Any, Default("false") =>;
     }
 }

@@ -1,6 +1,7 @@
 //! The tables of sent frames and received commands: `[output]`, `[j1939]`, `[commands]`.
 
 use super::E2eKey;
+use crate::can::secoc;
 use crate::config::document::TablePlace;
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
@@ -76,7 +77,9 @@ pub(crate) struct FrameKeys<'a> {
     pub period_ms: Option<u32>,
     /// Protection.
     pub e2e: Option<E2eKey>,
-    /// Its data id.
+    /// Authentication.
+    pub secoc: Option<secoc::Profile>,
+    /// Data id of both.
     pub data_id: Option<u16>,
 }
 
@@ -98,7 +101,9 @@ macro_rules! frame_section {
                 period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
                 /// AUTOSAR end-to-end protection: a checksum and a counter in the first bytes, profile 1 variant A or C (2 bytes) or profile 5 (3 bytes; the built-in layout then has 12 bytes and needs `fd = true`). Without it: as the DBC says; the built-in one: off.
                 e2e: Option<E2eKey>, "", Any, Optional;
-                /// Data id of the protection, known to sender and receivers; each protected frame has its own, up to 0xFFF with "1C". Needed with `e2e`.
+                /// AUTOSAR SecOC authentication with the key of `[authentication]`: freshness and authenticator behind the data, 12 bytes more. Only "fd" (32 bits of freshness, 64 bits of AES-128-CMAC; needs `fd = true`). Without it: none.
+                secoc: Option<secoc::Profile>, "", Any, Optional;
+                /// Data id of protection and authentication, known to sender and receivers; each such frame has its own, up to 0xFFF with "1C". Needed with `e2e` and `secoc`.
                 data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
             } and { place: &keys.place }
         }
@@ -130,8 +135,23 @@ frame_section! {
     OutputReply at "output.reply"
 }
 
+frame_section! {
+    /// The announcement of the freshness of authenticated commands, once a second, sent only with `commands.secoc`. It is itself authenticated (36 bits of freshness, 28 bits of AES-128-CMAC) and needs `data_id`; it has no period and no `e2e`.
+    OutputFreshness at "output.freshness"
+}
+
 section! {
-    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not executed.
+    /// The key of all authenticated frames: 16 bytes, as they are or as 32 hex digits, in a credential of systemd or in a file. It is read at the start, which fails without it, and written nowhere.
+    Authentication at "authentication" {
+        /// Name of the credential: the file of this name in `$CREDENTIALS_DIRECTORY` (`LoadCredential=NAME:PATH` in the unit). Without it: `key_file` is needed.
+        credential: Option<String>, "", NotEmpty, Optional;
+        /// File of the key, relative to this file, readable by its owner alone (mode 0600 or 0400). Without it: `credential` is needed.
+        key_file: Option<String>, "", NotEmpty, Optional;
+    }
+}
+
+section! {
+    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without authentication or end-to-end protection. With protection alone the commands are unauthenticated: every node of the bus can make one; and, as with every protected message, the first frame after a start only shows the counter and is not executed.
     Commands at "commands" gives FrameKeys<'_>, |keys| {
         /// Whether commands from the bus are executed.
         enabled: bool, "", Any, Default("false") =>;
@@ -143,9 +163,11 @@ section! {
         extended: bool, "", Any, Default("false");
         /// Whether CAN FD frames carry it. Without it: as the DBC says; the built-in one: classic frames.
         fd: Option<bool>, "", Any, Optional;
-        /// Profile of the protection. Needed when commands are enabled; "off" is refused then.
+        /// Profile of the protection. Needed when commands are enabled without `secoc`; "off" is refused then.
         e2e: Option<E2eKey>, "", Any, Optional;
-        /// Data id of the protection. Needed with `e2e`.
+        /// AUTOSAR SecOC authentication with the key of `[authentication]`, in place of `e2e`: "1" (8 bits of freshness, 24 of AES-128-CMAC), "3" (4 and 28 bits), or "fd" (32 and 64 bits, needs `fd = true`). Needs `[output.freshness]`. Without it: none.
+        secoc: Option<secoc::Profile>, "", Any, Optional;
+        /// Data id of protection or authentication. Needed with `e2e` and `secoc`.
         data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
         /// Frames that may be lost between two.
         max_delta_counter: u8, "frames", Between(1.0, 14.0), Default("1") =>;

@@ -79,7 +79,8 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[output]\n[commands]\nenabled = true\n",
-            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\": commands are never taken unprotected",
+            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\", or have secoc beside it: commands are \
+             never taken unprotected",
         ),
         (
             "[output]\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\nid = 0x6B1\n",
@@ -88,6 +89,18 @@ fn faults_of_alarms_and_commands() {
         (
             "[output.alarm]\ne2e = \"1A\"\ndata_id = 1\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
             "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[output.freshness]\ndata_id = 2\n",
+            "pack.toml:1: authentication.credential is not set, must be given, or key_file: secoc needs a key",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
+            "pack.toml:15: output.freshness.data_id is not set, must be given, 0 to 0xFFFF, with commands.secoc",
+        ),
+        (
+            "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
+            "pack.toml:16: output.alarm.secoc = \"1\", must be \"fd\" for a frame that is sent",
         ),
         (
             "[output.digest]\nid = 0x6B2\n",

@@ -163,7 +163,7 @@ fn single_faults_of_appended_tables() {
             "[output.alarm]\ne2e = \"1A\"\n",
             "pack.toml:15: output.alarm.data_id is not set, must be given, 0 to 0xFFFF, with e2e = \"1A\"",
         ),
-        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, must have e2e beside it"),
+        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, must have e2e or secoc beside it"),
         (
             "[output.alarm]\ne2e = \"1C\"\ndata_id = 0x1000\n",
             "pack.toml:17: output.alarm.data_id = 0x1000, must be 0 to 0xFFF with profile 1C",

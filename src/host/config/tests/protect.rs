@@ -205,7 +205,7 @@ fn an_identity_of_the_pack_must_be_protected_or_accepted() {
         faults(&open),
         [
             "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be a signal of a message in [[input.protected]], \
-             or have accept_unprotected = true beside it: forged frames of Status would discard everything learned"
+             or have accept_unprotected = true beside it: forged frames of Status would put aside everything learned"
         ]
     );
     assert!(read(&format!("{open}accept_unprotected = true\n")).is_ok());

@@ -11,7 +11,7 @@ use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    AlarmStatus, CellStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
+    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
     MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
     StoreStatus, VERSION,
 };
@@ -64,6 +64,7 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
             id: "3E9".to_owned(),
             checks: vec![StatusCount { status: "ok".to_owned(), count: 99 }],
         }],
+        commands: Some(CommandStatus { interface: "can0".to_owned(), id: "6B3".to_owned(), secoc: None }),
         controllers: vec![ControllerStatus {
             interface: "can0".to_owned(),
             id: "7EC".to_owned(),

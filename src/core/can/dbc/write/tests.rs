@@ -5,7 +5,8 @@ use proptest::prelude::*;
 use super::*;
 use crate::can::dbc::Repetition;
 use crate::can::e2e::{Profile, Protection};
-use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
+use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
+use crate::can::secoc::{self, Authentication};
 use crate::can::signal::SignalLayout;
 
 const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
@@ -13,7 +14,10 @@ const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
 #[test]
 fn the_shipped_file_is_what_the_writer_makes_of_the_default_layout() {
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-    let written = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap().to_dbc();
+    let mut made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
+    // Sent with authenticated commands only.
+    made.messages.push(default_database().unwrap().message("PACKWATCH_Freshness").unwrap().clone());
+    let written = made.to_dbc();
     for (number, (shipped, written)) in (1..).zip(SHIPPED.lines().zip(written.lines())) {
         assert_eq!(shipped, written, "line {number} of config/packwatch.dbc");
     }
@@ -125,6 +129,7 @@ prop_compose! {
         sender in prop::option::of("N[a-z0-9]{1,5}"),
         format in prop_oneof![Just(FrameFormat::Classic), any::<bool>().prop_map(|brs| FrameFormat::Fd { brs })],
         e2e in prop::option::of((prop_oneof![Just(Profile::P01A), Just(Profile::P01C), Just(Profile::P05)], any::<u16>())),
+        secoc in prop::option::of((prop::sample::select(secoc::Profile::ALL.to_vec()), any::<u16>())),
         parts in prop::collection::vec((signals(), hangings()), 0..8),
         cycle_time_ms in prop::option::of(1..=3_600_000_u32),
         count in prop::option::of(1..=999_999_u32),
@@ -132,9 +137,10 @@ prop_compose! {
         comment in prop::option::of(TEXT),
     ) -> (bool, Message) {
         let e2e = e2e.map(|(profile, data_id)| Protection { profile, data_id });
+        let secoc = secoc.map(|(profile, data_id)| Authentication { profile, data_id });
         let (id, name, signals) = (CanId::Standard(0), String::new(), assemble(parts));
         let repetition = Repetition { count, period_ms: times_ms[0], delay_ms: times_ms[1] };
-        (extended, Message { id, name, len_bytes, sender, format, e2e, signals, cycle_time_ms, repetition, comment })
+        (extended, Message { id, name, len_bytes, sender, format, e2e, secoc, signals, cycle_time_ms, repetition, comment })
     }
 }
 

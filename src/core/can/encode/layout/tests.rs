@@ -30,10 +30,11 @@ fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, St
 fn without_settings_the_layout_is_the_shipped_file_but_for_the_command() {
     let shipped = default_database().unwrap();
     let made = built_in(&LayoutSettings::default()).unwrap();
-    let sent = |name: &str| !matches!(name, "PACKWATCH_Command" | "PACKWATCH_Reply");
+    let sent = |name: &str| !matches!(name, "PACKWATCH_Command" | "PACKWATCH_Reply" | "PACKWATCH_Freshness");
     assert!(made.messages.iter().eq(shipped.messages.iter().filter(|message| sent(&message.name))));
     let command = Some(MessageSettings::default());
-    assert_eq!(built_in(&LayoutSettings { command, ..Default::default() }).unwrap(), shipped);
+    let made = built_in(&LayoutSettings { command, ..Default::default() }).unwrap();
+    assert!(made.messages.iter().eq(shipped.messages.iter().filter(|message| message.name != "PACKWATCH_Freshness")));
 }
 
 #[test]
@@ -65,6 +66,7 @@ fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
         command: Some(settings(4)),
         digest: settings(5),
         reply: settings(6),
+        freshness: MessageSettings::default(),
     };
     let made = built_in(&all).unwrap();
     for (message, shipped) in made.messages.iter().zip(&shipped.messages) {
@@ -122,6 +124,7 @@ fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
         command: Some(fd(on(Profile::P05, 4))),
         digest: on(Profile::P01C, 5),
         reply: on(Profile::P01A, 6),
+        freshness: MessageSettings::default(),
     };
     let made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
     let read = Database::parse(&made.to_dbc()).unwrap();
@@ -244,4 +247,63 @@ fn an_own_dbc_without_digest_and_reply_sends_what_it_has() {
     let plan = OutputPlan::new(&layout(LayoutBase::Own(&own), &settings).unwrap()).unwrap();
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
     assert_eq!((plan.digest_pages(), plan.has_reply()), (0, false));
+}
+
+fn secoc(profile: secoc::Profile, data_id: u16) -> MessageSettings {
+    MessageSettings { secoc: Some(Authentication { profile, data_id }), ..Default::default() }
+}
+
+#[test]
+fn an_authenticated_message_has_its_trailer_as_signals_and_reads_back_equal() {
+    let fd = |settings| MessageSettings { fd: Some(true), ..settings };
+    for (profile, len_bytes) in [(secoc::Profile::P1, 8), (secoc::Profile::P3, 8), (secoc::Profile::Fd, 16)] {
+        let command = secoc(profile, 4);
+        let settings = LayoutSettings {
+            alarm: MessageSettings { e2e: on(Profile::P05, 3).e2e, ..fd(secoc(secoc::Profile::Fd, 3)) },
+            digest: fd(secoc(secoc::Profile::Fd, 5)),
+            command: Some(if profile == secoc::Profile::Fd { fd(command) } else { command }),
+            freshness: secoc(secoc::Profile::Announcement, 6),
+            ..Default::default()
+        };
+        let made = built_in(&settings).unwrap();
+        assert_eq!(Database::parse(&made.to_dbc()).unwrap(), made, "{profile:?}");
+        let lens = ["Alarm", "Digest", "Command", "Freshness"]
+            .map(|name| made.message(&format!("PACKWATCH_{name}")).unwrap().len_bytes);
+        assert_eq!(lens, [24, 20, len_bytes, 8], "{profile:?}");
+        let plan = CommandPlan::new(&made).unwrap();
+        assert_eq!((plan.authentication(), plan.protection()), (command.secoc, None));
+        // The signals of the trailer are where it is written.
+        let command = made.message("PACKWATCH_Command").unwrap();
+        let mut payload = vec![0; usize::from(len_bytes)];
+        let authentication = Authentication { profile, data_id: 4 };
+        authentication.write_freshness(&mut payload, 0xFEDC_BA98_7654_3210);
+        authentication.write_mac(&mut payload, [0xA5; 16]);
+        let raw = |name| command.signal(name).unwrap().layout.plan().unwrap().raw(&payload).unwrap();
+        assert_eq!(raw("SecOCFreshness"), 0xFEDC_BA98_7654_3210 & ((1 << profile.freshness_bits()) - 1));
+        assert_eq!(raw("SecOCMac"), 0xA5A5_A5A5_A5A5_A5A5 >> (64 - profile.mac_bits()));
+        assert_eq!(raw("Command") + raw("Rule") + raw("Severity") + raw("Cell"), 0, "{profile:?}");
+    }
+}
+
+#[test]
+fn a_trailer_that_does_not_fit_is_refused() {
+    let fault = |settings: &LayoutSettings| {
+        let faults = built_in(settings).unwrap_err();
+        assert_eq!(faults.len(), 1, "{faults:?}");
+        format!("{}: {}", faults[0].key, faults[0].what)
+    };
+    let classic = LayoutSettings { alarm: secoc(secoc::Profile::Fd, 3), ..Default::default() };
+    assert_eq!(
+        fault(&classic),
+        "secoc: must have fd = true here and on the interface: freshness and authenticator make the message 20 bytes long"
+    );
+    let own = Database::parse(TEXT).unwrap();
+    let settings = LayoutSettings { command: Some(secoc(secoc::Profile::P1, 4)), ..Default::default() };
+    let faults = layout(LayoutBase::Own(&own), &settings).unwrap_err();
+    let texts: Vec<_> = faults.iter().map(|fault| (fault.key, fault.what.as_str())).collect();
+    assert_eq!(
+        texts,
+        [("secoc", "signal PACKWATCH_Command.Cell must leave the last 4 bytes free for profile 1")],
+        "an own DBC is not moved"
+    );
 }

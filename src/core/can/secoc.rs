@@ -1,0 +1,214 @@
+//! AUTOSAR secure on-board communication (SecOC): the layout of an authenticated payload, and what its authenticator covers.
+//!
+//! ```text
+//! data | freshness, its low bits | authenticator, its first bits      most significant bit first
+//! ```
+//!
+//! The authenticator is AES-128-CMAC over data id (16 bit), data and the whole freshness (64 bit), big-endian. Key and cipher
+//! belong to the caller, who passes the 16 bytes of a CMAC: this module has no secret and needs none to give the same results
+//! again.
+//!
+//! | profile | freshness | authenticator | bytes | a guess is right once in |
+//! | --- | --- | --- | --- | --- |
+//! | 1 | 8 bit | 24 bit | 4 | 1.7 x 10^7 |
+//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8, tried with each freshness that fits |
+//! | fd | 32 bit | 64 bit | 12 | 1.8 x 10^19 |
+//! | announcement | 36 bit | 28 bit | 8 | 2.7 x 10^8 |
+//!
+//! Source: AUTOSAR Classic Platform R22-11, "Specification of Secure Onboard Communication": profiles 1 and 3, order and width
+//! of the covered fields. The profiles `fd` and announcement are packwatch's own lengths.
+//!
+//! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here the receiver of commands announces it
+//! ([`FreshnessWindow`]); the values that packwatch sends rise by one from frame to frame.
+
+mod window;
+
+use serde::{Deserialize, Serialize};
+
+use super::MAX_DATA;
+
+pub use window::{ANNOUNCEMENT_STEP, FreshnessWindow};
+
+/// Longest input of an authenticator: data id, payload, freshness, bytes.
+const MAX_INPUT: usize = 2 + MAX_DATA + 8;
+/// Bits of a whole authenticator.
+const MAC_BITS: u32 = 128;
+
+/// Bytes of a whole authenticator, AES-128-CMAC.
+pub type Mac = [u8; 16];
+
+/// Lengths of what is sent of freshness and authenticator.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Profile {
+    /// AUTOSAR's profile 1.
+    #[serde(rename = "1")]
+    P1,
+    /// AUTOSAR's profile 3.
+    #[serde(rename = "3")]
+    P3,
+    /// For FD frames.
+    #[serde(rename = "fd")]
+    Fd,
+    /// Of the frame that announces the freshness of commands.
+    #[serde(rename = "announcement")]
+    Announcement,
+}
+
+impl Profile {
+    /// All profiles.
+    pub const ALL: [Self; 4] = [Self::P1, Self::P3, Self::Fd, Self::Announcement];
+
+    /// Name in a configuration.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::P1 => "1",
+            Self::P3 => "3",
+            Self::Fd => "fd",
+            Self::Announcement => "announcement",
+        }
+    }
+
+    /// Bits of the freshness that are sent.
+    pub const fn freshness_bits(self) -> u32 {
+        match self {
+            Self::P1 => 8,
+            Self::P3 => 4,
+            Self::Fd => 32,
+            Self::Announcement => 36,
+        }
+    }
+
+    /// Bits of the authenticator that are sent.
+    pub const fn mac_bits(self) -> u32 {
+        match self {
+            Self::P1 => 24,
+            Self::P3 | Self::Announcement => 28,
+            Self::Fd => 64,
+        }
+    }
+
+    /// Bytes of both at the end of the payload.
+    pub const fn trailer_bytes(self) -> usize {
+        ((self.freshness_bits() + self.mac_bits()) / 8) as usize
+    }
+}
+
+/// Agreement between sender and receiver of an authenticated message; the key is not part of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Authentication {
+    /// Lengths.
+    pub profile: Profile,
+    /// Data identifier, unique among the messages of one key.
+    pub data_id: u16,
+}
+
+/// What an authenticator is computed over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MacInput {
+    bytes: [u8; MAX_INPUT],
+    len: usize,
+}
+
+impl MacInput {
+    /// The bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+}
+
+impl Authentication {
+    /// What the authenticator of this payload and freshness covers; `None` = the payload is shorter than the trailer, or its data
+    /// longer than a frame.
+    pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
+        let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
+        let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };
+        for part in [&self.data_id.to_be_bytes()[..], data, &freshness.to_be_bytes()] {
+            input.bytes.get_mut(input.len..input.len + part.len())?.copy_from_slice(part);
+            input.len += part.len();
+        }
+        Some(input)
+    }
+
+    /// The low bits of the freshness in a payload; `None` = it is too short.
+    pub fn sent_freshness(&self, payload: &[u8]) -> Option<u64> {
+        let trailer = self.trailer(payload)?;
+        u64::try_from(trailer >> self.profile.mac_bits()).ok()
+    }
+
+    /// Writes the low bits of a freshness, and zeros in place of the authenticator.
+    pub fn write_freshness(&self, payload: &mut [u8], freshness: u64) {
+        self.write_trailer(payload, u128::from(freshness & self.freshness_mask()) << self.profile.mac_bits());
+    }
+
+    /// Writes the first bits of an authenticator behind the freshness.
+    pub fn write_mac(&self, payload: &mut [u8], mac: Mac) {
+        if let Some(trailer) = self.trailer(payload) {
+            let bits = self.profile.mac_bits();
+            self.write_trailer(payload, trailer >> bits << bits | self.first_bits(mac));
+        }
+    }
+
+    /// Whether the payload carries the first bits of `mac`; takes the same time wherever they differ.
+    pub fn has_mac(&self, payload: &[u8], mac: Mac) -> bool {
+        let sent_bits = (1 << self.profile.mac_bits()) - 1;
+        // One difference of whole words: no byte is compared before another.
+        self.trailer(payload)
+            .is_some_and(|trailer| std::hint::black_box(trailer & sent_bits ^ self.first_bits(mac)) == 0)
+    }
+
+    /// The mask of the freshness' bits that are sent.
+    pub(super) const fn freshness_mask(&self) -> u64 {
+        (1 << self.profile.freshness_bits()) - 1
+    }
+
+    const fn first_bits(&self, mac: Mac) -> u128 {
+        u128::from_be_bytes(mac) >> (MAC_BITS - self.profile.mac_bits())
+    }
+
+    /// The end of the payload as a number.
+    fn trailer(&self, payload: &[u8]) -> Option<u128> {
+        let start = payload.len().checked_sub(self.profile.trailer_bytes())?;
+        Some(payload.get(start..)?.iter().fold(0, |number, byte| number << 8 | u128::from(*byte)))
+    }
+
+    fn write_trailer(&self, payload: &mut [u8], trailer: u128) {
+        let bytes = self.profile.trailer_bytes();
+        let Some(start) = payload.len().checked_sub(bytes) else { return };
+        let all = trailer.to_be_bytes();
+        payload[start..].copy_from_slice(&all[all.len() - bytes..]);
+    }
+}
+
+/// Most freshness values that one payload can stand for: two announcements serve 32 values, profile 3 sends 16 codes.
+const MAX_CANDIDATES: usize = 2;
+
+/// A payload and the freshness values it may have: all that is needed to check its authenticator, except the key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MacCheck {
+    authentication: Authentication,
+    candidates: [Option<u64>; MAX_CANDIDATES],
+}
+
+impl MacCheck {
+    /// The freshness with which the authenticator of `payload` is right; `None` = with none. `mac` is AES-128-CMAC.
+    pub fn verify(&self, payload: &[u8], mac: impl Fn(&[u8]) -> Mac) -> Option<u64> {
+        let is_right = |freshness: &u64| {
+            let input = self.authentication.mac_input(payload, *freshness);
+            input.is_some_and(|input| self.authentication.has_mac(payload, mac(input.bytes())))
+        };
+        self.candidates.into_iter().flatten().find(is_right)
+    }
+
+    /// Whether the payload may have a freshness at all.
+    pub fn is_empty(&self) -> bool {
+        self.candidates.iter().all(Option::is_none)
+    }
+
+    /// Whether it may have this freshness.
+    pub fn has(&self, freshness: u64) -> bool {
+        self.candidates.contains(&Some(freshness))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,172 @@
+//! The key of authenticated frames: read once at the start, from a credential of the service manager or a file, and shown
+//! nowhere.
+//!
+//! In: where the key is. Out: AES-128-CMAC of any bytes. A key that is missing, readable by others, or not 16 bytes (or 32 hex
+//! digits) is an error that does not contain it.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::fs::File;
+use std::io::Read;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use aes::Aes128;
+use cmac::{Cmac, KeyInit, Mac as _};
+
+use crate::can::secoc::Mac;
+use crate::config::KeySource;
+
+/// Bytes of a key.
+const KEY_BYTES: usize = 16;
+/// Longest file that can be a key: hex digits and a line feed of any kind, and one byte more.
+const MAX_FILE_BYTES: u64 = 2 * KEY_BYTES as u64 + 3;
+/// Access of others to the file.
+const OTHERS: u32 = 0o077;
+
+/// See the module.
+#[derive(Clone)]
+pub struct CanKey(Cmac<Aes128>);
+
+impl fmt::Debug for CanKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("CanKey(hidden)")
+    }
+}
+
+impl CanKey {
+    /// Reads the key; `credentials` is the folder of the service manager's credentials (`$CREDENTIALS_DIRECTORY`).
+    ///
+    /// # Errors
+    /// Why it cannot be used, and where it was looked for.
+    pub fn load(source: &KeySource, credentials: Option<OsString>) -> Result<Self, String> {
+        match source {
+            KeySource::Credential(name) => {
+                let folder = credentials.map(PathBuf::from).ok_or_else(|| {
+                    format!("key of [authentication]: credential {name} cannot be read: $CREDENTIALS_DIRECTORY is not set, must be started with LoadCredential={name}:PATH")
+                })?;
+                Self::read(&folder.join(name), false)
+            }
+            KeySource::File(path) => Self::read(path, true),
+        }
+    }
+
+    fn read(path: &Path, is_private: bool) -> Result<Self, String> {
+        let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
+        let file = File::open(path).map_err(|why| error(why.to_string()))?;
+        let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
+        if is_private && mode & OTHERS != 0 {
+            return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
+        }
+        let mut content = Vec::new();
+        file.take(MAX_FILE_BYTES).read_to_end(&mut content).map_err(|why| error(why.to_string()))?;
+        Self::parse(&content).map_err(error)
+    }
+
+    /// A key as it is, or as hex digits with or without a line feed.
+    ///
+    /// # Errors
+    /// When it is neither, or one byte repeated.
+    pub fn parse(content: &[u8]) -> Result<Self, String> {
+        let found = content.len();
+        let neither = || format!("{found} bytes, must be {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES);
+        let key = <[u8; KEY_BYTES]>::try_from(content)
+            .ok()
+            .or_else(|| hex_key(content.trim_ascii_end()))
+            .ok_or_else(neither)?;
+        if key.iter().all(|byte| *byte == key[0]) {
+            return Err("one byte repeated, must be random".to_owned());
+        }
+        Cmac::new_from_slice(&key).map(Self).map_err(|_| neither())
+    }
+
+    /// AES-128-CMAC of `bytes`.
+    pub fn mac(&self, bytes: &[u8]) -> Mac {
+        let mut mac = self.0.clone();
+        mac.update(bytes);
+        mac.finalize().into_bytes().into()
+    }
+}
+
+fn hex_key(digits: &[u8]) -> Option<[u8; KEY_BYTES]> {
+    let mut key = [0; KEY_BYTES];
+    let value = |digit: u8| char::from(digit).to_digit(16).and_then(|value| u8::try_from(value).ok());
+    if digits.len() != 2 * KEY_BYTES {
+        return None;
+    }
+    for (byte, pair) in key.iter_mut().zip(digits.chunks(2)) {
+        *byte = value(pair[0])? << 4 | value(pair[1])?;
+    }
+    Some(key)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    /// Key and messages of RFC 4493, section 4, which are the examples of NIST SP 800-38B, D.1.
+    const KEY: &[u8] = b"2b7e151628aed2a6abf7158809cf4f3c";
+    const MESSAGE: &str = "6bc1bee22e409f96e93d7e117393172aae2d8a571e03ac9c9eb76fac45af8e5130c81c46a35ce411e5fbc1191a0a52eff69f2445df4f9b17ad2b417be66c3710";
+
+    fn hex(text: &str) -> Vec<u8> {
+        text.as_bytes()
+            .chunks(2)
+            .map(|pair| u8::from_str_radix(std::str::from_utf8(pair).unwrap(), 16).unwrap())
+            .collect()
+    }
+
+    #[test]
+    fn cmac_gives_the_vectors_of_rfc_4493_and_nist() {
+        let key = CanKey::parse(KEY).unwrap();
+        let message = hex(MESSAGE);
+        for (len, mac) in [
+            (0, "bb1d6929e95937287fa37d129b756746"),
+            (16, "070a16b46b4d4144f79bdd9dd04a287c"),
+            (20, "7d85449ea6ea19c823a7bf78837dfade"),
+            (40, "dfa66747de9ae63030ca32611497c827"),
+            (64, "51f0bebf7e3b9d92fc49741779363cfe"),
+        ] {
+            assert_eq!(key.mac(&message[..len]).to_vec(), hex(mac), "{len} bytes");
+        }
+    }
+
+    #[test]
+    fn a_key_is_16_bytes_or_32_hex_digits_and_never_shown() {
+        let raw = hex(std::str::from_utf8(KEY).unwrap());
+        let wanted = CanKey::parse(KEY).unwrap().mac(b"x");
+        for same in [raw.as_slice(), b"2B7E151628AED2A6ABF7158809CF4F3C\n", b"2b7e151628aed2a6abf7158809cf4f3c\r\n"] {
+            assert_eq!(CanKey::parse(same).unwrap().mac(b"x"), wanted);
+        }
+        for bad in [&b""[..], b"2b7e", b"zb7e151628aed2a6abf7158809cf4f3c", &[7; 17], &[b'0'; 33]] {
+            let error = CanKey::parse(bad).unwrap_err();
+            assert_eq!(error, format!("{} bytes, must be 16 bytes or 32 hex digits", bad.len()));
+        }
+        assert_eq!(CanKey::parse(&[b'0'; 32]).unwrap_err(), "one byte repeated, must be random");
+        assert_eq!(format!("{:?}", CanKey::parse(KEY).unwrap()), "CanKey(hidden)");
+    }
+
+    #[test]
+    fn a_key_that_cannot_be_used_is_an_error_that_says_where() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("can.key");
+        let source = KeySource::File(path.clone());
+        let error = |source: &KeySource, credentials: Option<&Path>| {
+            CanKey::load(source, credentials.map(|folder| folder.as_os_str().to_owned())).unwrap_err()
+        };
+        assert!(error(&source, None).ends_with("can.key: No such file or directory (os error 2)"));
+        std::fs::write(&path, KEY).unwrap();
+        for (mode, is_good) in [(0o600, true), (0o400, true), (0o640, false), (0o604, false), (0o620, false)] {
+            std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+            assert_eq!(CanKey::load(&source, None).is_ok(), is_good, "{mode:o}");
+        }
+        assert!(error(&source, None).ends_with("can.key: mode 0620, must be 0600 or 0400: no other user may read it"));
+        let credential = KeySource::Credential("can.key".to_owned());
+        assert!(error(&credential, None).contains("$CREDENTIALS_DIRECTORY is not set"));
+        assert!(
+            CanKey::load(&credential, Some(folder.path().as_os_str().to_owned())).is_ok(),
+            "the manager keeps it private"
+        );
+    }
+}

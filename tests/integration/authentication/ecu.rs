@@ -1,0 +1,193 @@
+//! A sender of authenticated commands as the manual describes it, an attacker's material, and a bus between them and the core.
+
+use std::cell::RefCell;
+
+use packwatch::can::secoc::{Authentication, Mac, Profile};
+use packwatch::can::{CanId, Frame};
+use packwatch::io::can_key::CanKey;
+use packwatch::monitor::{
+    Command, CommandCounts, Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot,
+};
+use packwatch::quantity::{BusIndex, Timestamp};
+
+use crate::support::config_texts;
+use crate::support::rig::{DBC, PACK};
+
+pub(crate) const COMMAND: u32 = 0x6B3;
+pub(crate) const FRESHNESS: u32 = 0x6B6;
+pub(crate) const REPLY: u32 = 0x6B5;
+const COMMAND_ID: u16 = 0x0321;
+const FRESHNESS_ID: u16 = 0x0322;
+const BUS: BusIndex = BusIndex(0);
+/// A wall clock of 2027.
+const START_MS: i64 = 1_800_000_000_000;
+
+pub(crate) fn key(byte: u8) -> CanKey {
+    CanKey::parse(&[byte, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]).unwrap()
+}
+
+/// Commands with a profile, in place of the unauthenticated ones.
+pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
+    let secoc = format!("secoc = \"{profile}\"\n");
+    let fd = if profile == "fd" { "fd = true\n" } else { "" };
+    let pack =
+        PACK.replace("name = \"can0\"\n", "name = \"can0\"\nfd = true\n").replace("e2e = \"1A\"\n", &(secoc + fd));
+    let tables = "[output.freshness]\ndata_id = 0x0322\n[authentication]\nkey_file = \"can.key\"\n";
+    config_texts::load(&format!("{pack}{tables}{more}"), DBC).monitor
+}
+
+/// The sender. It keeps nothing over a restart: [`Ecu::new`] again.
+pub(crate) struct Ecu {
+    key: CanKey,
+    pub(crate) authentication: Authentication,
+    /// The freshness of the next command; `None` = wait for an announcement.
+    next: Option<u64>,
+    announced: u64,
+}
+
+impl Ecu {
+    pub(crate) fn new(profile: Profile, key: CanKey) -> Self {
+        let authentication = Authentication { profile, data_id: COMMAND_ID };
+        Self { key, authentication, next: None, announced: 0 }
+    }
+
+    /// Takes an announcement: only a right one, and only a higher one.
+    pub(crate) fn hear(&mut self, frame: &Frame) {
+        if frame.id() != CanId::standard(FRESHNESS).unwrap() {
+            return;
+        }
+        let announcement = Authentication { profile: Profile::Announcement, data_id: FRESHNESS_ID };
+        let sent = announcement.sent_freshness(frame.data()).unwrap();
+        let span = 1 << Profile::Announcement.freshness_bits();
+        let high = self.announced / span * span;
+        for freshness in [high + sent, high + span + sent] {
+            let input = announcement.mac_input(frame.data(), freshness).unwrap();
+            if freshness > self.announced && announcement.has_mac(frame.data(), self.key.mac(input.bytes())) {
+                (self.announced, self.next) = (freshness, Some(freshness));
+                return;
+            }
+        }
+    }
+
+    /// A command; `None` = the announced values are used up.
+    pub(crate) fn command(&mut self, command: u8, cell: u16) -> Option<Frame> {
+        let freshness = self.next.filter(|next| *next < self.announced + 16)?;
+        self.next = Some(freshness + 1);
+        Some(self.made(command, cell, freshness))
+    }
+
+    /// A command with any freshness.
+    pub(crate) fn made(&self, command: u8, cell: u16, freshness: u64) -> Frame {
+        let codes = u32::from(command) | 31 << 4 | u32::from(cell) << 11;
+        let mut payload = codes.to_le_bytes().to_vec();
+        payload.resize(4 + self.authentication.profile.trailer_bytes(), 0);
+        self.authentication.write_freshness(&mut payload, freshness);
+        let input = self.authentication.mac_input(&payload, freshness).unwrap();
+        self.authentication.write_mac(&mut payload, self.key.mac(input.bytes()));
+        frame_of(&payload)
+    }
+}
+
+pub(crate) fn frame_of(payload: &[u8]) -> Frame {
+    let id = CanId::standard(COMMAND).unwrap();
+    if payload.len() <= 8 { Frame::classic(id, payload) } else { Frame::fd(id, false, false, payload) }.unwrap()
+}
+
+/// A tick, or a frame and the freshness of its right authenticator.
+pub(crate) type JournalLine = Option<(Frame, Option<u64>)>;
+
+/// The daemon on a bus, driven by hand.
+pub(crate) struct Daemon {
+    pub(crate) config: MonitorConfig,
+    pub(crate) monitor: Monitor,
+    key: CanKey,
+    out: Outputs,
+    pub(crate) ms: i64,
+    /// Frames it sent with the last input, with their authenticators.
+    pub(crate) sent: Vec<Frame>,
+    /// Commands executed, ever.
+    pub(crate) executed: u64,
+    /// Inputs as a journal has them, when wanted.
+    pub(crate) journal: Option<Vec<(i64, JournalLine)>>,
+    pub(crate) macs: RefCell<u64>,
+}
+
+impl Daemon {
+    pub(crate) fn new(config: MonitorConfig) -> Self {
+        let mut daemon = Self {
+            monitor: Monitor::new(config.clone()),
+            config,
+            key: key(0xA0),
+            out: Outputs::default(),
+            ms: START_MS,
+            sent: Vec::new(),
+            executed: 0,
+            journal: None,
+            macs: RefCell::new(0),
+        };
+        daemon.pass(20);
+        daemon
+    }
+
+    fn now(&self) -> Timestamp {
+        Timestamp::from_nanos(self.ms * 1_000_000)
+    }
+
+    /// Lets time pass, with a tick every 10 ms.
+    pub(crate) fn pass(&mut self, ms: i64) {
+        self.sent.clear();
+        for _ in 0..ms / 10 {
+            self.ms += 10;
+            if let Some(journal) = &mut self.journal {
+                journal.push((self.ms, None));
+            }
+            self.monitor.handle(Input::Tick { time: self.now() }, &mut self.out);
+            self.drain();
+        }
+    }
+
+    /// Gives it a command frame; whether it was executed.
+    pub(crate) fn receive(&mut self, frame: &Frame) -> bool {
+        self.sent.clear();
+        let before = self.executed;
+        let mac = |bytes: &[u8]| -> Mac {
+            *self.macs.borrow_mut() += 1;
+            self.key.mac(bytes)
+        };
+        let check = self.monitor.mac_check(BUS, frame).unwrap();
+        let freshness = check.verify(frame.data(), mac);
+        if let Some(journal) = &mut self.journal {
+            journal.push((self.ms, Some((*frame, freshness))));
+        }
+        self.monitor.handle(Input::SecuredFrame { time: self.now(), bus: BUS, frame, freshness }, &mut self.out);
+        self.drain();
+        self.executed > before
+    }
+
+    fn drain(&mut self) {
+        let is_command = |kind: &EventKind| matches!(kind, EventKind::Command { command, .. } if is_of_bus(command));
+        self.executed += self.out.events.iter().filter(|event| is_command(&event.kind)).count() as u64;
+        let sealed = self.out.frames.iter().map(|sent| match sent.secured {
+            Some(secured) => secured.seal(&sent.frame, |bytes| self.key.mac(bytes)),
+            None => sent.frame,
+        });
+        self.sent.extend(sealed);
+        self.out.clear();
+    }
+
+    pub(crate) fn counts(&self) -> CommandCounts {
+        self.monitor.authenticated_commands().unwrap().2
+    }
+
+    /// Kills it and starts it again from a stored state, `away_ms` later.
+    pub(crate) fn restart(&mut self, stored: Snapshot, downtime: Downtime, away_ms: i64) {
+        self.ms += away_ms;
+        self.monitor = Monitor::new(self.config.clone());
+        self.monitor.restore(stored, downtime).unwrap();
+        self.pass(20);
+    }
+}
+
+fn is_of_bus(command: &Command) -> bool {
+    matches!(command, Command::Acknowledge(_) | Command::Clear(_) | Command::PackReplaced)
+}
