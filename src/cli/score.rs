@@ -80,7 +80,12 @@ fn settings(args: &Args, config: &Config) -> Result<ScoreSettings, Failure> {
             "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
         ));
     }
+    let learned = (!args.learn.is_empty())
+        .then(|| score::learn(&args.learn, &monitor, args.statistics.sleep_gap))
+        .transpose()
+        .map_err(failure)?;
     Ok(ScoreSettings {
+        learned,
         truth_capacity_ah: args.statistics.truth_capacity.unwrap_or(monitor.model.capacity_ah),
         monitor,
         remove: args.starts.remove,

@@ -12,6 +12,7 @@
 mod case;
 mod cycles;
 mod feed;
+mod learn;
 mod life;
 mod picture;
 mod soc;
@@ -23,6 +24,7 @@ use rayon::prelude::*;
 
 pub use case::{Case, CaseScore, Start};
 pub use cycles::CycleTable;
+pub use learn::{Learned, learn};
 pub use life::{DischargeScore, LifeScore};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
@@ -56,6 +58,8 @@ pub struct ScoreSettings {
     pub skip_cycles: usize,
     /// Smallest and largest part of each half-cycle's charge that is seen; `None` = all of it.
     pub window: Option<(f64, f64)>,
+    /// State after the files that came before each scored one; `None` = each is the first.
+    pub learned: Option<Learned>,
     /// Folder for the plots.
     pub plots: Option<PathBuf>,
 }

@@ -37,6 +37,9 @@ pub(crate) struct Args {
     pub(crate) cell: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) label: LabelArgs,
+    /// Measured files that the monitor has seen before, in this order: each scored file continues from what they have taught
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "cycles")]
+    pub(crate) learn: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) starts: StartArgs,
     #[command(flatten)]

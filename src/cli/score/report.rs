@@ -10,6 +10,7 @@ use crate::config::Config;
 use crate::lab::score::{
     CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore,
 };
+use crate::monitor::ModelState;
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.
 pub(super) struct Bar {
@@ -63,8 +64,18 @@ struct Document<'a> {
     settle_s: f64,
     converged_within_points: f64,
     converged_hold_s: f64,
+    /// What the files of --learn have taught.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    learned: Option<LearnedDocument>,
     scores: &'a [CaseScore],
     totals: Vec<Total<'a>>,
+}
+
+#[derive(Serialize)]
+struct LearnedDocument {
+    model: ModelState,
+    capacity_ah: f64,
+    capacity_std_ah: f64,
 }
 
 /// One case over all files.
@@ -107,6 +118,11 @@ impl ScoreReport<'_> {
             settle_s: self.settings.settle_s,
             converged_within_points: CONVERGED_POINTS,
             converged_hold_s: CONVERGED_HOLD_S,
+            learned: self.settings.learned.as_ref().map(|learned| LearnedDocument {
+                model: learned.model,
+                capacity_ah: learned.capacity.mean,
+                capacity_std_ah: learned.capacity.std(),
+            }),
             scores: self.scores,
             totals: self.totals(),
         })

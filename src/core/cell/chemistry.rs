@@ -17,7 +17,8 @@ use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
 /// Materials of both electrodes, by what is on the label or in a data sheet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Chemistry {
     /// Nickel-rich NMC (811).
     Nmc811Graphite,
@@ -89,7 +90,8 @@ impl Chemistry {
 const NEGATIVES: [Negative; 3] = [Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged];
 
 /// What is on the label of a cell.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Label {
     /// Chemistry.
     pub chemistry: Chemistry,
@@ -100,6 +102,9 @@ pub struct Label {
     /// Highest voltage, V.
     pub voltage_max_v: f64,
 }
+
+/// Distance of a highest voltage from the usual one of a chemistry within which it is one of that chemistry, V.
+const USUAL_WITHIN_V: f64 = 0.2;
 
 /// SOC breakpoints of a model from a label.
 pub(super) const SOC: [f64; 21] =
@@ -189,6 +194,15 @@ impl Label {
         Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
     }
 
+    /// The label with another chemistry: between the same voltages where these are usual of it, else between its usual ones.
+    pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
+        let (low_v, high_v) = chemistry.usual_voltages_v();
+        let is_usual = (self.voltage_max_v - high_v).abs() <= USUAL_WITHIN_V;
+        let (voltage_min_v, voltage_max_v) =
+            if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
+        Self { chemistry, voltage_min_v, voltage_max_v, ..*self }
+    }
+
     /// Mean and spread of the open-circuit curves of such cells; `None` when no cell of this chemistry has these cut-offs.
     pub fn curve(&self) -> Option<CurvePrior> {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
@@ -255,9 +269,8 @@ impl Label {
             let settled_ohm: f64 = branches.iter().fold(r0_ohm.values[t][s], |sum, it| sum + it.r_ohm.values[t][s]);
             USUAL_LOAD_PER_H * self.rated_ah * settled_ohm
         };
-        let error_v = |t: usize| {
-            (0..SOC.len()).map(|s| curve.rest_v[s].hypot(drop_std[t] * drop_v(t, s))).collect::<Vec<f64>>()
-        };
+        let error_v =
+            |t: usize| (0..SOC.len()).map(|s| curve.rest_v[s].hypot(drop_std[t] * drop_v(t, s))).collect::<Vec<f64>>();
         CellModel {
             name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
             rated_capacity_ah: self.rated_ah,

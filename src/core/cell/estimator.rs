@@ -42,7 +42,7 @@ mod state_vector;
 mod step;
 
 pub use bank::EstimatorBank;
-pub use cell_estimator::CellEstimator;
+pub use cell_estimator::{AdoptedState, CellEstimator};
 pub use state::CellState;
 pub use step::{CellStep, StepResult};
 

@@ -23,7 +23,7 @@ pub use config::{
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
-pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
+pub use estimator::{AdoptedState, CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,

@@ -11,6 +11,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::CellStep;
+use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
 /// Most rows: with 56 bytes each below 7 kB.
@@ -140,6 +141,13 @@ pub struct NotebookConfig {
     pub tau_s: [f64; FILTERS],
 }
 
+impl NotebookConfig {
+    /// For a pack of cells known by their label.
+    pub fn new(cells: u32, rated_ah: f64) -> Self {
+        Self { cells, rated_ah, tau_s: TAU_S }
+    }
+}
+
 impl Notebook {
     /// The rows, those of a stretch together and in their order.
     pub fn rows(&self) -> &[Row] {
@@ -156,9 +164,30 @@ impl Notebook {
         self.unread = 0;
     }
 
+    /// The same rows, none of them used.
+    pub fn all_unread(self) -> Self {
+        Self { unread: u32::try_from(self.rows.len()).unwrap_or(u32::MAX), ..self }
+    }
+
+    /// Rows that came after the last [`Self::mark_read`] and are still there.
+    pub fn new_rows(&self) -> &[Row] {
+        &self.rows[self.rows.len().saturating_sub(self.unread as usize)..]
+    }
+
+    /// Number of these that are of a class of SOC, temperature and direction without any earlier row.
+    pub fn rows_of_new_classes(&self, rated_ah: f64) -> usize {
+        let (old, new) = self.rows.split_at(self.rows.len() - self.new_rows().len());
+        new.iter().filter(|row| old.iter().all(|old| old.class(rated_ah) != row.class(rated_ah))).count()
+    }
+
     /// Charge taken out in the present stretch, Ah, with its number.
     pub fn present(&self) -> Option<(u32, f64)> {
         self.present.as_ref().map(|stretch| (self.number, stretch.charge_ah))
+    }
+
+    /// Present current through the filters, A; `None` = no stretch is under way.
+    pub fn filtered_a(&self) -> Option<[f64; FILTERS]> {
+        self.present.as_ref().map(|stretch| stretch.filtered_a)
     }
 
     /// Takes a reading; whether a row is complete: [`Self::close_row`] then ends it.
@@ -258,9 +287,8 @@ impl Notebook {
         self.make_room(config);
     }
 
-    /// Ends the present stretch: what follows does not hang together with it.
-    pub fn end_stretch(&mut self, config: &NotebookConfig) {
-        self.readings = Readings::default();
+    /// Ends the present row where it is long enough: the vehicle rests, or the stretch ends.
+    pub fn finish_row(&mut self, config: &NotebookConfig) {
         let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
         if let (Some(stretch), Some(before)) = (&self.present, before)
             && stretch.row.seconds >= LEAST_ROW_S
@@ -268,25 +296,47 @@ impl Notebook {
             let moved_ah = stretch.charge_ah - f64::from(before.charge_ah);
             self.close_row(config, f64::from(before.soc) - moved_ah / config.rated_ah);
         }
-        self.present = None;
+    }
+
+    /// Ends the present stretch: what follows does not hang together with it.
+    pub fn end_stretch(&mut self, config: &NotebookConfig) {
+        self.finish_row(config);
+        (self.readings, self.present) = (Readings::default(), None);
     }
 
     /// Drops rows beyond the bounds.
     fn make_room(&mut self, config: &NotebookConfig) {
-        let stretches = self.rows.chunk_by(|a, b| a.stretch == b.stretch).count();
-        if stretches > MAX_STRETCHES
-            && let Some(oldest) = self.rows.first().map(|row| row.stretch)
+        let class_of = |row: &Row| row.class(config.rated_ah);
+        if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > MAX_STRETCHES
+            && let Some(dropped) = self.least_missed(config)
         {
-            self.rows.retain(|row| row.stretch != oldest);
+            let unread_from = self.rows.len() - self.new_rows().len();
+            let unread = self.rows[unread_from..].iter().filter(|row| row.stretch != dropped).count();
+            self.rows.retain(|row| row.stretch != dropped);
+            self.unread = u32::try_from(unread).unwrap_or(u32::MAX);
         }
         while self.rows.len() > MAX_ROWS {
-            let class_of = |row: &Row| row.class(config.rated_ah);
             let classes: Vec<_> = self.rows.iter().map(class_of).collect();
             let size = |at: usize| classes.iter().filter(|class| **class == classes[at]).count();
             let fullest = (0..classes.len()).rev().max_by_key(|&at| size(at)).unwrap_or(0);
             let oldest = classes.iter().position(|class| *class == classes[fullest]).unwrap_or(0);
+            if oldest >= self.rows.len() - self.new_rows().len() {
+                self.unread -= 1;
+            }
             self.rows.remove(oldest);
         }
+    }
+
+    /// The stretch, but the present one, with the fewest rows of a class that no other stretch has; the oldest of these.
+    fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
+        let class_of = |row: &Row| row.class(config.rated_ah);
+        let alone = |stretch: &[Row]| {
+            let has_other =
+                |row: &&Row| self.rows.iter().any(|it| it.stretch != row.stretch && class_of(it) == class_of(row));
+            stretch.iter().filter(|row| !has_other(row)).count()
+        };
+        let stretches = self.rows.chunk_by(|a, b| a.stretch == b.stretch).filter(|rows| rows[0].stretch != self.number);
+        stretches.min_by_key(|rows| alone(rows)).map(|rows| rows[0].stretch)
     }
 
     /// Checks the numbers of a stored notebook.
@@ -294,7 +344,12 @@ impl Notebook {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        InvalidState::unless(self.rows.len() <= MAX_ROWS, "the rows of the notebook", self.rows.len() as f64, "at most 120")?;
+        InvalidState::unless(
+            self.rows.len() <= MAX_ROWS,
+            "the rows of the notebook",
+            self.rows.len() as f64,
+            "at most 120",
+        )?;
         for row in &self.rows {
             let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
             let [a, b, c] = row.filtered_a;

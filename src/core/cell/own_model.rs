@@ -8,7 +8,9 @@ pub mod fit;
 use serde::{Deserialize, Serialize};
 
 use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, ResistanceFactors, TEMPERATURE_NODES};
+use super::config::EstimatorConfig;
 use super::model::{CellModel, ModelSpread};
+use super::notebook::Row;
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
@@ -64,6 +66,26 @@ impl OwnModel {
         Some(model)
     }
 
+    /// The estimator's settings for the learned `model`, by those for the label's.
+    pub fn estimator_config(&self, base: &EstimatorConfig, label: &CellModel, model: &CellModel) -> EstimatorConfig {
+        let (Some(old), Some(new)) = (label.spread, model.spread) else { return *base };
+        // A key of the configuration stands in place of the label's.
+        let instead = |value: f64, old: f64, new: f64| if value == old { new } else { value };
+        let parts = |value: f64, old: f64, new: f64| (value * value - old * old).max(0.0).sqrt().hypot(new);
+        let mut config = *base;
+        config.initial.soc = None;
+        config.initial.capacity_ah = self.capacity.mean;
+        config.initial.capacity_std_ah = self.capacity.std();
+        config.initial.curve = self.capacity;
+        config.initial.log_resistance_std =
+            instead(base.initial.log_resistance_std, old.log_resistance, new.log_resistance);
+        config.voltage.drop_error_sqrt_s = parts(base.voltage.drop_error_sqrt_s, old.drop_sqrt_s, new.drop_sqrt_s);
+        config.voltage.load_error_sqrt_s = parts(base.voltage.load_error_sqrt_s, old.drop_sqrt_s, new.drop_sqrt_s);
+        config.sensor.voltage_offset_v = parts(base.sensor.voltage_offset_v, old.curve_v, new.curve_v);
+        config.sensor.slow_branch = instead(base.sensor.slow_branch, old.slow_branch, new.slow_branch);
+        config
+    }
+
     /// Whether what is left unknown is small: capacity within 3 %.
     pub fn is_settled(&self) -> bool {
         self.capacity.std() < 0.03 * self.capacity.mean
@@ -78,7 +100,12 @@ impl OwnModel {
         InvalidState::unless(rises, "the curve of a learned model", self.curve_v[0], "rising over SOC")?;
         let factors = self.factors.ln.iter().flatten().chain(&self.factors.by_temperature);
         for &factor in factors {
-            InvalidState::unless(factor.abs() <= 5.0, "a resistance of a learned model", factor, "-5 to 5 (ln of a ratio)")?;
+            InvalidState::unless(
+                factor.abs() <= 5.0,
+                "a resistance of a learned model",
+                factor,
+                "-5 to 5 (ln of a ratio)",
+            )?;
         }
         let numbers = self.curve_v.iter().chain(self.modes_v.iter().flatten());
         InvalidState::unless_numbers("the curve of a learned model", numbers.copied())?;
@@ -87,6 +114,11 @@ impl OwnModel {
         InvalidState::unless_capacity("the capacity of a learned model", self.capacity.mean)?;
         InvalidState::unless_positive("the variance of the capacity of a learned model", self.capacity.variance)
     }
+}
+
+/// Cost of rows by a model, `None` = that of the label ([`fit::Fit::cost`] without the prior); `None` when there are no rows.
+pub fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
+    fit::rows_cost(label, own, rows)
 }
 
 /// SOC nodes of the resistance factors.

@@ -248,6 +248,29 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
     }
 
+    /// Continues with another model of the cell, whose estimator has adopted it: the present half-cycle begins anew at `soc`, and
+    /// the capacity at `capacity`, Ah, where that is given.
+    pub fn adopt(
+        &mut self,
+        config: &CapacityConfig,
+        cell: usize,
+        capacity: Option<ScalarGaussian>,
+        soc: Option<ScalarGaussian>,
+        estimator: &CellEstimator,
+    ) {
+        if let Some(capacity) = capacity {
+            self.drift[cell] = DriftFilter::new(config, capacity);
+            (self.capacity[cell], self.learned[cell]) = (capacity, true);
+        }
+        self.prior[cell] = estimator.capacity();
+        self.in_doubt.retain(|&other| other != cell);
+        // What a joined half-cycle began with was estimated with the old model.
+        let at_start = soc.filter(|_| !self.joining);
+        for (mark, soc) in [(&mut self.start, at_start), (&mut self.candidate, soc)] {
+            mark.iter_mut().for_each(|mark| mark.cells[cell].soc = soc);
+        }
+    }
+
     /// Whether a cell's capacity has been measured since its configured start.
     pub fn has_learned(&self, cell: usize) -> bool {
         self.learned.get(cell).copied().unwrap_or(false)

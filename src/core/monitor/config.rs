@@ -11,7 +11,7 @@ use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
-use crate::cell::{CellModel, EstimatorConfig};
+use crate::cell::{CellModel, EstimatorConfig, Label};
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
 use crate::sample::SampleConfig;
@@ -41,6 +41,8 @@ pub struct MonitorConfig {
     pub sample: SampleConfig,
     /// Cell model.
     pub model: CellModel,
+    /// What is on the label of the cells, where their own model is learned; `None` = the model holds.
+    pub label: Option<Label>,
     /// Estimator.
     pub estimator: EstimatorConfig,
     /// Learning at transitions.
@@ -113,6 +115,7 @@ impl MonitorConfig {
             ("[poll]", self.poll == new.poll && self.supply == new.supply),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
             ("pack.cell_model", self.model == same_model),
+            ("pack.learn_model", self.label.is_some() == new.label.is_some()),
             ("estimator.capacity_state", self.estimator.capacity_state == new.estimator.capacity_state),
             ("capacity.method", is_nominal(self) == is_nominal(new)),
         ];

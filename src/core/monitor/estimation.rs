@@ -7,11 +7,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::batch::CellBatch;
+use super::modelling::{Adoption, Modelling};
 use super::{Estimate, MeasuredValues, MonitorConfig};
 use crate::cell::model_check::model_id;
-use crate::cell::{CellStep, EstimatorBank, ModelCheck, ModelEvidence};
+use crate::cell::{AdoptedState, CellModel, CellStep, EstimatorBank, EstimatorConfig, ModelCheck, ModelEvidence};
 use crate::filter::ScalarGaussian;
-use crate::health::Learner;
+use crate::health::{CapacityConfig, Learner};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
@@ -71,20 +72,25 @@ impl Estimation {
     }
 
     /// Other settings for the same cells.
-    pub(super) fn reconfigure(&mut self, config: &MonitorConfig, learner: &Learner) {
-        let mut estimator = config.estimator;
-        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
-        self.bank.reconfigure(&config.model, &estimator);
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
+        self.use_model(modelling, learner);
         let model = self.model_id();
         self.checks.iter_mut().for_each(|check| *check = check.or_new(model));
         self.note_checks();
         self.ambient_c = config.sample.ambient_c;
     }
 
+    /// The model in force for the same cells.
+    pub(super) fn use_model(&mut self, modelling: &Modelling, learner: &Learner) {
+        let (model, mut estimator): (CellModel, EstimatorConfig) = modelling.in_force();
+        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
+        self.bank.reconfigure(&model, &estimator);
+    }
+
     /// Forgets all cells: another pack is connected.
-    pub(super) fn forget(&mut self) {
-        let cells = self.cells();
-        self.bank = EstimatorBank::new(self.bank.model(), self.bank.config(), cells);
+    pub(super) fn forget(&mut self, modelling: &Modelling) {
+        let (cells, (model, estimator)) = (self.cells(), modelling.in_force());
+        self.bank = EstimatorBank::new(&model, &estimator, cells);
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
@@ -108,15 +114,55 @@ impl Estimation {
     }
 
     /// Steps the filters of all waiting samples; returns these, for [`finish`](Self::finish).
-    pub(super) fn step(&mut self, learner: &mut Learner) -> Vec<CellSample> {
+    pub(super) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
         for sample in &samples {
             let step = self.next_step(sample, learner);
+            modelling.note(&step);
             self.bank.add(sample.cell.index(), &step);
         }
         self.bank.step();
         self.check_models(&samples);
+        if modelling.has_row() {
+            modelling.close_row(self.mean_soc());
+        }
         samples
+    }
+
+    /// Mean SOC of the cells, fraction; without any, half.
+    fn mean_soc(&self) -> f64 {
+        let socs = (0..self.cells()).filter_map(|cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
+        let (count, sum) = socs.fold((0.0, 0.0), |(count, sum), soc| (count + 1.0, sum + soc));
+        if count > 0.0 { sum / count } else { 0.5 }
+    }
+
+    /// Continues with another model. The cells keep their differences from the mean cell.
+    pub(super) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
+        let Adoption { model, config: estimator, mean, with_capacity } = adoption;
+        let (cells, bank) = (self.cells(), &mut self.bank);
+        let soc = differences((0..cells).map(|cell| bank.filtered_soc(cell).map(|soc| soc.mean)));
+        let log_resistance = differences((0..cells).map(|cell| Some(bank.log_resistance(cell).mean)));
+        let log_capacity = differences((0..cells).map(|cell| Some(libm::log(learner.capacity(cell).mean))));
+        let mut estimator = *estimator;
+        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
+        bank.reconfigure(model, &estimator);
+        for cell in 0..cells {
+            let ratio = libm::exp(log_capacity[cell]);
+            let fitted =
+                ScalarGaussian { mean: mean.capacity.mean * ratio, variance: mean.capacity.variance * ratio * ratio };
+            let capacity = with_capacity.then_some(fitted);
+            let state = AdoptedState {
+                soc: mean.soc.map(|mean| ScalarGaussian { mean: mean.mean + soc[cell], ..mean }),
+                capacity: capacity.unwrap_or(learner.capacity(cell)),
+                log_resistance: log_resistance[cell],
+                ..*mean
+            };
+            bank.change(cell, |cell| cell.adopt(model, &estimator, &state));
+            learner.adopt(config, cell, capacity, state.soc, &bank.cell(cell));
+        }
+        let model = self.model_id();
+        self.checks.fill(ModelCheck::new(model));
+        self.note_checks();
     }
 
     /// Ends the work on stepped samples.
@@ -294,6 +340,13 @@ impl Estimation {
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
         self.batch = batch;
     }
+}
+
+/// Difference of each value from the mean of those that are known; 0 where it is not.
+fn differences(values: impl Iterator<Item = Option<f64>> + Clone) -> Vec<f64> {
+    let known = values.clone().flatten();
+    let mean = known.clone().sum::<f64>() / known.count().max(1) as f64;
+    values.map(|value| value.map_or(0.0, |value| value - mean)).collect()
 }
 
 /// Resistance of a cell relative to new.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::input::{BusEvent, Command, Source};
+use super::modelling::ModelState;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::decode::Channel;
 use crate::can::diagnostic::MessageLoss;
@@ -11,6 +12,7 @@ use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
 use crate::can::poll::PollChange;
+use crate::cell::Chemistry;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -249,6 +251,21 @@ pub enum EventKind {
     TimeBackwards {
         /// By how much, s.
         seconds: f64,
+    },
+    /// The model of the cells was learned from what the vehicle noted of them; or it turned out that it cannot be.
+    Model {
+        /// How well it is known now.
+        state: ModelState,
+        /// Capacity of the mean cell, Ah; `None` = nothing was learned.
+        capacity_ah: Option<f64>,
+        /// Its standard deviation, Ah.
+        capacity_std_ah: Option<f64>,
+        /// Root mean square of the residuals, V.
+        residual_v: Option<f64>,
+        /// The chemistry that explains the voltages better than that on the label.
+        chemistry: Option<Chemistry>,
+        /// The model before was the better one and holds again.
+        is_taken_back: bool,
     },
     /// A cell's filter failed and started again from its voltage.
     FilterReset {

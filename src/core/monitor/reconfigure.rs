@@ -58,7 +58,8 @@ impl Monitor {
         let changed = old.changed_tables(&config);
         self.intake.reconfigure(&config);
         let stages = &mut self.stages;
-        stages.estimation.reconfigure(&config, &stages.learning.state.learner);
+        stages.modelling.reconfigure(&config);
+        stages.estimation.reconfigure(&config, &stages.modelling, &stages.learning.state.learner);
         stages.sampling.reconfigure(&config);
         stages.sleep.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);

@@ -12,6 +12,7 @@ use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
+use super::modelling::ModellingState;
 use super::sampling::Identity;
 use super::sender::Schedule;
 use super::stages::Stages;
@@ -54,6 +55,8 @@ pub struct Snapshot {
     identity: Identity,
     #[serde(default)]
     statistics: Statistics,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    modelling: Option<ModellingState>,
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
@@ -127,7 +130,7 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
-        let Stages { sampling, estimation, learning, alarming, sender, statistics, sleep } = &self.stages;
+        let Stages { sampling, estimation, modelling, learning, alarming, sender, statistics, sleep } = &self.stages;
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
@@ -144,6 +147,7 @@ impl Monitor {
             buses,
             identity: sampling.identity,
             statistics: statistics.clone(),
+            modelling: modelling.stored(),
             asleep_since: sleep.since,
         }
     }
@@ -214,7 +218,11 @@ impl Stages {
 
     /// Continues from a checked and rebased snapshot.
     fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
-        let Self { sampling, estimation, learning, .. } = self;
+        let Self { sampling, estimation, modelling, learning, .. } = self;
+        if let Some(stored) = snapshot.modelling {
+            modelling.restore(stored);
+            estimation.use_model(modelling, &snapshot.learning.learner);
+        }
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in snapshot.cells.iter().enumerate() {
             learning.cells[index] = cell.health;
@@ -271,6 +279,7 @@ impl Snapshot {
             stored.check().map_err(at_cell)?;
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
+        self.modelling.iter().try_for_each(ModellingState::check)?;
         self.sampler.check()?;
         Ok(self.learning.check()?)
     }

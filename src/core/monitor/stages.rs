@@ -6,6 +6,7 @@
 use super::alarming::Alarming;
 use super::estimation::Estimation;
 use super::learning::Learning;
+use super::modelling::Modelling;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
@@ -25,6 +26,7 @@ use crate::sample::{CellSample, Moment};
 pub(super) struct Stages {
     pub(super) sampling: Sampling,
     pub(super) estimation: Estimation,
+    pub(super) modelling: Modelling,
     pub(super) learning: Learning,
     pub(super) alarming: Alarming,
     pub(super) sender: Sender,
@@ -37,6 +39,7 @@ impl Stages {
         Self {
             sampling: Sampling::new(config),
             estimation: Estimation::new(config),
+            modelling: Modelling::new(config),
             learning: Learning::new(config),
             alarming: Alarming::new(config),
             sender: Sender::new(config),
@@ -159,7 +162,7 @@ impl Stages {
         if self.estimation.batch.waiting.is_empty() {
             return;
         }
-        let samples = self.estimation.step(&mut self.learning.state.learner);
+        let samples = self.estimation.step(&mut self.learning.state.learner, &mut self.modelling);
         let bank = &self.estimation.bank;
         self.statistics.note_voltages(samples.iter().map(|sample| bank.result(sample.cell.index())));
         let is_quiet = self.are_innovations_quiet(out);
@@ -215,6 +218,19 @@ impl Stages {
         learning.complete_mode(change, &mut estimation.bank, &mut Publisher { now, alarming, sender, out });
     }
 
+    /// Fits the model of the cells to what was noted of them, and continues with it.
+    fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.step_waiting(now, true, out);
+        let Self { estimation, modelling, learning, .. } = self;
+        let before = modelling.view().state;
+        if let Some(adoption) = modelling.refit() {
+            estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);
+        } else if modelling.has_returned() {
+            estimation.use_model(modelling, &learning.state.learner);
+        }
+        out.events.extend(self.modelling.event(before).map(|kind| Event { time: now, kind }));
+    }
+
     /// Executes a command.
     pub(super) fn handle_command(
         &mut self,
@@ -259,7 +275,8 @@ impl Stages {
             capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
         };
         out.events.push(Event { time: now, kind });
-        self.estimation.forget();
+        self.modelling.forget();
+        self.estimation.forget(&self.modelling);
         self.estimation.bank.set_current_offset_std(self.learning.config.capacity.current_offset_std_a);
         self.learning.forget(&self.estimation.bank);
         self.forget_pack_state();
@@ -277,6 +294,10 @@ impl Stages {
     /// the pack's values wait for a new reading of every cell.
     pub(super) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
+        if self.modelling.is_due() {
+            self.learn_model(now, out);
+        }
+        self.modelling.end_stretch();
         self.sender.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
@@ -316,6 +337,9 @@ impl Stages {
         }
         if silence != Silence::Lasts {
             self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
+            if self.modelling.observe_mode(now, self.learning.mode()) {
+                self.learn_model(now, out);
+            }
         }
         if !self.sampling.sampler.voltages_fresh(now) {
             // A cell without a voltage may be the weakest.

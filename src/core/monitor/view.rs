@@ -1,7 +1,7 @@
 //! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
 
 use super::stages::Stages;
-use super::{ControllerCount, Estimate, Monitor, Statistics, Validity};
+use super::{ControllerCount, Estimate, ModelView, Monitor, Statistics, Validity};
 use crate::alarm::AlarmEngine;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
@@ -105,6 +105,11 @@ impl Monitor {
     /// What came from each controller that answers diagnostic requests.
     pub fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.intake.controllers()
+    }
+
+    /// How well the model of the cells is known.
+    pub fn model(&self) -> ModelView<'_> {
+        self.stages.modelling.view()
     }
 
     /// Why no diagnostic request is sent (`None` = they are), and how many are refused for good; `None` without `[poll]`.

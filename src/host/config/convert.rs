@@ -69,6 +69,7 @@ pub(super) fn monitor(
         },
         rules,
         model,
+        label: super::label::label(pack).filter(|_| pack.learn_model),
     })
 }
 

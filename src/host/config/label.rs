@@ -7,6 +7,17 @@ use super::keys::Pack;
 use super::tables::RawTables;
 use crate::cell::{CellModel, Label};
 
+/// What is on the label, where no file is named and nothing is missing.
+pub(super) fn label(pack: &Pack) -> Option<Label> {
+    let (chemistry, rated_ah) = (pack.chemistry.filter(|_| pack.cell_model.is_none())?, pack.rated_capacity_ah?);
+    let usual = Label::usual(chemistry, rated_ah);
+    Some(Label {
+        voltage_min_v: pack.voltage_min_v.unwrap_or(usual.voltage_min_v),
+        voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
+        ..usual
+    })
+}
+
 /// The model by `chemistry`, where no file is named.
 pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
     let pack = raw.pack.as_ref()?;
@@ -18,16 +29,11 @@ pub(super) fn model(raw: &RawTables, faults: &mut Faults) -> Option<CellModel> {
         );
         return None;
     };
-    let Some(rated_ah) = pack.rated_capacity_ah else {
+    let Some(label) = label(pack) else {
         pack.place.fault(faults, "chemistry", "needs rated_capacity_ah, the capacity on the label of one cell");
         return None;
     };
-    let usual = Label::usual(chemistry, rated_ah);
-    let label = Label {
-        voltage_min_v: pack.voltage_min_v.unwrap_or(usual.voltage_min_v),
-        voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
-        ..usual
-    };
+    let usual = Label::usual(chemistry, label.rated_ah);
     let model = label.model();
     if model.is_none() {
         let Label { voltage_min_v, voltage_max_v, .. } = label;

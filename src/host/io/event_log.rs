@@ -11,8 +11,9 @@ use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::poll::PollChange;
+use crate::cell::Chemistry;
 use crate::config::VehicleIdentity;
-use crate::monitor::{BusEvent, Event, EventKind, Source};
+use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// Repeated faults of one interface are logged as a sum after this long, s; then after twice that, and so on.
@@ -114,6 +115,7 @@ impl EventLog {
             EventKind::BusAsleep { asleep: true, .. } => tracing::info!("the buses sleep"),
             EventKind::BusAsleep { asleep: false, seconds } => tracing::info!(seconds, "the buses are awake"),
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
+            EventKind::Model { .. } => log_model(&event.kind),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
                 tracing::warn!(cell = number(cell), mean_nis, "estimate not to be trusted");
@@ -220,6 +222,21 @@ fn log_poll(change: PollChange) {
             let request = format!("{service:02X} {identifier:04X}");
             tracing::warn!(%id, request, "diagnostic request refused for good, code {code:02X}: it is not sent again");
         }
+    }
+}
+
+/// Logs what is known of the cells' model.
+fn log_model(kind: &EventKind) {
+    let EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back } = *kind else {
+        return;
+    };
+    let chemistry = chemistry.map(Chemistry::name);
+    match state {
+        ModelState::Unfit => {
+            tracing::warn!(fits_better = chemistry, "the voltages contradict the chemistry on the label")
+        }
+        _ if is_taken_back => tracing::warn!(?state, capacity_ah, "the cell model before was better and holds again"),
+        _ => tracing::info!(?state, capacity_ah, capacity_std_ah, residual_v, "cell model learned"),
     }
 }
 

@@ -119,6 +119,7 @@ pub(super) fn note_event(
         EventKind::Gap { .. } => "gap",
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",
+        EventKind::Model { .. } => "model",
         EventKind::Trust { .. } => "trust",
         EventKind::Command { .. } => "command",
         EventKind::BadCommand { .. } => "bad_command",

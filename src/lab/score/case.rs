@@ -16,7 +16,7 @@ use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 
 /// A part whose beginning is unknown is placed this long after the record so far.
-const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
+pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Rows between two reports of progress.
 const REPORT_EVERY: usize = 4096;
 /// An initial SOC beyond 0 or 1 by no more than this is limited to that end (a counter that does not start at 0).
@@ -229,7 +229,7 @@ impl<'a> CaseRun<'a> {
         Self {
             job,
             settings,
-            feeder: Feeder::new(config, settings.sleep_gap_s),
+            feeder: Feeder::new(config, settings.sleep_gap_s, settings.learned.as_ref()),
             current_offset_a,
             cycles,
             span: None,

@@ -1,10 +1,11 @@
 //! Feeds rows of a measured file to the monitor: frames as a bus would carry them, and the driver's ticks between them.
 
+use super::learn::Learned;
 use crate::can::Frame;
 use crate::can::decode::SensorIndex;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::ticks::Ticks;
-use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// A monitor with the encoder and ticks of a replay.
@@ -21,8 +22,9 @@ pub(super) struct Feeder {
 }
 
 impl Feeder {
-    pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
-        Self {
+    /// A monitor before its first row, which continues from what it has learned.
+    pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
+        let mut feeder = Self {
             encoder: InputEncoder::new(&config.input).with_answers(&config.answers),
             protector: InputProtector::new(&config.guards),
             monitor: Monitor::new(config),
@@ -30,7 +32,20 @@ impl Feeder {
             frames: Vec::new(),
             out: Outputs { want_estimates: true, ..Outputs::default() },
             uncarried: 0,
+        };
+        if let Some(learned) = learned {
+            // It is of the same configuration.
+            let restored = feeder.monitor.restore(learned.snapshot.clone(), Downtime::Unknown);
+            debug_assert!(restored.is_ok(), "{restored:?}");
         }
+        feeder
+    }
+
+    /// What the monitor has learned.
+    pub(super) fn learned(&self) -> Learned {
+        let monitor = &self.monitor;
+        let capacity = monitor.capacity(CellIndex(0));
+        Learned { snapshot: monitor.snapshot(), model: monitor.model().state, capacity }
     }
 
     /// Feeds one row: A (positive = discharge), V, degrees C; NaN = no value.

@@ -9,6 +9,7 @@ use super::downtime::update_after_downtime;
 use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
 use super::memory::{Memory, USED_PRIOR};
 use super::noise::VoltageReading;
+use super::slow_branch::SlowBranch;
 use super::state_vector::{
     BRANCHES, CAPACITY, CURRENT_OFFSET, CURVE_CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, SLOW_BRANCH,
     UNKNOWN_SOC_VARIANCE, square, widened, within_bounds,
@@ -22,6 +23,27 @@ use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
 const USUAL_LOAD_PER_H: f64 = 0.5;
 /// Least and largest SOC at a start by the voltage.
 const FIRST_SOC: (f64, f64) = (-0.05, 1.05);
+
+/// State in which a cell continues with another model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdoptedState {
+    /// SOC, fraction; `None` = from the next voltage.
+    pub soc: Option<ScalarGaussian>,
+    /// Covariance of SOC and capacity, Ah.
+    pub soc_by_capacity: f64,
+    /// Capacity, Ah.
+    pub capacity: ScalarGaussian,
+    /// ln of the resistance relative to the model.
+    pub log_resistance: f64,
+    /// Current through first-order filters with the time constants of the branches, A; `None` = the branches have relaxed.
+    pub filtered_a: Option<[f64; MAX_BRANCHES]>,
+}
+
+/// Temperature of a cell whose own was never known, degrees C.
+const ADOPTED_C: f64 = 25.0;
+
+/// Largest correlation of an adopted SOC with the capacity.
+const ADOPTED_CORRELATION: f64 = 0.99;
 
 /// The estimator of one cell.
 #[derive(Debug, Clone)]
@@ -135,6 +157,50 @@ impl CellEstimator {
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+    }
+
+    /// Continues with another `model` from a state that was found with it: what was estimated with the old one is left.
+    pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
+        let temperature_c = self.memory.temperature_c;
+        self.memory.capacity = state.capacity;
+        self.memory.set_curve(state.capacity);
+        self.memory.log_resistance = ScalarGaussian::from_std(state.log_resistance, config.initial.log_resistance_std);
+        (self.memory.slow_branch, self.memory.rejected, self.memory.rejected_s) = (SlowBranch::default(), 0, 0.0);
+        (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
+        let Some(soc) = state.soc.filter(|_| self.filter.is_some()) else {
+            self.filter = None;
+            return;
+        };
+        let kept = LearnedState {
+            log_resistance: self.memory.log_resistance,
+            capacity: state.capacity,
+            covariance: 0.0,
+            by_constant: SMatrix::zeros(),
+        };
+        let position = model.grid_position(soc.mean, temperature_c.unwrap_or(ADOPTED_C));
+        let ratio = libm::exp(state.log_resistance);
+        let filtered_a = state.filtered_a.unwrap_or_default();
+        let branch_v = |i: usize| model.branch_r_ohm(i, &position) * ratio * filtered_a[i];
+        let own_variance = square(config.initial.branch_std_v).max(KNOWN_VARIANCE);
+        let mut branch_variance = [own_variance; MAX_BRANCHES];
+        for (i, variance) in branch_variance.iter_mut().enumerate().take(model.branches.len()) {
+            *variance += square(config.initial.log_resistance_std * branch_v(i));
+        }
+        let mut filter = match model.branches.len() {
+            1 => Filter::One(initial_state(soc, &branch_variance, &kept)),
+            2 => Filter::Two(initial_state(soc, &branch_variance, &kept)),
+            _ => Filter::Three(initial_state(soc, &branch_variance, &kept)),
+        };
+        each!(&mut filter, x => {
+            // Rounding must not make them more than fully correlated.
+            let most = ADOPTED_CORRELATION * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
+            let covariance = state.soc_by_capacity.clamp(-most, most);
+            (x.covariance[(0, CAPACITY)], x.covariance[(CAPACITY, 0)]) = (covariance, covariance);
+            for i in 0..model.branches.len() {
+                x.mean[BRANCHES + i] = branch_v(i);
+            }
+        });
+        self.filter = Some(filter);
     }
 
     /// Variance of each branch's voltage at a start, V^2: under load, a usual load of unknown duration has filled it.

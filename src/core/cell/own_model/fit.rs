@@ -58,10 +58,10 @@ const SOC_AND_CAPACITY: usize = 4;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
-    /// Number of the last stretch and the SOC at which it began.
-    pub last: (u32, f64),
-    /// Standard deviation of the SOC at the charge so far taken out of the last stretch, fraction.
-    pub last_std: f64,
+    /// Present SOC, fraction; `None` = the present stretch has no rows.
+    pub soc: Option<ScalarGaussian>,
+    /// Covariance of that with the capacity, Ah.
+    pub soc_by_capacity: f64,
     /// Minus the logarithm of the posterior density, up to a constant that is the same for every label.
     pub cost: f64,
 }
@@ -87,22 +87,19 @@ struct Prediction {
     slope: Vec<f64>,
 }
 
-/// Fits; `None` when the rows say too little, or the label has no model.
-pub fn fit(label: &Label, rows: &[Row], present_ah: Option<f64>) -> Option<Fit> {
+/// Fits; `None` when the rows say too little, or the label has no model. `present` is the number of the present stretch and
+/// the charge taken out in it so far, Ah.
+pub fn fit(label: &Label, rows: &[Row], present: Option<(u32, f64)>) -> Option<Fit> {
     let soc_span = span_ah(rows) / label.rated_ah;
     if rows.len() < LEAST_ROWS || soc_span < LEAST_SPAN {
         return None;
     }
-    let stretches: Vec<&[Row]> = rows.chunk_by(|a, b| a.stretch == b.stretch).collect();
-    let stretch = stretches.iter().enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
-    let basis = Basis { model: label.model()?, curve: label.curve()?, rows, stretch };
-    let size = BEGINNINGS + stretches.len();
+    let basis = Basis::new(label, rows)?;
+    let size = BEGINNINGS + basis.stretches();
     let prior = prior(&basis.curve, size)?;
     let mut theta = DVector::zeros(size);
     theta[LOG_CAPACITY] = libm::log(label.rated_ah);
-    for k in 0..stretches.len() {
-        theta[BEGINNINGS + k] = basis.likeliest_beginning(&theta, k);
-    }
+    basis.set_beginnings(&mut theta);
     let start = theta.clone();
     let (mut normal, mut slope, mut cost) = basis.normal(&theta, &start, &prior);
     let mut damping = 1e-3;
@@ -125,7 +122,25 @@ pub fn fit(label: &Label, rows: &[Row], present_ah: Option<f64>) -> Option<Fit> 
             damping *= 8.0;
         }
     }
-    basis.finish(&theta, normal, cost, present_ah)
+    basis.finish(&theta, normal, cost, present)
+}
+
+/// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density, with the most likely SOC at the
+/// beginning of each stretch. `None` when the label has no model, or there are no rows.
+pub(super) fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
+    let basis = Basis::new(label, rows)?;
+    let mut theta = DVector::zeros(BEGINNINGS + basis.stretches());
+    theta[LOG_CAPACITY] = libm::log(own.map_or(label.rated_ah, |own| own.capacity.mean));
+    if let Some(own) = own {
+        (0..SOC_NODES).for_each(|s| theta[s] = own.curve_v[s] - basis.curve.mean_v[s]);
+        for j in 0..RESISTANCES {
+            (0..FACTOR_NODES).for_each(|n| theta[FACTORS + j * FACTOR_NODES + n] = own.factors.ln[j][n]);
+            theta[BY_TEMPERATURE + j] = own.factors.by_temperature[j];
+        }
+    }
+    basis.set_beginnings(&mut theta);
+    let cost = (0..rows.len()).map(|at| basis.row_cost(&basis.predict(&theta, at), at).0).sum();
+    (!rows.is_empty()).then_some(cost)
 }
 
 /// Charge over which the longest stretch spans, Ah.
@@ -176,7 +191,23 @@ fn interval(nodes: &[f64], x: f64) -> (usize, f64) {
     (at, ((x - nodes[at]) / (nodes[at + 1] - nodes[at])).clamp(0.0, 1.0))
 }
 
-impl Basis<'_> {
+impl<'a> Basis<'a> {
+    fn new(label: &Label, rows: &'a [Row]) -> Option<Self> {
+        let stretches = rows.chunk_by(|a, b| a.stretch == b.stretch);
+        let stretch = stretches.enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
+        Some(Self { model: label.model()?, curve: label.curve()?, rows, stretch })
+    }
+
+    /// Number of stretches.
+    fn stretches(&self) -> usize {
+        self.stretch.last().map_or(0, |last| last + 1)
+    }
+
+    /// Sets the SOC at which each stretch most likely began.
+    fn set_beginnings(&self, theta: &mut DVector<f64>) {
+        (0..self.stretches()).for_each(|k| theta[BEGINNINGS + k] = self.likeliest_beginning(theta, k));
+    }
+
     fn predict(&self, theta: &DVector<f64>, at: usize) -> Prediction {
         let row = &self.rows[at];
         let beginning = BEGINNINGS + self.stretch[at];
@@ -187,11 +218,8 @@ impl Basis<'_> {
         let position = self.model.grid_position(soc, temperature_c);
         let (node, along) = interval(&SOC, soc);
         let own_v = theta[node] + along * (theta[node + 1] - theta[node]);
-        let own_slope_v = if (0.0..1.0).contains(&soc) {
-            (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node])
-        } else {
-            0.0
-        };
+        let own_slope_v =
+            if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
         let slope_v = self.model.ocv_slope_v(&position, capacity_ah) + own_slope_v;
         let (per_ah_v, _) = self.model.aged_ocv_changes_v(&position, capacity_ah);
         let mut index = vec![node, node + 1, LOG_CAPACITY, beginning];
@@ -202,7 +230,8 @@ impl Basis<'_> {
         let mut drop_v = 0.0;
         let ohm: [f64; RESISTANCES] = std::array::from_fn(|j| {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln = theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm = match j {
                 0 => self.model.r0_ohm(&position),
                 j => self.model.branch_r_ohm(j - 1, &position),
@@ -274,7 +303,13 @@ impl Basis<'_> {
         (normal, gradient, cost)
     }
 
-    fn finish(&self, theta: &DVector<f64>, normal: DMatrix<f64>, cost: f64, present_ah: Option<f64>) -> Option<Fit> {
+    fn finish(
+        &self,
+        theta: &DVector<f64>,
+        normal: DMatrix<f64>,
+        cost: f64,
+        present: Option<(u32, f64)>,
+    ) -> Option<Fit> {
         let predictions: Vec<Prediction> = (0..self.rows.len()).map(|at| self.predict(theta, at)).collect();
         let rows = self.rows.len() as f64;
         let (mut squares, mut squares_v) = (0.0, 0.0);
@@ -305,12 +340,16 @@ impl Basis<'_> {
             ln: std::array::from_fn(|j| std::array::from_fn(|n| theta[FACTORS + j * FACTOR_NODES + n])),
             by_temperature: std::array::from_fn(|j| theta[BY_TEMPERATURE + j]),
         };
-        let last = self.rows.last()?;
-        let k = BEGINNINGS + *self.stretch.last()?;
-        let moved = present_ah.unwrap_or(f64::from(last.charge_ah)) / capacity_ah;
-        let last_variance = covariance[(k, k)]
-            + moved * moved * covariance[(LOG_CAPACITY, LOG_CAPACITY)]
-            + 2.0 * moved * covariance[(k, LOG_CAPACITY)];
+        let log_capacity_variance = covariance[(LOG_CAPACITY, LOG_CAPACITY)];
+        let last = self.rows.last().zip(self.stretch.last());
+        let present = present.zip(last).filter(|((number, _), (row, _))| *number == row.stretch);
+        let soc = present.map(|((_, present_ah), (_, k))| {
+            let (k, moved) = (BEGINNINGS + k, present_ah / capacity_ah);
+            let with_capacity = covariance[(k, LOG_CAPACITY)];
+            let variance = covariance[(k, k)] + moved * moved * log_capacity_variance + 2.0 * moved * with_capacity;
+            let soc = ScalarGaussian { mean: theta[k] - moved, variance: variance.max(0.0) };
+            (soc, capacity_ah * (with_capacity + moved * log_capacity_variance))
+        });
         let array = |values: &[f64]| std::array::from_fn(|s| values[s]);
         Some(Fit {
             own: OwnModel {
@@ -322,8 +361,8 @@ impl Basis<'_> {
                 capacity,
                 residual_v: (squares_v / rows).sqrt(),
             },
-            last: (last.stretch, theta[k]),
-            last_std: last_variance.max(0.0).sqrt(),
+            soc: soc.map(|(soc, _)| soc),
+            soc_by_capacity: soc.map_or(0.0, |(_, by_capacity)| by_capacity),
             cost,
         })
     }
@@ -337,7 +376,8 @@ impl Basis<'_> {
         let mut settled_ohm = 0.0;
         for j in 0..RESISTANCES {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln = theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm =
                 if j == 0 { self.model.r0_ohm(&position) } else { self.model.branch_r_ohm(j - 1, &position) };
             let ohm = label_ohm * libm::exp(ln);

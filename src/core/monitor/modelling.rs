@@ -1,0 +1,333 @@
+//! Modelling stage: a model of the pack's own cells, learned from what the vehicle notes of them.
+//!
+//! In: the steps of all cells; the moments at which the vehicle rests or sleeps. Out: another model for the estimators with the
+//! state in which they continue, and what is known of it ([`ModelView`]). Only a pack whose cells are known by their [`Label`] has
+//! one; that of a model file is given.
+//!
+//! A model is fitted anew when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
+//! driving. Before that the model in force and the one before it are judged on the new rows, which neither has seen: the
+//! one that predicts them worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
+//! temperature or part of the charge; the capacity is then left to the half-cycles.
+
+use serde::{Deserialize, Serialize};
+
+use super::{EventKind, MonitorConfig};
+use crate::cell::own_model::fit::{self, Fit};
+use crate::cell::own_model::rows_cost;
+use crate::cell::{
+    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, Label, Notebook, NotebookConfig, OwnModel,
+};
+use crate::quantity::{InvalidState, Mode, Timestamp};
+
+/// Fewest new rows for which a fit is made: they cover 12 % of the charge, or half an hour.
+const LEAST_NEW_ROWS: usize = 6;
+
+/// Shortest rest in which a model changes, s: longer than a red light.
+const REST_S: f64 = 120.0;
+
+/// Difference of the costs (minus the logarithms of the posterior densities) from which on another chemistry is the cell's: e^-12
+/// is beyond what errors of a row's voltage explain.
+const CHEMISTRY_MARGIN: f64 = 12.0;
+
+/// Residual from which on no chemistry explains the cells, V.
+const UNFIT_V: f64 = 0.030;
+
+/// How well the model of the cells is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ModelState {
+    /// That of the label: nothing is learned yet.
+    Prior,
+    /// Learned in part.
+    Learning,
+    /// Learned: what is left unknown is small.
+    Learned,
+    /// The voltages contradict it: the chemistry on the label is wrong, or the cells are of none that is known.
+    Unfit,
+    /// From a model file: nothing is learned.
+    Given,
+}
+
+/// What is known of the cells' model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ModelView<'a> {
+    /// How well it is known.
+    pub state: ModelState,
+    /// On the label; `None` = a model file.
+    pub label: Option<Label>,
+    /// What was learned; `None` = nothing yet.
+    pub own: Option<&'a OwnModel>,
+    /// Rows from which it is learned.
+    pub notebook: Option<&'a Notebook>,
+    /// The chemistry that explains the voltages better than that on the label.
+    pub chemistry: Option<Chemistry>,
+    /// Fits so far, and models taken back because the one before was better.
+    pub fits: u32,
+    /// Models taken back.
+    pub taken_back: u32,
+}
+
+/// The modelling stage.
+#[derive(Debug)]
+pub(super) struct Modelling {
+    label: Option<Label>,
+    /// Of the configuration: the label's.
+    model: CellModel,
+    estimator: EstimatorConfig,
+    notebook: NotebookConfig,
+    pub(super) state: ModellingState,
+    /// Since when the pack rests.
+    rest_since: Option<Timestamp>,
+    /// A row is complete.
+    has_row: bool,
+    /// Of the latest fit.
+    outcome: FitOutcome,
+}
+
+/// What a fit has changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum FitOutcome {
+    Nothing,
+    /// The new model is in force.
+    Adopted,
+    /// The model before is in force again.
+    Returned,
+}
+
+/// The stage's part of the snapshot.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ModellingState {
+    /// What was on the label when it was learned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    label: Option<Label>,
+    #[serde(default)]
+    notebook: Notebook,
+    /// The model in force.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    own: Option<OwnModel>,
+    /// The one before; `None` = that of the label.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    before: Option<OwnModel>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    chemistry: Option<Chemistry>,
+    #[serde(default)]
+    is_unfit: bool,
+    #[serde(default)]
+    fits: u32,
+    #[serde(default)]
+    taken_back: u32,
+}
+
+/// Another model for the estimators.
+#[derive(Debug)]
+pub(super) struct Adoption {
+    pub(super) model: CellModel,
+    pub(super) config: EstimatorConfig,
+    /// State of the mean cell.
+    pub(super) mean: AdoptedState,
+    /// Whether the cells' capacities begin with that of the fit.
+    pub(super) with_capacity: bool,
+}
+
+impl ModellingState {
+    /// Checks the numbers of a stored state.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        self.notebook.check()?;
+        self.own.iter().chain(&self.before).try_for_each(OwnModel::check)
+    }
+
+    fn fits_label(&self, label: &Label) -> bool {
+        self.label.is_none_or(|stored| stored == *label)
+    }
+}
+
+impl Modelling {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        let rated_ah = config.label.map_or(config.model.rated_capacity_ah, |label| label.rated_ah);
+        Self {
+            label: config.label,
+            model: config.model.clone(),
+            estimator: config.estimator,
+            notebook: NotebookConfig::new(u32::from(config.sample.cells), rated_ah),
+            state: ModellingState::default(),
+            rest_since: None,
+            has_row: false,
+            outcome: FitOutcome::Nothing,
+        }
+    }
+
+    /// Other settings for the same cells.
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
+        (self.model, self.estimator) = (config.model.clone(), config.estimator);
+    }
+
+    /// Forgets what was learned: another pack is connected.
+    pub(super) fn forget(&mut self) {
+        self.state = ModellingState::default();
+        (self.rest_since, self.has_row) = (None, false);
+    }
+
+    /// Continues from a stored state. What was learned with another label is forgotten, its rows are not.
+    pub(super) fn restore(&mut self, state: ModellingState) {
+        let Some(label) = &self.label else { return };
+        self.state = if state.fits_label(label) {
+            state
+        } else {
+            ModellingState { notebook: state.notebook.all_unread(), ..ModellingState::default() }
+        };
+    }
+
+    /// The model and settings in force.
+    pub(super) fn in_force(&self) -> (CellModel, EstimatorConfig) {
+        let own = self.label.as_ref().zip(self.state.own.as_ref());
+        let learned = own.and_then(|(label, own)| {
+            let model = own.cell_model(label)?;
+            let estimator = own.estimator_config(&self.estimator, &self.model, &model);
+            Some((model, estimator))
+        });
+        learned.unwrap_or_else(|| (self.model.clone(), self.estimator))
+    }
+
+    /// Notes a cell's step.
+    #[inline]
+    pub(super) fn note(&mut self, step: &CellStep) {
+        if self.label.is_some() {
+            self.has_row |= self.state.notebook.add(&self.notebook, step);
+        }
+    }
+
+    /// Whether [`Self::close_row`] is due.
+    #[inline]
+    pub(super) fn has_row(&self) -> bool {
+        self.has_row
+    }
+
+    /// Ends a row, at the mean SOC of the cells.
+    pub(super) fn close_row(&mut self, soc: f64) {
+        self.has_row = false;
+        self.state.notebook.close_row(&self.notebook, soc);
+    }
+
+    /// Takes the pack's mode; whether the vehicle has rested long enough for another model.
+    pub(super) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
+        if self.label.is_none() || mode != Mode::Rest {
+            self.rest_since = None;
+            return false;
+        }
+        let since = *self.rest_since.get_or_insert(now);
+        now.since(since) >= REST_S && self.is_due()
+    }
+
+    /// Whether enough is new for another fit.
+    pub(super) fn is_due(&self) -> bool {
+        let ModellingState { notebook, own, is_unfit, .. } = &self.state;
+        let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && !is_unfit;
+        self.label.is_some()
+            && notebook.unread() >= LEAST_NEW_ROWS
+            && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
+    }
+
+    /// Fits a model to all rows, after those in force were judged on the new ones. `None` = none is to be adopted.
+    pub(super) fn refit(&mut self) -> Option<Adoption> {
+        let label = self.label?;
+        self.state.notebook.finish_row(&self.notebook);
+        self.take_back_if_worse(&label);
+        let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
+        let fitted = fit::fit(&label, self.state.notebook.rows(), self.state.notebook.present());
+        self.state.notebook.mark_read();
+        let fitted = fitted?;
+        self.state.fits = self.state.fits.saturating_add(1);
+        self.state.chemistry = better_chemistry(&label, &fitted, self.state.notebook.rows());
+        self.state.is_unfit = self.state.chemistry.is_some() || fitted.own.residual_v > UNFIT_V;
+        if self.state.is_unfit {
+            return None;
+        }
+        let Fit { own, soc, soc_by_capacity, .. } = fitted;
+        let filtered_a = self.state.notebook.filtered_a();
+        let mean = AdoptedState { soc, soc_by_capacity, capacity: own.capacity, log_resistance: 0.0, filtered_a };
+        self.state.label = Some(label);
+        self.state.before = self.state.own.replace(own);
+        self.outcome = FitOutcome::Adopted;
+        let (model, config) = self.in_force();
+        Some(Adoption { model, config, mean, with_capacity: !was_settled })
+    }
+
+    /// Returns to the model before when it predicts the new rows better.
+    fn take_back_if_worse(&mut self, label: &Label) {
+        self.outcome = FitOutcome::Nothing;
+        let Some(own) = &self.state.own else { return };
+        let new_rows = self.state.notebook.new_rows();
+        let cost = |own: Option<&OwnModel>| rows_cost(label, own, new_rows);
+        let (Some(present), Some(before)) = (cost(Some(own)), cost(self.state.before.as_ref())) else { return };
+        if before < present {
+            self.state.own = self.state.before.take();
+            self.state.taken_back = self.state.taken_back.saturating_add(1);
+            self.outcome = FitOutcome::Returned;
+        }
+    }
+
+    /// Whether the latest fit ended with the model before.
+    pub(super) fn has_returned(&self) -> bool {
+        self.outcome == FitOutcome::Returned
+    }
+
+    /// The state, to be stored; `None` = nothing is learned here.
+    pub(super) fn stored(&self) -> Option<ModellingState> {
+        self.label.map(|_| self.state.clone())
+    }
+
+    /// The event of the latest fit; `None` when nothing has changed. `before` is the state before it.
+    pub(super) fn event(&self, before: ModelState) -> Option<EventKind> {
+        let ModelView { state, own, chemistry, .. } = self.view();
+        let is_new = state != before || self.outcome != FitOutcome::Nothing;
+        is_new.then(|| EventKind::Model {
+            state,
+            capacity_ah: own.map(|own| own.capacity.mean),
+            capacity_std_ah: own.map(|own| own.capacity.std()),
+            residual_v: own.map(|own| own.residual_v),
+            chemistry,
+            is_taken_back: self.has_returned(),
+        })
+    }
+
+    /// What is known.
+    pub(super) fn view(&self) -> ModelView<'_> {
+        let ModellingState { notebook, own, chemistry, is_unfit, fits, taken_back, .. } = &self.state;
+        let state = match (self.label, own) {
+            (None, _) => ModelState::Given,
+            _ if *is_unfit => ModelState::Unfit,
+            (_, None) => ModelState::Prior,
+            (_, Some(own)) if own.is_settled() => ModelState::Learned,
+            _ => ModelState::Learning,
+        };
+        ModelView {
+            state,
+            label: self.label,
+            own: own.as_ref(),
+            notebook: self.label.map(|_| notebook),
+            chemistry: *chemistry,
+            fits: *fits,
+            taken_back: *taken_back,
+        }
+    }
+
+    /// What follows does not hang together with the rows so far.
+    pub(super) fn end_stretch(&mut self) {
+        self.rest_since = None;
+        if self.label.is_some() {
+            self.state.notebook.end_stretch(&self.notebook);
+        }
+    }
+}
+
+/// The chemistry that explains the rows clearly better than that of the label, if there is one.
+fn better_chemistry(label: &Label, fitted: &Fit, rows: &[crate::cell::notebook::Row]) -> Option<Chemistry> {
+    let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
+    let costs = others.filter_map(|chemistry| {
+        let other = label.with_chemistry(chemistry);
+        Some((chemistry, fit::fit(&other, rows, None)?.cost))
+    });
+    let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
+    best.filter(|(_, cost)| *cost < fitted.cost - CHEMISTRY_MARGIN).map(|(chemistry, _)| chemistry)
+}

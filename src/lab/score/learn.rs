@@ -1,0 +1,47 @@
+//! What a vehicle has learned before the scored file: measured files through the monitor, one after the other.
+
+use std::path::PathBuf;
+
+use super::case::UNKNOWN_GAP_NS;
+use super::feed::Feeder;
+use crate::error::LabError;
+use crate::filter::ScalarGaussian;
+use crate::measured::MeasuredFile;
+use crate::monitor::{ModelState, MonitorConfig, Snapshot};
+use crate::quantity::Timestamp;
+
+/// A monitor's state after its first files.
+#[derive(Debug, Clone)]
+pub struct Learned {
+    /// The state.
+    pub snapshot: Snapshot,
+    /// How well the cell's model is known.
+    pub model: ModelState,
+    /// Capacity, Ah.
+    pub capacity: ScalarGaussian,
+}
+
+/// Runs `files` through a monitor, with a gap of unknown length between them.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn learn(files: &[PathBuf], config: &MonitorConfig, sleep_gap_s: f64) -> Result<Learned, LabError> {
+    let mut feeder = Feeder::new(config.clone(), sleep_gap_s, None);
+    feeder.out.want_estimates = false;
+    let mut latest = Timestamp::ZERO;
+    for path in files {
+        for part in &MeasuredFile::read(path)?.parts {
+            let Some(&first_s) = part.time_s.first() else { continue };
+            let base = latest.plus_nanos(UNKNOWN_GAP_NS).plus_secs(-first_s);
+            feeder.unknown_gap(base.plus_secs(first_s));
+            for row in 0..part.len() {
+                let time = base.plus_secs(part.time_s[row]);
+                feeder.row(time, part.current_a[row], part.voltage_v[row], part.temperature_c[row]);
+                feeder.out.clear();
+                latest = latest.max(time);
+            }
+        }
+    }
+    feeder.unknown_gap(latest);
+    Ok(feeder.learned())
+}
