@@ -112,7 +112,10 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
     let ModelTables { grid, tables, voltage_error_v } =
-        if is_ageing { ModelTables::fitted(fit, errors) } else { ModelTables::beyond(fit, errors, &outcome.measured) };
+        match is_ageing {
+            true => ModelTables::fitted(fit, errors),
+            false => ModelTables::beyond(fit, errors, &outcome.measured, outcome.logs.is_some()),
+        };
     let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
     let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     let beyond = if is_ageing { "" } else { ", the first and the last beyond those measured" };

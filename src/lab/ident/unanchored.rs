@@ -11,6 +11,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use super::fit::{FitSettings, FittedTables, MIN_ROWS, judge, space};
+use super::grid::arrhenius;
 use super::parameters::{Layout, ParameterTables};
 use super::pass::{FreeScale, NormalEquations, accumulate, visits};
 use super::prior::Prior;
@@ -199,12 +200,17 @@ pub fn fit(
 fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, log_capacity: f64) -> Record {
     let grid = &settings.grid;
     let per_ah = libm::exp(-log_capacity);
+    let (coldest_c, warmest_c) = (grid.temperature_c[0], grid.temperature_c[grid.temperature_c.len() - 1]);
     let mut placed = record.clone();
     for row in &mut placed.rows {
         row.soc = beginning_soc + row.soc * per_ah;
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
+        // A cell warms up as it is driven: beyond the nodes its resistances follow Arrhenius' law, as between them.
+        let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
+        let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
+        row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);
     }
     placed
 }
