@@ -58,7 +58,7 @@ pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
             "cell": number, "capacity_ah": outcome.capacity_ah * cell.capacity_ratio.0,
             "capacity_std_ah": outcome.capacity_ah * cell.capacity_ratio.1,
             "resistance_ratio": cell.resistance_ratio.0, "resistance_ratio_std": cell.resistance_ratio.1,
-            "residual_v": cell.residual_v,
+            "leakage_per_h": cell.leakage_per_h.0, "residual_v": cell.residual_v,
         })
     });
     let value = serde_json::json!({

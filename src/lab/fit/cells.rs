@@ -3,7 +3,7 @@
 //! In: the distance of every cell's voltage from the mean (V) at some rows, and the fitted records of the mean cell. Out: a
 //! [`CellDeviation`] per cell. All cells have one curve and one current sensor, so that errors of the model and of the current are
 //! those of all: the distance is linear in what a cell has of its own,
-//! d = slope (dSOC + (q / C) dlnC) - drop dlnR + offset, and one least-squares solution per cell has it.
+//! d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset, and one least-squares solution per cell has it.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -14,18 +14,20 @@ use crate::ident::record::Record;
 
 /// Shortest time between two rows of distances, s: they change with the SOC.
 const PERIOD_S: f64 = 5.0;
-/// Standard deviations before the fit: ln capacity, ln resistance, the sensor's offset (V), SOC.
-const PRIOR: [f64; 4] = [0.15, 0.4, 0.003, 0.15];
+/// Standard deviations before the fit: ln capacity, ln resistance, the sensor's offset (V), leakage (part of the capacity per h), SOC.
+const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
+/// What a cell has of its own beside its SOC.
+const OWN: usize = 4;
 /// Deviation of a distance that repeats itself, V, over this time, s.
 const DISTANCE_V: f64 = 0.002;
 const REPEATS_S: f64 = 50.0;
 /// Fewest cells that can be compared.
 const LEAST_CELLS: usize = 4;
 /// A cell does not belong when it is this many robust deviations from the median, as many of its own, and beyond the least
-/// difference that matters: of the capacity, of the resistance, of the residual (V).
+/// difference that matters: of the capacity, of the resistance, of the residual (V), of the leakage (part of the capacity per h).
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
-const FLOOR: [f64; 3] = [0.03, 0.15, 0.004];
+const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
 /// A normal distribution's standard deviation relative to its median distance.
 const OF_MEDIAN: f64 = 1.4826;
 
@@ -55,6 +57,8 @@ pub struct CellDeviation {
     pub capacity_ratio: (f64, f64),
     /// Resistance relative to the mean cell, and its standard deviation.
     pub resistance_ratio: (f64, f64),
+    /// Leakage beyond the mean cell's, part of the capacity per h, and its standard deviation.
+    pub leakage_per_h: (f64, f64),
     /// SOC above that of the mean cell at the beginning of the first stretch, fraction.
     pub soc_offset: f64,
     /// What these do not explain, root mean square, V.
@@ -67,6 +71,7 @@ struct Factors {
     weight: f64,
     slope_v: f64,
     charge_v: f64,
+    hours_v: f64,
     drop_v: f64,
 }
 
@@ -113,25 +118,31 @@ fn factors(
         let low = row.ocv.iter().map(|(node, _)| node).min().unwrap_or(0);
         let s = (low % columns).min(columns - 2);
         let first = low - low % columns;
-        let slope_v =
-            (tables.ocv_v[first + s + 1] - tables.ocv_v[first + s]) / (soc[s + 1] - soc[s]);
+        let slope_v = (tables.ocv_v[first + s + 1] - tables.ocv_v[first + s]) / (soc[s + 1] - soc[s]);
         let drop_v = row.ocv.at(&tables.ocv_v) - (row.voltage_v - residual_v[at]);
         let weight = (time_s - last_s).min(REPEATS_S) / REPEATS_S;
         last_s = time_s;
-        Factors { stretch, weight, slope_v, charge_v: slope_v * (first_soc - row.soc), drop_v }
+        Factors {
+            stretch,
+            weight,
+            slope_v,
+            charge_v: slope_v * (first_soc - row.soc),
+            hours_v: slope_v * row.time_s / 3600.0,
+            drop_v,
+        }
     };
     distances.time_s.iter().map(of_time).collect()
 }
 
 fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]) -> CellDeviation {
-    let size = 3 + stretches;
-    let prior = |i: usize| PRIOR[i.min(3)];
+    let size = OWN + stretches;
+    let prior = |i: usize| PRIOR[i.min(OWN)];
     let mut normal = DMatrix::from_fn(size, size, |a, b| if a == b { 1.0 / (prior(a) * prior(a)) } else { 0.0 });
     let mut right = DVector::zeros(size);
     let rows = || factors.iter().zip(all_v).filter(|(_, v)| v[cell].is_finite());
     for (at, v) in rows() {
         let weight = at.weight / (DISTANCE_V * DISTANCE_V);
-        let terms = [(0, at.charge_v), (1, -at.drop_v), (2, 1.0), (3 + at.stretch, at.slope_v)];
+        let terms = at.terms();
         for (i, a) in terms {
             right[i] += weight * a * f64::from(v[cell]);
             for (j, b) in terms {
@@ -144,7 +155,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
     let x = &inverse * right;
     let (mut squares, mut weights) = (0.0, 0.0);
     for (at, v) in rows() {
-        let model_v = at.charge_v * x[0] - at.drop_v * x[1] + x[2] + at.slope_v * x[3 + at.stretch];
+        let model_v: f64 = at.terms().iter().map(|&(i, term)| term * x[i]).sum();
         squares += at.weight * (f64::from(v[cell]) - model_v).powi(2);
         weights += at.weight;
     }
@@ -158,14 +169,35 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
         let ratio = libm::exp(x[i]);
         (ratio, ratio * scale * inverse[(i, i)].sqrt())
     };
-    CellDeviation { capacity_ratio: ratio(0), resistance_ratio: ratio(1), soc_offset: x[3], residual_v }
+    let leakage_per_h = (x[3], scale * inverse[(3, 3)].sqrt());
+    CellDeviation {
+        capacity_ratio: ratio(0),
+        resistance_ratio: ratio(1),
+        leakage_per_h,
+        soc_offset: x[OWN],
+        residual_v,
+    }
+}
+
+impl Factors {
+    /// Indices of the unknowns on which the distance depends, with what they are multiplied with.
+    fn terms(&self) -> [(usize, f64); OWN + 1] {
+        let soc = (OWN + self.stretch, self.slope_v);
+        [(0, self.charge_v), (1, -self.drop_v), (2, 1.0), (3, -self.hours_v), soc]
+    }
 }
 
 impl CellDeviation {
     /// Of a cell without readings.
     fn unknown() -> Self {
         let unknown = (f64::NAN, f64::INFINITY);
-        Self { capacity_ratio: unknown, resistance_ratio: unknown, soc_offset: f64::NAN, residual_v: f64::NAN }
+        Self {
+            capacity_ratio: unknown,
+            resistance_ratio: unknown,
+            leakage_per_h: unknown,
+            soc_offset: f64::NAN,
+            residual_v: f64::NAN,
+        }
     }
 }
 
@@ -176,6 +208,7 @@ pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
     }
     let capacity = Spread::of(cells.iter().map(|cell| cell.capacity_ratio.0));
     let resistance = Spread::of(cells.iter().map(|cell| cell.resistance_ratio.0));
+    let leakage = Spread::of(cells.iter().map(|cell| cell.leakage_per_h.0));
     let residual = Spread::of(cells.iter().map(|cell| cell.residual_v));
     let (percent, of) = (|x: f64| 100.0 * x, OWN_DEVIATIONS);
     let mut notes = vec![format!(
@@ -192,6 +225,13 @@ pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
         }
         if resistance.is_far(r, FLOOR[1]) && (r - resistance.median).abs() > of * r_std {
             what.push(format!("resistance {:+.0} +/- {:.0} %", percent(r / resistance.median - 1.0), percent(r_std)));
+        }
+        let (l, l_std) = cell.leakage_per_h;
+        if leakage.is_far(l, FLOOR[3]) && (l - leakage.median).abs() > of * l_std {
+            what.push(format!(
+                "loses {:.2} % of its charge per hour more than the others",
+                percent(l - leakage.median)
+            ));
         }
         if residual.is_far(cell.residual_v, FLOOR[2]) {
             what.push(format!("voltage unlike the others', {:.1} mV", 1e3 * cell.residual_v));
@@ -216,7 +256,10 @@ impl Spread {
     fn of(values: impl Iterator<Item = f64>) -> Self {
         let known: Vec<f64> = values.filter(|value| value.is_finite()).collect();
         let centre = median(known.clone());
-        Self { median: centre, deviation: OF_MEDIAN * median(known.iter().map(|value| (value - centre).abs()).collect()) }
+        Self {
+            median: centre,
+            deviation: OF_MEDIAN * median(known.iter().map(|value| (value - centre).abs()).collect()),
+        }
     }
 
     fn is_far(&self, value: f64, floor: f64) -> bool {
@@ -236,7 +279,7 @@ mod tests {
 
     fn cell(capacity: f64, resistance: f64, residual_v: f64) -> CellDeviation {
         let (capacity_ratio, resistance_ratio) = ((capacity, 0.005), (resistance, 0.01));
-        CellDeviation { capacity_ratio, resistance_ratio, soc_offset: 0.0, residual_v }
+        CellDeviation { capacity_ratio, resistance_ratio, leakage_per_h: (0.0, 1e-5), soc_offset: 0.0, residual_v }
     }
 
     #[test]
@@ -262,7 +305,9 @@ mod tests {
         let mut cells = vec![cell(1.0, 1.0, 0.0); 8];
         cells[0] = cell(0.98, 1.1, 0.003);
         assert_eq!(notes(&cells).len(), 1);
-        assert!(fit(3, &[], &[], &ParameterTables { ocv_v: vec![], r0_ohm: vec![], r_ohm: vec![], tau_s: vec![] }, &[])
-            .is_empty());
+        assert!(
+            fit(3, &[], &[], &ParameterTables { ocv_v: vec![], r0_ohm: vec![], r_ohm: vec![], tau_s: vec![] }, &[])
+                .is_empty()
+        );
     }
 }

@@ -33,7 +33,8 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     let mut notes = Vec::new();
     let is_unshown = after.std_ah / after.mean_ah > UNSHOWN * before.std_ah / before.mean_ah;
     if is_unshown {
-        notes.push("the logs do not show the capacity: it stays near that of the model the fit started from".to_owned());
+        notes
+            .push("the logs do not show the capacity: it stays near that of the model the fit started from".to_owned());
     }
     let span = records.iter().map(span).fold(0.0, f64::max);
     if span < LEAST_SPAN {
@@ -50,7 +51,9 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
         moved[usize::from(soc < 0.0)] += soc.abs();
     }
     if rest_s < LEAST_REST_S {
-        notes.push("no rest in the logs: the curve and slow resistances are told apart by their usual sizes alone".to_owned());
+        notes.push(
+            "no rest in the logs: the curve and slow resistances are told apart by their usual sizes alone".to_owned(),
+        );
     }
     for (moved, direction) in moved.iter().zip(["discharge", "charge"]) {
         if *moved < LEAST_MOVED {
@@ -60,7 +63,8 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     if parts.iter().all(|part| part.temperature_c.iter().all(|t| t.is_nan())) {
         notes.push("no temperature in the logs: that of the surroundings is assumed".to_owned());
     }
-    let interval_s = median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
+    let interval_s =
+        median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
     if interval_s > SLOW_S {
         notes.push(format!(
             "readings every {interval_s:.0} s: the series resistance is not told from that of the fastest branch"

@@ -13,10 +13,12 @@ use std::rc::Rc;
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::prepare::CREDIBLE_BEYOND_V;
 use super::cells::{self, CellDistances};
 use super::evidence::{self, Capacity};
-use super::{ELECTRODES_C, FileResidual, FitOutcome, FitProgress, LogsOutcome, MeasuredRange, chemistry, judged, verdict};
+use super::prepare::CREDIBLE_BEYOND_V;
+use super::{
+    ELECTRODES_C, FileResidual, FitOutcome, FitProgress, LogsOutcome, MeasuredRange, chemistry, judged, verdict,
+};
 use crate::cell::{AgedOcv, CellModel};
 use crate::error::LabError;
 use crate::ident::fit::{FitSettings, FittedTables, judge};
@@ -48,6 +50,8 @@ const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive: its voltage is that of a SOC that differs by this, per unit of Arrhenius' factor above
 /// 1 (rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C).
 const COLD_SOC: f64 = 0.03;
+/// Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
+const LEAST_OFFSET_H: f64 = 1000.0;
 /// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
 /// this time, h.
 const HELD_V: f64 = 0.012;
@@ -184,7 +188,8 @@ fn fit_stretches(
     let cold_v = unsettled_v(&fit.fitted);
     let voltage_error_v = (0..errors_v.len()).map(|n| errors_v[n].hypot(fit.ocv_std_v[n]).hypot(cold_v[n])).collect();
     let distances: Vec<&CellDistances> = stretches.iter().map(|stretch| &stretch.cells).collect();
-    let cells = cells::fit(usize::from(request.monitor.sample.cells), &distances, &fit.records, &fit.fitted.tables, &grid.soc);
+    let cells =
+        cells::fit(usize::from(request.monitor.sample.cells), &distances, &fit.records, &fit.fitted.tables, &grid.soc);
     let mut notes = notes(model, stretches, &fit, &known);
     notes.extend(cells::notes(&cells));
     let found = electrodes::identify(|soc| fit.fitted.ocv_v(soc, ELECTRODES_C));
@@ -279,9 +284,9 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     let judged: Vec<bool> = (0..part.len()).map(is_judged).collect();
     let record = Record::prepare(&part, &judged, grid, &limits);
     let scale = record::share(&record) * record::weight(&record) / model.rated_capacity_ah;
-    let full_ah = full_ah(&part, model);
+    let full = full(&part, model);
     let beginning = if begins_full(&part, model) { (1.0, FULL_STD) } else { stretch.beginning };
-    UnanchoredRecord { record, scale, beginning, full_ah }
+    UnanchoredRecord { record, scale, beginning, full }
 }
 
 /// Whether a stretch begins with a full cell: its open-circuit voltage is that of one even with the least resistance.
@@ -301,13 +306,13 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Charge taken out where a charge at the highest voltage has faded: the cell is full. The last such row counts.
-fn full_ah(part: &MeasuredPart, model: &CellModel) -> Option<f64> {
+/// Charge taken out, Ah, and time, h, where a charge at the highest voltage has faded: the cell is full. The last such row counts.
+fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
         part.voltage_v[k] >= model.voltage_max_v - HELD_V && (-most_a..-0.01 * most_a).contains(&part.current_a[k])
     };
-    (0..part.len()).rev().find(is_full).map(|k| -part.soc[k])
+    (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
 /// A node per group of temperatures; stretches without a temperature have that of the surroundings.
@@ -358,6 +363,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
+        offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / LEAST_OFFSET_H),
     }
 }
 

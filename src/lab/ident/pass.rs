@@ -21,11 +21,11 @@ const SIGMA_V: f64 = 0.010;
 /// Seconds over which model error repeats itself: one independent residual in this time.
 const REPEATS_S: f64 = 50.0;
 /// The same where the SOC is not known. Chosen on Panasonic 18650PF and on a simulated LG M50, as the two below.
-const FREE_REPEATS_S: f64 = 100.0;
+const FREE_REPEATS_S: f64 = 250.0;
 /// Part of the voltage drop by which a circuit is wrong.
 const DROP_ERROR: f64 = 0.05;
 /// Power of Arrhenius' factor by which a circuit's error grows with cold.
-const COLD_POWER: f64 = 1.0;
+const COLD_POWER: f64 = 0.7;
 /// Such errors from which on the cost grows linearly.
 const HUBER_ERRORS: f64 = 3.0;
 
@@ -165,13 +165,18 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - charge / capacity, both parameters.
+/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - (charge - offset x time) / capacity, with
+/// beginning, capacity and the current sensor's offset as parameters.
 #[derive(Debug, Clone, Copy)]
 pub struct FreeScale<'a> {
     /// Breakpoints.
     pub grid: &'a Grid,
     /// Index of ln(capacity).
     pub log_capacity: usize,
+    /// Index of the current sensor's offset, A.
+    pub offset: usize,
+    /// Capacity, Ah.
+    pub capacity_ah: f64,
     /// Index of the record's SOC at its first row.
     pub beginning: usize,
     /// Its value.
@@ -190,8 +195,9 @@ impl FreeScale<'_> {
         let upper_v = if place.along_t == 0.0 { 0.0 } else { place.along_t * rise_v(place.t + 1) };
         let slope_v =
             ((1.0 - place.along_t) * rise_v(place.t) + upper_v) / (self.grid.soc[place.s + 1] - self.grid.soc[place.s]);
-        index.extend([self.log_capacity, self.beginning]);
-        j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v]);
+        index.extend([self.log_capacity, self.offset, self.beginning]);
+        let by_offset = row.time_s / 3600.0 / self.capacity_ah;
+        j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v * by_offset, -slope_v]);
     }
 }
 

@@ -3,8 +3,8 @@
 //! In: records with the charge taken out since their first row, a prior of the open-circuit curve (V, V^2) and of the
 //! resistances, the label's capacity (Ah). Out: tables, capacity, and the SOC at which each record began.
 //!
-//! SOC = s_k - q / C: the beginning s_k of record k and ln C are parameters beside those of the tables, and all are found
-//! together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
+//! SOC = s_k - (q - o t) / C: the beginning s_k of record k, ln C and the offset o of the current sensor (A) are parameters beside
+//! those of the tables, and all are found together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
 //! as in the prior. Every pass places the rows in the tables again.
 
 use nalgebra::{DMatrix, DVector};
@@ -23,6 +23,9 @@ const BEGINNING: (f64, f64) = (-0.05, 1.05);
 /// Largest factor between the capacity and the label's.
 const CAPACITY_FACTOR: f64 = 1.6;
 
+/// Largest offset of the current, in its standard deviations.
+const MOST_OFFSETS: f64 = 4.0;
+
 /// Standard deviation of the SOC at the end of a full charge.
 const FULL_STD: f64 = 0.01;
 
@@ -39,6 +42,8 @@ pub struct Known {
     pub capacity_ah: f64,
     /// Its standard deviation, fraction.
     pub capacity_std: f64,
+    /// Standard deviation of the current sensor's offset, A.
+    pub offset_std_a: f64,
 }
 
 /// A record with the charge of its rows.
@@ -50,8 +55,8 @@ pub struct UnanchoredRecord {
     pub scale: f64,
     /// SOC at the first row, as far as it is known, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, at the moment at which a charge ended with a full cell: SOC 1.
-    pub full_ah: Option<f64>,
+    /// Charge taken out, Ah, and time since the first row, h, at the moment at which a charge ended with a full cell: SOC 1.
+    pub full: Option<(f64, f64)>,
 }
 
 /// A fit of tables, capacity and beginnings.
@@ -115,7 +120,7 @@ pub fn fit(
     let grid = &settings.grid;
     let layout = Layout::new(grid, known.tables.r_ohm.len());
     let log_capacity = layout.len();
-    let beginning = |k: usize| log_capacity + 1 + k;
+    let (offset, beginning) = (log_capacity + 1, |k: usize| log_capacity + 2 + k);
     let ln = |values: &[f64]| values.iter().map(|&x| libm::log(x)).collect::<Vec<f64>>();
     let mut start = known.tables.ocv_v.clone();
     start.extend(ln(&known.tables.r0_ohm));
@@ -130,18 +135,29 @@ pub fn fit(
     start.push(log_label);
     space.low.push(log_label - libm::log(CAPACITY_FACTOR));
     space.high.push(log_label + libm::log(CAPACITY_FACTOR));
+    start.push(0.0);
+    space.low.push(-MOST_OFFSETS * known.offset_std_a);
+    space.high.push(MOST_OFFSETS * known.offset_std_a);
     for record in records {
         start.push(record.beginning.0);
         space.low.push(BEGINNING.0);
         space.high.push(BEGINNING.1);
     }
-    let placed =
-        |theta: &[f64], k: usize| place(&records[k].record, settings, theta[beginning(k)], theta[log_capacity]);
+    let placed = |theta: &[f64], k: usize| {
+        place(&records[k].record, settings, theta[beginning(k)], [theta[log_capacity], theta[offset]])
+    };
     let evaluate = |theta: &[f64]| {
         let tables = ParameterTables::new(&layout, theta);
         let of_record = |k: usize| {
             let mut normal = NormalEquations::new(theta.len());
-            let free = FreeScale { grid, log_capacity, beginning: beginning(k), beginning_soc: theta[beginning(k)] };
+            let free = FreeScale {
+                grid,
+                log_capacity,
+                offset,
+                capacity_ah: libm::exp(theta[log_capacity]),
+                beginning: beginning(k),
+                beginning_soc: theta[beginning(k)],
+            };
             accumulate(&placed(theta, k), records[k].scale, &layout, &tables, Some(&free), &mut normal);
             normal
         };
@@ -157,14 +173,17 @@ pub fn fit(
             normal.add(&[at], &[1.0 / std], residual, 1.0);
         };
         near(log_capacity, log_label, known.capacity_std);
+        near(offset, 0.0, known.offset_std_a);
         for (k, record) in records.iter().enumerate() {
             near(beginning(k), record.beginning.0, record.beginning.1);
         }
-        for (k, full_ah) in records.iter().enumerate().filter_map(|(k, record)| Some((k, record.full_ah?))) {
-            let taken = full_ah * libm::exp(-theta[log_capacity]);
+        for (k, (full_ah, full_h)) in records.iter().enumerate().filter_map(|(k, record)| Some((k, record.full?))) {
+            let per_ah = libm::exp(-theta[log_capacity]);
+            let taken = (full_ah - theta[offset] * full_h) * per_ah;
             let residual = (theta[beginning(k)] - taken - 1.0) / FULL_STD;
             normal.cost += 0.5 * residual * residual;
-            normal.add(&[log_capacity, beginning(k)], &[taken / FULL_STD, 1.0 / FULL_STD], residual, 1.0);
+            let j = [taken / FULL_STD, full_h * per_ah / FULL_STD, 1.0 / FULL_STD];
+            normal.add(&[log_capacity, offset, beginning(k)], &j, residual, 1.0);
         }
         normal
     };
@@ -196,14 +215,14 @@ pub fn fit(
     })
 }
 
-/// The record with SOC = beginning - charge / capacity, placed in the tables.
-fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, log_capacity: f64) -> Record {
+/// The record with its SOC, placed in the tables.
+fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capacity, offset_a]: [f64; 2]) -> Record {
     let grid = &settings.grid;
     let per_ah = libm::exp(-log_capacity);
     let (coldest_c, warmest_c) = (grid.temperature_c[0], grid.temperature_c[grid.temperature_c.len() - 1]);
     let mut placed = record.clone();
     for row in &mut placed.rows {
-        row.soc = beginning_soc + row.soc * per_ah;
+        row.soc = beginning_soc + (row.soc + offset_a * row.time_s / 3600.0) * per_ah;
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));

@@ -137,7 +137,9 @@ impl CellEstimator {
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
             // On a flat curve a voltage just beyond its end would be of any SOC.
-            model.soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v).clamp(FIRST_SOC.0, FIRST_SOC.1)
+            model
+                .soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
+                .clamp(FIRST_SOC.0, FIRST_SOC.1)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = self.first_branch_variance(model, config, step, soc.mean);
