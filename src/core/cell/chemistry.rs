@@ -134,7 +134,7 @@ pub const RESISTANCES: usize = 4;
 pub const TAU_S: [f64; RESISTANCES - 1] = [RESISTANCE[1].tau_s, RESISTANCE[2].tau_s, RESISTANCE[3].tau_s];
 
 /// SOC nodes of [`ResistanceFactors`].
-pub const FACTOR_SOC: [f64; 5] = [0.0, 0.1, 0.3, 0.7, 1.0];
+pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0];
 
 /// Resistances of a cell relative to those of its label.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

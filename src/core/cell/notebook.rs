@@ -15,13 +15,16 @@ use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
 /// Most rows: with 56 bytes each below 7 kB.
-pub const MAX_ROWS: usize = 120;
+pub const MAX_ROWS: usize = 160;
 /// Most stretches: each has an SOC of its own to be found.
 const MAX_STRETCHES: usize = 16;
 /// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const ROW_K: f64 = 4.0;
+/// Below this SOC, where curves are steep and resistances rise, a row is shorter by a factor.
+const LOW_SOC: f64 = 0.15;
+const LOW_SOC_PART: f64 = 0.25;
 /// Shortest row at the end of a stretch, s.
 const LEAST_ROW_S: f64 = 20.0;
 /// Shortest time between two readings of the mean cell, s.
@@ -222,6 +225,8 @@ impl Notebook {
         if unmeasured_s > HOLE_S * cells {
             self.end_stretch(config);
         }
+        let last = self.rows.last().filter(|row| row.stretch == self.number);
+        let last_soc = last.map(|row| (f64::from(row.soc), f64::from(row.charge_ah)));
         let Some(stretch) = &mut self.present else {
             self.number = self.number.wrapping_add(1);
             // Under load the branches are taken as settled: the load before is not known.
@@ -257,7 +262,9 @@ impl Notebook {
         row.current_a += dt_s * current_a;
         row.temperature_c += dt_s * temperature_c;
         row.filtered_a.iter_mut().zip(filtered_a).for_each(|(sum, filtered_a)| *sum += dt_s * filtered_a);
-        (charge_ah - first_ah).abs() >= ROW_SOC * config.rated_ah
+        let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
+        let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
+        (charge_ah - first_ah).abs() >= part * ROW_SOC * config.rated_ah
             || row.seconds >= ROW_S
             || (temperature_c - first_c).abs() >= ROW_K
     }
@@ -372,7 +379,8 @@ impl Row {
         let current_a = f64::from(self.current_a);
         let direction = if current_a > rest_a { 1 } else { -i32::from(current_a < -rest_a) };
         let step = |value: f32, width: f64| (f64::from(value) / width).floor().clamp(-100.0, 100.0) as i32;
-        (step(self.soc, CLASS_SOC), step(self.temperature_c, CLASS_K), direction)
+        let soc_width = if f64::from(self.soc) < LOW_SOC { LOW_SOC_PART * CLASS_SOC } else { CLASS_SOC };
+        (step(self.soc, soc_width), step(self.temperature_c, CLASS_K), direction)
     }
 }
 

@@ -116,7 +116,7 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows by a model, `None` = that of the label ([`fit::Fit::cost`] without the prior); `None` when there are no rows.
+/// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density; `None` when there are no rows.
 pub fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(label, own, rows)
 }

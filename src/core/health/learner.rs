@@ -111,6 +111,9 @@ pub struct Learner {
     /// Offset of the current sensor.
     #[serde(default)]
     offset: CurrentOffset,
+    /// Half-cycles leave the capacity as it is.
+    #[serde(skip)]
+    is_held: bool,
 }
 
 impl Learner {
@@ -200,6 +203,11 @@ impl Learner {
             );
             self.start = Some(end);
         }
+    }
+
+    /// Whether half-cycles leave the capacity as it is: the model of the cells is not known well enough.
+    pub fn hold(&mut self, is_held: bool) {
+        self.is_held = is_held;
     }
 
     /// Runs the capacity filter of one cell over its completed half-cycle.
@@ -292,7 +300,7 @@ impl Learner {
         let after = estimator.capacity();
         let is_in_doubt = self.in_doubt.contains(&cell);
         self.in_doubt.retain(|&other| other != cell);
-        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt);
+        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !self.is_held);
         let measurement = evidence.map(|z| {
             // With the curve of the capacity that comes out: z = C + s (C_curve - C).
             let weight = 1.0 - after.variance / self.prior[cell].variance;

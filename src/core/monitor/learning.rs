@@ -122,7 +122,15 @@ impl Learning {
     }
 
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.
-    pub(super) fn complete_mode(&mut self, change: ModeChange, bank: &mut EstimatorBank, to: &mut Publisher<'_>) {
+    /// `teaches_capacity`: the model is good enough for that.
+    pub(super) fn complete_mode(
+        &mut self,
+        change: ModeChange,
+        bank: &mut EstimatorBank,
+        teaches_capacity: bool,
+        to: &mut Publisher<'_>,
+    ) {
+        self.state.learner.hold(!teaches_capacity);
         to.event(EventKind::Mode { from: change.from, to: change.to });
         // At a loss of the current nothing new is learned: the evidence waits.
         if change.to != Mode::Unknown {

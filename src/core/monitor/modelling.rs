@@ -12,6 +12,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{EventKind, MonitorConfig};
+use crate::cell::notebook::Row;
 use crate::cell::own_model::fit::{self, Fit};
 use crate::cell::own_model::rows_cost;
 use crate::cell::{
@@ -219,6 +220,11 @@ impl Modelling {
         now.since(since) >= REST_S && self.is_due()
     }
 
+    /// Whether half-cycles teach the capacity: while the model is the label's, its errors would be taken for lost capacity.
+    pub(super) fn teaches_capacity(&self) -> bool {
+        self.label.is_none() || self.state.own.is_some()
+    }
+
     /// Whether enough is new for another fit.
     pub(super) fn is_due(&self) -> bool {
         let ModellingState { notebook, own, is_unfit, .. } = &self.state;
@@ -238,7 +244,7 @@ impl Modelling {
         self.state.notebook.mark_read();
         let fitted = fitted?;
         self.state.fits = self.state.fits.saturating_add(1);
-        self.state.chemistry = better_chemistry(&label, &fitted, self.state.notebook.rows());
+        self.state.chemistry = better_chemistry(&label, fitted.own.capacity.mean, self.state.notebook.rows());
         self.state.is_unfit = self.state.chemistry.is_some() || fitted.own.residual_v > UNFIT_V;
         if self.state.is_unfit {
             return None;
@@ -322,12 +328,11 @@ impl Modelling {
 }
 
 /// The chemistry that explains the rows clearly better than that of the label, if there is one.
-fn better_chemistry(label: &Label, fitted: &Fit, rows: &[crate::cell::notebook::Row]) -> Option<Chemistry> {
+fn better_chemistry(label: &Label, capacity_ah: f64, rows: &[Row]) -> Option<Chemistry> {
+    let cost = |label: &Label| fit::label_cost(label, rows, capacity_ah);
+    let own = cost(label)?;
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
-    let costs = others.filter_map(|chemistry| {
-        let other = label.with_chemistry(chemistry);
-        Some((chemistry, fit::fit(&other, rows, None)?.cost))
-    });
+    let costs = others.filter_map(|chemistry| Some((chemistry, cost(&label.with_chemistry(chemistry))?)));
     let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
-    best.filter(|(_, cost)| *cost < fitted.cost - CHEMISTRY_MARGIN).map(|(chemistry, _)| chemistry)
+    best.filter(|(_, cost)| *cost < own - CHEMISTRY_MARGIN).map(|(chemistry, _)| chemistry)
 }

@@ -214,8 +214,9 @@ impl Stages {
     }
 
     fn complete_mode(&mut self, now: Timestamp, change: ModeChange, out: &mut Outputs) {
-        let Self { estimation, learning, alarming, sender, .. } = self;
-        learning.complete_mode(change, &mut estimation.bank, &mut Publisher { now, alarming, sender, out });
+        let Self { estimation, modelling, learning, alarming, sender, .. } = self;
+        let mut publisher = Publisher { now, alarming, sender, out };
+        learning.complete_mode(change, &mut estimation.bank, modelling.teaches_capacity(), &mut publisher);
     }
 
     /// Fits the model of the cells to what was noted of them, and continues with it.

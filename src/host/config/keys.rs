@@ -131,7 +131,7 @@ section! {
         /// Chemistry of a cell without a model file: estimates begin with what all such cells have in common, and their intervals are as wide as these cells differ. LMO is that of early electric cars, blended with a layered oxide; "nmc-graphite" when the nickel content is not known. Without it: `cell_model` is needed.
         chemistry: Option<Chemistry>, "", Any, Optional;
         /// Whether the model of a cell without a model file is learned on board from drives, charges and rests.
-        learn_model: bool, "", Any, Default("false");
+        learn_model: bool, "", Any, Default("true");
         /// Lowest voltage of a cell without a model file: empty. Without it: usual of the chemistry (NMC, NCA and LFP 2.5 V, else 3.0 V).
         voltage_min_v: Option<f64>, "V", Above(0.0, 100.0), Optional;
         /// Highest voltage of a cell without a model file: full. Without it: usual of the chemistry (LFP 3.65 V, else 4.2 V).

@@ -80,7 +80,7 @@ impl CellEstimator {
         step: &CellStep,
     ) -> Result<Option<Update>, FilterError> {
         let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
-        if self.filter.is_none() {
+        if self.filter.is_none() || (self.memory.is_soc_unknown && step.current_a.is_some()) {
             self.start(model, config, step);
         } else if let Some(filter) = &mut self.filter {
             let capacity_ah = each!(&*filter, x => x.mean[CAPACITY]);
@@ -159,6 +159,7 @@ impl CellEstimator {
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+        self.memory.is_soc_unknown = false;
     }
 
     /// Continues with another `model` from a state that was found with it: what was estimated with the old one is left.
@@ -245,7 +246,7 @@ impl CellEstimator {
     /// Handles a gap of unknown length: the SOC becomes unknown, the branches may have relaxed.
     pub fn handle_unknown_gap(&mut self) {
         self.memory.end_downtime();
-        (self.memory.rest_s, self.memory.is_unseen) = (0.0, true);
+        (self.memory.rest_s, self.memory.is_unseen, self.memory.is_soc_unknown) = (0.0, true, true);
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);

@@ -88,6 +88,9 @@ pub(super) struct Memory {
     /// No voltage has been used since the last sleep or unknown gap.
     #[serde(default)]
     pub(super) is_unseen: bool,
+    /// After a gap of unknown length the SOC says nothing: the filter restarts from the next voltage.
+    #[serde(default)]
+    pub(super) is_soc_unknown: bool,
     /// Consecutive readings beyond the gate.
     pub(super) rejected: u32,
     /// Duration of that run, s.
@@ -117,6 +120,7 @@ impl Memory {
             noted_s: 0.0,
             used_prior: 0.0,
             is_unseen: false,
+            is_soc_unknown: false,
             rejected: 0,
             rejected_s: 0.0,
             rejected_after_gap: false,

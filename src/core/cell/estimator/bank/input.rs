@@ -24,7 +24,10 @@ impl CellSlot {
     /// Whether a step that measured the current all the time can be an ordinary one.
     #[inline]
     pub(super) fn is_ordinary(&self) -> bool {
-        self.has_filter && self.memory.rejected == 0 && self.memory.downtime_std_if_any().is_none()
+        self.has_filter
+            && self.memory.rejected == 0
+            && !self.memory.is_soc_unknown
+            && self.memory.downtime_std_if_any().is_none()
     }
 }
 

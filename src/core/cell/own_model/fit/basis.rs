@@ -1,0 +1,186 @@
+//! The voltage of a notebook's rows by the parameters of a fit, and their derivatives.
+//!
+//! In: parameters ([`Layout`](super) of indices below), rows. Out: V. A row's voltage is linear in the curve and in all resistances.
+
+use nalgebra::{DMatrix, DVector};
+
+use crate::cell::chemistry::curve::CurvePrior;
+use crate::cell::chemistry::{FACTOR_SOC, Label, RESISTANCES, SOC};
+use crate::cell::model::{CellModel, arrhenius};
+use crate::cell::notebook::Row;
+use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
+
+/// First indices of the parameters: the curve's deviations from the label's, V, at the SOC breakpoints; ln of the resistances'
+/// factors over SOC; their deviation from the law of temperature; ln of the capacity, Ah; the SOC at which each stretch began.
+pub(super) const FACTORS: usize = SOC_NODES;
+pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
+pub(super) const LOG_CAPACITY: usize = BY_TEMPERATURE + RESISTANCES;
+pub(super) const BEGINNINGS: usize = LOG_CAPACITY + 1;
+/// Parameters of SOC and capacity among those of a row.
+pub(super) const SOC_AND_CAPACITY: usize = 4;
+
+/// Limits of the parameters: SOC at a beginning, ln of a factor, deviation from the law of temperature.
+pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
+const MOST_LOG_FACTOR: f64 = 2.5;
+const MOST_BY_TEMPERATURE: f64 = 1.5;
+
+/// Error with which the first beginnings are found, V and fraction of the drop.
+const FIRST_V: f64 = 0.02;
+const FIRST_DROP: f64 = 0.1;
+
+/// The label as the fit uses it.
+pub(super) struct Basis<'a> {
+    pub(super) model: CellModel,
+    pub(super) curve: CurvePrior,
+    pub(super) rows: &'a [Row],
+    /// Stretch of each row, counted from 0.
+    pub(super) stretch: Vec<usize>,
+}
+
+/// The voltage of a row by parameters, and its derivatives.
+pub(super) struct Prediction {
+    pub(super) voltage_v: f64,
+    /// Voltage drop in the cell, V.
+    pub(super) drop_v: f64,
+    pub(super) soc: f64,
+    /// Slope of the open-circuit voltage, V per unit of SOC.
+    pub(super) slope_v: f64,
+    pub(super) ohm: [f64; RESISTANCES],
+    /// Change of ln of a resistance with each of its three parameters.
+    pub(super) by_factor: [f64; 3],
+    /// Parameters on which the voltage depends: four of SOC and capacity, then three of each resistance.
+    pub(super) index: Vec<usize>,
+    pub(super) slope: Vec<f64>,
+}
+
+/// Interval of `x` among rising `nodes` and the weight of its upper end, within 0 to 1.
+fn interval(nodes: &[f64], x: f64) -> (usize, f64) {
+    let at = nodes[1..nodes.len() - 1].iter().take_while(|&&node| x >= node).count();
+    (at, ((x - nodes[at]) / (nodes[at + 1] - nodes[at])).clamp(0.0, 1.0))
+}
+
+impl<'a> Basis<'a> {
+    pub(super) fn new(label: &Label, rows: &'a [Row]) -> Option<Self> {
+        let stretches = rows.chunk_by(|a, b| a.stretch == b.stretch);
+        let stretch = stretches.enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
+        Some(Self { model: label.model()?, curve: label.curve()?, rows, stretch })
+    }
+
+    /// Number of parameters.
+    pub(super) fn size(&self) -> usize {
+        BEGINNINGS + self.stretch.last().map_or(0, |last| last + 1)
+    }
+
+    /// The parameters of a model, `None` = that of the label, with the SOC at which each stretch most likely began.
+    pub(super) fn parameters(&self, label: &Label, own: Option<&OwnModel>) -> DVector<f64> {
+        let mut theta = DVector::zeros(self.size());
+        theta[LOG_CAPACITY] = libm::log(own.map_or(label.rated_ah, |own| own.capacity.mean));
+        if let Some(own) = own {
+            (0..SOC_NODES).for_each(|s| theta[s] = own.curve_v[s] - self.curve.mean_v[s]);
+            for j in 0..RESISTANCES {
+                (0..FACTOR_NODES).for_each(|n| theta[FACTORS + j * FACTOR_NODES + n] = own.factors.ln[j][n]);
+                theta[BY_TEMPERATURE + j] = own.factors.by_temperature[j];
+            }
+        }
+        for k in BEGINNINGS..self.size() {
+            theta[k] = self.likeliest_beginning(&theta, k);
+        }
+        theta
+    }
+
+    /// Limits the parameters to what they can be.
+    pub(super) fn bound(theta: &mut DVector<f64>) {
+        for (i, value) in theta.iter_mut().enumerate().skip(FACTORS) {
+            let (low, high) = match i {
+                ..BY_TEMPERATURE => (-MOST_LOG_FACTOR, MOST_LOG_FACTOR),
+                BY_TEMPERATURE..LOG_CAPACITY => (-MOST_BY_TEMPERATURE, MOST_BY_TEMPERATURE),
+                LOG_CAPACITY => continue,
+                BEGINNINGS.. => BEGINNING,
+            };
+            *value = value.clamp(low, high);
+        }
+    }
+
+    /// Voltage of a row by parameters.
+    pub(super) fn predict(&self, theta: &DVector<f64>, at: usize) -> Prediction {
+        let row = &self.rows[at];
+        let beginning = BEGINNINGS + self.stretch[at];
+        let capacity_ah = libm::exp(theta[LOG_CAPACITY]);
+        let moved = f64::from(row.charge_ah) / capacity_ah;
+        let soc = theta[beginning] - moved;
+        let temperature_c = f64::from(row.temperature_c);
+        let position = self.model.grid_position(soc, temperature_c);
+        let (node, along) = interval(&SOC, soc);
+        let own_v = theta[node] + along * (theta[node + 1] - theta[node]);
+        let own_slope_v =
+            if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
+        let slope_v = self.model.ocv_slope_v(&position, capacity_ah) + own_slope_v;
+        let (per_ah_v, _) = self.model.aged_ocv_changes_v(&position, capacity_ah);
+        let mut index = vec![node, node + 1, LOG_CAPACITY, beginning];
+        let mut slope = vec![1.0 - along, along, slope_v * moved + per_ah_v * capacity_ah, slope_v];
+        let (low, part) = interval(&FACTOR_SOC, soc);
+        let by_temperature = libm::log(arrhenius(temperature_c));
+        let by_factor = [1.0 - part, part, by_temperature];
+        let mut drop_v = 0.0;
+        let ohm: [f64; RESISTANCES] = std::array::from_fn(|j| {
+            let first = FACTORS + j * FACTOR_NODES + low;
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let label_ohm = match j {
+                0 => self.model.r0_ohm(&position),
+                j => self.model.branch_r_ohm(j - 1, &position),
+            };
+            let ohm = label_ohm * libm::exp(ln);
+            let current_a = f64::from(if j == 0 { row.current_a } else { row.filtered_a[j - 1] });
+            let part_v = ohm * current_a;
+            drop_v += part_v;
+            index.extend([first, first + 1, BY_TEMPERATURE + j]);
+            slope.extend(by_factor.map(|factor| -factor * part_v));
+            ohm
+        });
+        let voltage_v = self.model.aged_ocv_v(&position, capacity_ah) + own_v - drop_v;
+        Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
+    }
+
+    /// The SOC at which the stretch of parameter `k` most likely began, with the other parameters as they are.
+    fn likeliest_beginning(&self, theta: &DVector<f64>, k: usize) -> f64 {
+        let mut theta = theta.clone();
+        let rows: Vec<usize> = (0..self.rows.len()).filter(|&at| BEGINNINGS + self.stretch[at] == k).collect();
+        let mut cost = |soc: f64| {
+            theta[k] = soc;
+            let row_cost = |&at: &usize| {
+                let Prediction { voltage_v, drop_v, .. } = self.predict(&theta, at);
+                let deviations =
+                    (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / FIRST_V.hypot(FIRST_DROP * drop_v);
+                // Beyond three deviations linearly.
+                if deviations <= 3.0 { 0.5 * deviations * deviations } else { 3.0 * (deviations - 1.5) }
+            };
+            rows.iter().map(row_cost).sum::<f64>()
+        };
+        let tried = (0..=44).map(|step| BEGINNING.0 + (BEGINNING.1 - BEGINNING.0) * f64::from(step) / 44.0);
+        tried.map(|soc| (soc, cost(soc))).min_by(|a, b| a.1.total_cmp(&b.1)).map_or(0.5, |found| found.0)
+    }
+
+    /// Standard deviation of ln(drop) at half charge and a temperature.
+    pub(super) fn drop_std(&self, theta: &DVector<f64>, covariance: &DMatrix<f64>, temperature_c: f64) -> f64 {
+        let position = self.model.grid_position(0.5, temperature_c);
+        let by_temperature = libm::log(arrhenius(temperature_c));
+        let (low, part) = interval(&FACTOR_SOC, 0.5);
+        let mut share = DVector::zeros(theta.len());
+        let mut settled_ohm = 0.0;
+        for j in 0..RESISTANCES {
+            let first = FACTORS + j * FACTOR_NODES + low;
+            let ln =
+                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let label_ohm =
+                if j == 0 { self.model.r0_ohm(&position) } else { self.model.branch_r_ohm(j - 1, &position) };
+            let ohm = label_ohm * libm::exp(ln);
+            settled_ohm += ohm;
+            share[first] += (1.0 - part) * ohm;
+            share[first + 1] += part * ohm;
+            share[BY_TEMPERATURE + j] += by_temperature * ohm;
+        }
+        share /= settled_ohm;
+        share.dot(&(covariance * &share)).max(0.0).sqrt()
+    }
+}

@@ -1,0 +1,127 @@
+//! Errors of a notebook's rows: their covariance, and the cost of residuals by it.
+//!
+//! In: predictions and rows. Out: whitened residuals with their derivatives, and their cost (minus the logarithm of their density).
+
+use nalgebra::{DMatrix, DVector};
+
+use super::basis::{Basis, Prediction, SOC_AND_CAPACITY};
+use crate::cell::notebook::{CurrentSteps, Row};
+
+/// Standard deviations of a row's error: of the voltage, V; of the drop, fraction; of the SOC.
+const ROW_V: f64 = 0.006;
+const ROW_DROP: f64 = 0.08;
+const ROW_SOC: f64 = 0.01;
+/// The same of the part that repeats, and the distance of SOC over which it changes.
+const REPEATED_V: f64 = 0.012;
+const REPEATED_DROP: f64 = 0.2;
+const REPEATED_SOC: f64 = 0.01;
+const ERROR_SOC: f64 = 0.12;
+/// Growth of the drop's relative error with the drop, per V.
+const DROP_GROWTH_PER_V: f64 = 3.0;
+/// Residual, in standard deviations, from which on it counts linearly (Huber).
+const HUBER: f64 = 3.0;
+/// Standard deviation of the steps' voltage, V.
+const STEP_V: f64 = 0.01;
+/// Least sum of squared steps that says something, A^2.
+const LEAST_STEPS_A2: f64 = 1e-12;
+/// Most that the steps of one row say of a resistance: its standard deviation of ln.
+const STEPS_LOG_STD: f64 = 0.2;
+
+/// Gauss-Newton's sums: normal matrix, gradient and cost.
+pub(super) struct NormalEquations {
+    pub(super) normal: DMatrix<f64>,
+    pub(super) gradient: DVector<f64>,
+    pub(super) cost: f64,
+}
+
+impl NormalEquations {
+    /// Adds a residual with its derivatives at `index` and its weight.
+    fn add(&mut self, index: &[usize], slope: &[f64], residual: f64, weight: f64) {
+        for (&i, a) in index.iter().zip(slope) {
+            self.gradient[i] += weight * a * residual;
+            for (&j, b) in index.iter().zip(slope) {
+                self.normal[(i, j)] += weight * a * b;
+            }
+        }
+    }
+
+    /// Adds all rows at the parameters `theta`; `None` when their errors have no covariance: something is no number.
+    pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>) -> Option<()> {
+        let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
+        let (count, size) = (predictions.len(), theta.len());
+        let lower = covariance(&predictions).cholesky()?.unpack();
+        // Residuals and derivatives side by side, whitened together.
+        let mut all = DMatrix::zeros(count, size + 1);
+        for (at, prediction) in predictions.iter().enumerate() {
+            all[(at, size)] = prediction.voltage_v - f64::from(basis.rows[at].voltage_v);
+            for (&i, slope) in prediction.index.iter().zip(&prediction.slope) {
+                all[(at, i)] += slope;
+            }
+        }
+        if !lower.solve_lower_triangular_mut(&mut all) {
+            return None;
+        }
+        let mut slope = vec![0.0; size];
+        for at in 0..count {
+            let residual = all[(at, size)];
+            let deviations = residual.abs();
+            let is_usual = deviations <= HUBER;
+            self.cost += libm::log(lower[(at, at)] / ROW_V);
+            self.cost += if is_usual { 0.5 * deviations * deviations } else { HUBER * (deviations - 0.5 * HUBER) };
+            let weight = if is_usual { 1.0 } else { HUBER / deviations };
+            slope.iter_mut().enumerate().for_each(|(i, slope)| *slope = all[(at, i)]);
+            for (i, &of_i) in slope.iter().enumerate() {
+                self.gradient[i] += weight * of_i * residual;
+                let column = self.normal.column_mut(i);
+                column.into_iter().zip(&slope).for_each(|(sum, of_j)| *sum += weight * of_i * of_j);
+            }
+        }
+        for (row, prediction) in basis.rows.iter().zip(&predictions) {
+            self.add_steps(row, prediction);
+        }
+        Some(())
+    }
+
+    /// Adds what the steps of the current within a row say of the series resistance and the fastest branch.
+    ///
+    /// The least squares v = - R0 i - R1 x, of which the row has the sums, in two rows (Cholesky factor of the sums of i and x).
+    fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
+        let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
+        let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
+        if ii <= LEAST_STEPS_A2 {
+            return;
+        }
+        let of_i = [ii.sqrt(), ix / ii.sqrt()];
+        let of_x = (xx - of_i[1] * of_i[1]).max(0.0).sqrt();
+        let v_i = iv / of_i[0];
+        let v_x = if of_x > 0.0 { (xv - of_i[1] * v_i) / of_x } else { 0.0 };
+        let weight = (1.0 / (STEP_V * STEP_V)).min(1.0 / (STEPS_LOG_STD * STEPS_LOG_STD * v_i * v_i));
+        let Prediction { ohm: [series_ohm, fast_ohm, ..], by_factor, index, .. } = prediction;
+        let residuals_v = [v_i + of_i[0] * series_ohm + of_i[1] * fast_ohm, v_x + of_x * fast_ohm];
+        let slope = |per_series: f64, per_fast: f64| {
+            let of = |per: f64| by_factor.map(|factor| per * factor);
+            [of(per_series * series_ohm), of(per_fast * fast_ohm)].concat()
+        };
+        // The parameters of the series resistance and of the fastest branch.
+        let index = &index[SOC_AND_CAPACITY..SOC_AND_CAPACITY + 2 * by_factor.len()];
+        self.add(index, &slope(of_i[0], of_i[1]), residuals_v[0], weight);
+        self.add(index, &slope(0.0, of_x), residuals_v[1], weight);
+        self.cost += 0.5 * weight * (residuals_v[0] * residuals_v[0] + residuals_v[1] * residuals_v[1]);
+    }
+}
+
+/// Covariance of the rows' errors, V^2.
+fn covariance(predictions: &[Prediction]) -> DMatrix<f64> {
+    let drop_v: Vec<f64> =
+        predictions.iter().map(|it| it.drop_v * (1.0 + DROP_GROWTH_PER_V * it.drop_v.abs())).collect();
+    DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
+        let (x, y) = (&predictions[a], &predictions[b]);
+        let distance = (x.soc - y.soc) / ERROR_SOC;
+        let near = libm::exp(-0.5 * distance * distance);
+        let of = |v: f64, soc: f64, drop: f64| {
+            v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]
+        };
+        let own = if a == b { of(ROW_V, ROW_SOC, ROW_DROP) } else { 0.0 };
+        own + near * of(REPEATED_V, REPEATED_SOC, REPEATED_DROP)
+    })
+}
