@@ -10,6 +10,8 @@ use crate::ident::MeasuredPart;
 
 /// Difference of the logarithms of the posterior densities from which on another chemistry is the cell's: as in the service.
 const MARGIN: f64 = 12.0;
+/// Fewest rows that are compared.
+const LEAST_ROWS: usize = 12;
 /// Temperature where a log has none, degrees C.
 const AMBIENT_C: f64 = 25.0;
 
@@ -55,14 +57,18 @@ fn rows<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f6
     notebook.rows().to_vec()
 }
 
-/// What the logs say about the chemistry; `None` = nothing against that of the label.
-pub(super) fn note<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Option<String> {
+/// What the logs say about the chemistry, of a capacity (Ah) that a fit has found; `None` = nothing against that of the label.
+pub(super) fn note<'a>(
+    label: &Label,
+    capacity_ah: f64,
+    stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>,
+) -> Option<String> {
     let rows = rows(label, stretches);
     let cost = |chemistry: Chemistry| {
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
-        Some((chemistry, fit::fit(&of, &rows, None)?.cost))
+        Some((chemistry, fit::label_cost(&of, &rows, capacity_ah)?))
     };
-    let Some((_, own)) = cost(label.chemistry) else {
+    let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= LEAST_ROWS) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
     };
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);

@@ -12,7 +12,7 @@ const REST_H: f64 = 50.0;
 /// Least time at rest, s, and least charge moved in one direction, as SOC.
 const LEAST_REST_S: f64 = 300.0;
 const LEAST_MOVED: f64 = 0.02;
-/// Interval of the readings from which on the series resistance is not told from the fastest branch, s.
+/// Interval of the readings from which on the series resistance cannot be separated from the fastest branch, s.
 const SLOW_S: f64 = 3.0;
 /// Steps of the voltage from which on they hide resistances of small currents, V.
 const COARSE_V: f64 = 0.01;
@@ -52,7 +52,7 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     }
     if rest_s < LEAST_REST_S {
         notes.push(
-            "no rest in the logs: the curve and slow resistances are told apart by their usual sizes alone".to_owned(),
+            "no rest in the logs: the curve and slow resistances are separated by their usual sizes alone".to_owned(),
         );
     }
     for (moved, direction) in moved.iter().zip(["discharge", "charge"]) {
@@ -67,7 +67,7 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
         median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
     if interval_s > SLOW_S {
         notes.push(format!(
-            "readings every {interval_s:.0} s: the series resistance is not told from that of the fastest branch"
+            "readings every {interval_s:.0} s: the series resistance cannot be separated from the fastest branch"
         ));
     }
     let step_v = step_v(parts);

@@ -230,7 +230,7 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     let before = Capacity { mean_ah: known.capacity_ah, std_ah: known.capacity_std * known.capacity_ah };
     notes.extend(evidence::notes(&parts, &fit.records, before, Capacity { mean_ah: capacity_ah, std_ah }));
     let beginnings = stretches.iter().map(|stretch| (&stretch.part, stretch.beginning.0));
-    notes.extend(chemistry::label_of(model).and_then(|label| chemistry::note(&label, beginnings)));
+    notes.extend(chemistry::label_of(model).and_then(|label| chemistry::note(&label, capacity_ah, beginnings)));
     notes
 }
 
