@@ -64,6 +64,9 @@
 //! | what a BPX file becomes | `lab/import/bpx/curve.rs` (open-circuit voltage), `lab/import/bpx/circuit.rs` (resistances) |
 //! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
 //! | a finding of the doctor | `core/doctor/judge` |
+//! | how well a cell model is known, what measurement is advised | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
+//! | what a cell model file holds | `host/config/cell_model.rs` (read), `host/config/cell_model/write.rs` (written) |
+//! | a picture of a cell model | `lab/model_pictures.rs` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //!

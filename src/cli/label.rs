@@ -1,13 +1,17 @@
 //! A cell by what is on its label, on the command line.
 
+#[cfg(feature = "lab")]
 use std::path::Path;
 
+#[cfg(feature = "lab")]
 use super::Failure;
 use super::numbers::above_0;
-use crate::cell::Chemistry;
+use crate::cell::{Chemistry, Label};
+#[cfg(feature = "lab")]
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 
 /// The configuration used when none is given, and what it names; the cell model comes from the command line.
+#[cfg(feature = "lab")]
 pub(crate) const BUILT_IN: [(&str, &[u8]); 2] = [
     ("score.toml", include_bytes!("../../config/score.toml")),
     ("measured.dbc", include_bytes!("../../config/measured.dbc")),
@@ -31,6 +35,21 @@ pub(crate) struct LabelArgs {
     pub(crate) voltage_max: Option<f64>,
 }
 
+impl LabelArgs {
+    /// The label; `None` without a chemistry.
+    pub(crate) fn label(&self) -> Option<Label> {
+        let name = self.chemistry.as_ref()?;
+        let (chemistry, _) = Chemistry::ALL.into_iter().find(|(_, known)| known == name)?;
+        let usual = Label::usual(chemistry, self.rated?);
+        Some(Label {
+            voltage_min_v: self.voltage_min.unwrap_or(usual.voltage_min_v),
+            voltage_max_v: self.voltage_max.unwrap_or(usual.voltage_max_v),
+            ..usual
+        })
+    }
+}
+
+#[cfg(feature = "lab")]
 impl LabelArgs {
     /// The built-in configuration of one measured cell with this label; `None` without a chemistry.
     ///
@@ -61,6 +80,7 @@ pub(crate) fn one_of_chemistries() -> clap::builder::PossibleValuesParser {
 }
 
 /// The built-in configuration with the keys of a label in place of the cell model.
+#[cfg(feature = "lab")]
 fn of_label(keys: &str) -> Result<Config, ConfigFaults> {
     let read = |file: &Path| {
         let known = BUILT_IN.iter().find(|(name, _)| Path::new(name) == file);

@@ -3,6 +3,7 @@
 
 mod alarm_groups;
 mod alarms;
+mod cells;
 mod check;
 mod command;
 mod control_args;
@@ -24,8 +25,8 @@ mod gpr;
 mod history;
 #[cfg(feature = "lab")]
 mod import;
-#[cfg(feature = "lab")]
 mod label;
+mod model;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod numbers;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
@@ -94,6 +95,10 @@ enum Command {
     Check(check::Args),
     /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
     Doctor(Box<doctor::Args>),
+    /// List the cell models that are there, and the chemistries that a label may name
+    Cells(cells::Args),
+    /// Show, plot, export or compare cell models: curve, resistances, and how well they are known
+    Model(Box<model::Args>),
     /// Write the DBC of the configured frames, for their receivers
     Dbc(dbc::Args),
     /// Write manual pages and shell completions
@@ -169,6 +174,8 @@ pub fn main() -> ExitCode {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Cells(args) => cells::run(&args),
+        Command::Model(args) => model::run(&args),
         Command::Dbc(args) => dbc::run(&args),
         Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]

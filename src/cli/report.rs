@@ -9,12 +9,13 @@ use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
 
+use crate::config::cell_model::SourcedModel;
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
-use crate::monitor::Monitor;
+use crate::monitor::{Monitor, Snapshot};
 use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
 
@@ -55,7 +56,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config_text = args.config.as_deref().map(config_text).transpose();
     let reference = args.reference.as_deref().map(report::read_reference).transpose();
     let reference = reference.map_err(failure)?;
-    let (data, provenance, vehicle) = match (&args.state, &config) {
+    let (data, provenance, vehicle, snapshot) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
         (None, None) => return Err(Failure::new("neither --state nor -c with logs, one must be given")),
@@ -67,6 +68,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let context = PageContext {
         title: args.title(&vehicle),
         config: config.as_ref(),
+        model: cell_model(snapshot.as_ref(), config.as_ref())?,
         config_text: config_text?,
         reference: reference.unwrap_or_default(),
         provenance,
@@ -103,10 +105,24 @@ impl Args {
     }
 }
 
+/// The cells' model at the end: learned, else that of the configuration.
+fn cell_model(snapshot: Option<&Snapshot>, config: Option<&Config>) -> Result<Option<SourcedModel>, Failure> {
+    let label = config.and_then(|config| config.monitor.label);
+    let view = snapshot.map(|snapshot| snapshot.model(label)).transpose().map_err(failure)?.flatten();
+    let configured = || {
+        let config = config?;
+        Some(SourcedModel { model: config.monitor.model.clone(), source: config.model_source.clone() })
+    };
+    Ok(view.as_ref().and_then(config::of_view).or_else(configured))
+}
+
+/// What a report is made of: data, provenance, vehicle and the last state.
+type Parts = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
+
 /// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
-fn of_store(folder: &Path) -> Result<(Data, Provenance, VehicleIdentity), Failure> {
+fn of_store(folder: &Path) -> Result<Parts, Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let vehicle = reader.vehicle().map_err(Failure::new)?;
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
@@ -122,10 +138,10 @@ fn of_store(folder: &Path) -> Result<(Data, Provenance, VehicleIdentity), Failur
         ),
     };
     let provenance = vec![("History".to_owned(), folder.display().to_string()), ("Hash chain".to_owned(), chain)];
-    Ok((data, provenance, vehicle))
+    Ok((data, provenance, vehicle, reader.snapshot()))
 }
 
-fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance, VehicleIdentity), Failure> {
+fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
     let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
     let watched = Rc::clone(&data);
@@ -137,14 +153,15 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance, VehicleI
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
-    let settings = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
+    let settings =
+        ReplaySettings { snapshot: true, ..ReplaySettings::plain(args.input.sleep_gap, config.interface_names()) };
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
-    let (summary, _) = result.map_err(failure)?;
+    let (summary, snapshot) = result.map_err(failure)?;
     // The replay has ended and with it the closure that shared the data.
     let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));
-    Ok((data, provenance(args, &summary), config.vehicle.clone()))
+    Ok((data, provenance(args, &summary), config.vehicle.clone(), snapshot))
 }
 
 fn provenance(args: &Args, summary: &ReplaySummary) -> Provenance {

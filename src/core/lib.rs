@@ -29,6 +29,8 @@
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |
+//! | bands of a cell model, which measurement helps most | `cell/model_bands.rs` |
+//! | how far two cell models are apart | `cell/model_comparison.rs` |
 //! | how a model of another cell is found | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
 //! | a finding of the doctor | `doctor/judge/` |

@@ -15,6 +15,7 @@ pub mod gpr;
 pub mod ident;
 pub mod import;
 pub mod measured;
+pub mod model_pictures;
 pub mod report;
 pub mod rul;
 pub mod score;

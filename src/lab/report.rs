@@ -9,6 +9,7 @@ mod data;
 mod forecast;
 mod html;
 mod limits;
+mod model;
 mod pictures;
 mod reference;
 mod series;

@@ -42,6 +42,7 @@ mod layering;
 mod life_decodes;
 mod log_grammar;
 mod measured_life;
+mod model_cli;
 mod monitor_alarms;
 mod monitor_damaged;
 mod monitor_properties;

@@ -7,6 +7,7 @@ use crate::cli::alarm_groups::{AlarmGroup, grouped};
 use crate::cli::alarms::with_unit;
 use crate::cli::output;
 use crate::io::stamp;
+use crate::monitor::ModelState;
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{CellStatus, LossStatus, PackStatus, StatusDocument};
 
@@ -77,6 +78,10 @@ fn pack(text: &mut String, document: &StatusDocument) {
     if pack.current_offset_a.is_some() {
         let offset = with_std(pack.current_offset_a, pack.current_offset_std_a, 3, " A");
         let _ = writeln!(text, "offset     current sensor {offset} (reading less true current)");
+    }
+    if let Some(state) = pack.model_state.filter(|state| *state != ModelState::Given) {
+        let better = pack.model_fits_better.map_or_else(String::new, |it| format!(": {} fits better", it.name()));
+        let _ = writeln!(text, "model      {}{better}", word(state));
     }
     let _ = writeln!(text, "losses     {}", losses(&pack.losses));
     let _ = writeln!(text, "life       {}", remaining(pack));

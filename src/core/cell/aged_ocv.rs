@@ -11,6 +11,21 @@
 
 use super::electrodes::{Electrodes, LostMaterial};
 
+/// What says how the curve ages.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum AgeingLaw {
+    /// A shift; 0 = the curve shrinks evenly.
+    Shift(f64),
+    /// The electrodes of the new cell.
+    Electrodes(Electrodes),
+}
+
+impl Default for AgeingLaw {
+    fn default() -> Self {
+        Self::Shift(0.0)
+    }
+}
+
 /// Active material lost of either electrode per part of capacity lost. Between no loss of material (a calendar life) and
 /// loss in proportion; graphite cells with layered oxides that cycle at moderate temperature lose mostly lithium
 /// (Birkl et al. 2017; Dubarry et al. 2012).
@@ -45,6 +60,9 @@ pub struct AgedOcv {
     /// electrodes.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
+    law: AgeingLaw,
+    /// Modes added by [`Self::add_spread`]; empty = none.
+    spread_v: [Vec<f64>; MIXES],
 }
 
 /// Number of mixes of losses that may be other than assumed: more material of the negative, of the positive electrode.
@@ -114,7 +132,7 @@ impl AgedOcv {
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;
         }
-        let mut table = Self::default();
+        let mut table = Self { law: AgeingLaw::Electrodes(*electrodes), ..Self::default() };
         for (part, mut row) in aged.into_iter().rev() {
             table.lithium.push(row.iter_mut().filter_map(Vec::pop).collect());
             let [offset_v, mixes_v @ ..] = row;
@@ -131,7 +149,7 @@ impl AgedOcv {
     /// By a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new) and the middle one of the new cell's `rows`, V, by
     /// temperature. 1 = the top keeps its ampere-hours, 0 = the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
-        let mut table = Self::default();
+        let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let ocv_v = |at: f64| interpolate(soc, &rows[rows.len() / 2], at);
         for part in LOST_CAPACITIES {
             let shifted = |shift: f64, z: f64| ocv_v(z + shift * (1.0 - part) * z * (1.0 - z));
@@ -181,6 +199,7 @@ impl AgedOcv {
     /// is there at every capacity. Where mix and mode have the same direction they add, so that neither hides the other.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
+        self.spread_v.clone_from(modes_v);
         for (table, mode_v) in self.mixes_v.iter_mut().zip(modes_v) {
             for row in table {
                 let product: f64 = row.iter().zip(mode_v).map(|(mix_v, mode_v)| mix_v * mode_v).sum();
@@ -188,6 +207,16 @@ impl AgedOcv {
                 row.iter_mut().zip(mode_v).for_each(|(mix_v, mode_v)| *mix_v = sign * *mix_v + mode_v);
             }
         }
+    }
+
+    /// What it was made from.
+    pub fn law(&self) -> AgeingLaw {
+        self.law
+    }
+
+    /// Modes of the curve's spread between cells, V per standard deviation at the SOC breakpoints; empty = none.
+    pub fn spread_v(&self) -> &[Vec<f64>; MIXES] {
+        &self.spread_v
     }
 
     /// Offset at a capacity over the interval from SOC breakpoint `s`.

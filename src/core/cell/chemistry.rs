@@ -228,13 +228,14 @@ impl Label {
             drop_sqrt_s: DROP_SQRT_S,
         };
         let curve = CurveOfCells { mean_v: curve.mean_v, modes_v, rest_v, electrodes: curve.electrodes };
-        Some(self.model_of(&curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
+        Some(self.model_of(self.rated_ah, &curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
     }
 
-    /// The model of a cell with this curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
+    /// The model of a cell with this present capacity, Ah, curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each
     /// temperature of the tables, counted in the model's error at a usual load.
     pub fn model_of(
         &self,
+        capacity_ah: f64,
         curve: &CurveOfCells,
         factors: &ResistanceFactors,
         drop_std: &[f64; TEMPERATURE_NODES],
@@ -243,8 +244,8 @@ impl Label {
         let rows = vec![curve.mean_v.clone(); TEMPERATURE_C.len()];
         let mut aged_ocv = curve
             .electrodes
-            .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, self.rated_ah, &rows))
-            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, self.rated_ah, &rows));
+            .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
+            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {
             let UsualResistance { ohm_ah, shape, .. } = &RESISTANCE[j];
@@ -274,7 +275,7 @@ impl Label {
         CellModel {
             name: format!("{} {} Ah (chemistry prior)", self.chemistry.name(), self.rated_ah),
             rated_capacity_ah: self.rated_ah,
-            capacity_ah: self.rated_ah,
+            capacity_ah,
             voltage_min_v: self.voltage_min_v,
             voltage_max_v: self.voltage_max_v,
             soc: SOC.to_vec(),
@@ -291,7 +292,7 @@ impl Label {
 }
 
 /// Load at which an error of the resistances counts as one of the model, per rated capacity: C/2.
-const USUAL_LOAD_PER_H: f64 = 0.5;
+pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 /// Shift of the curve of an ageing cell whose electrodes are not in the library.
 const AGEING_SHIFT: f64 = 0.5;

@@ -8,20 +8,24 @@ pub mod aged_ocv;
 pub mod chemistry;
 pub mod circuit;
 pub mod config;
+pub mod coverage;
 pub mod electrodes;
 pub mod estimator;
 pub mod loss_modes;
 pub mod model;
+pub mod model_bands;
 pub mod model_check;
+pub mod model_comparison;
 pub mod notebook;
 pub mod own_model;
 
-pub use aged_ocv::AgedOcv;
+pub use aged_ocv::{AgedOcv, AgeingLaw};
 pub use chemistry::{Chemistry, Label};
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
 };
+pub use coverage::Coverage;
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{AdoptedState, CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use loss_modes::LossModes;
@@ -29,6 +33,8 @@ pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,
     arrhenius,
 };
+pub use model_bands::{Advice, Measurement, ModelBands, advise};
 pub use model_check::{ModelCheck, ModelEvidence};
+pub use model_comparison::{Difference, ModelComparison};
 pub use notebook::{Notebook, NotebookConfig};
 pub use own_model::OwnModel;

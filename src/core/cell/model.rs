@@ -11,7 +11,7 @@
 //! between nodes whose resistances differ the product of two interpolated values is up to twice that of either node.
 //! Effect: none where both are constant.
 
-use super::aged_ocv::{AgedOcv, MIXES, OffsetLine};
+use super::aged_ocv::{AgedOcv, AgeingLaw, MIXES, OffsetLine};
 use super::loss_modes::LossModes;
 use crate::filter::{ScalarGaussian, bisect};
 
@@ -110,6 +110,14 @@ pub struct ModelSpread {
     pub capacity: f64,
     /// Voltage drop: fraction of it over one second, in the present and in the load of the last minutes.
     pub drop_sqrt_s: f64,
+}
+
+impl ModelSpread {
+    /// Of cells of the model's own type.
+    pub fn usual(branches: usize) -> Self {
+        let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
+        Self { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
+    }
 }
 
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.
@@ -217,6 +225,26 @@ impl CellModel {
         position.temperature.between(position.temperature.along_t, rise)
             / (self.soc[position.s + 1] - self.soc[position.s])
             + self.offset(position, capacity_ah).offset_v.0[1]
+    }
+
+    /// The model of new cells of this capacity, Ah, whose curve is that of these cells when they have aged to it. How it changes
+    /// further follows from the same electrodes.
+    pub fn rebased(&self, capacity_ah: f64) -> Self {
+        let last = self.soc.len() - 2;
+        let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);
+        let row = |row: &Vec<f64>| row.iter().enumerate().map(|(s, v)| v + offset_v(s)).collect::<Vec<f64>>();
+        let rows: Vec<Vec<f64>> = self.ocv_v.values.iter().map(row).collect();
+        let of_shift = |shift| AgedOcv::of_shift(shift, &self.soc, capacity_ah, &rows);
+        let mut aged_ocv = match self.aged_ocv.law() {
+            AgeingLaw::Shift(shift) => of_shift(shift),
+            AgeingLaw::Electrodes(electrodes) => {
+                AgedOcv::of_electrodes(&electrodes, &self.soc, capacity_ah, &rows).unwrap_or_else(|| of_shift(0.0))
+            }
+        };
+        if self.spread.is_some() {
+            aged_ocv.add_spread(self.aged_ocv.spread_v());
+        }
+        Self { capacity_ah, ocv_v: Table { values: rows }, aged_ocv, ..self.clone() }
     }
 
     fn offset(&self, position: &GridPosition, capacity_ah: f64) -> OffsetLine {

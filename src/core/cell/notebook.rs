@@ -373,6 +373,11 @@ impl Notebook {
 }
 
 impl Row {
+    /// SOC as estimated then, fraction.
+    pub fn soc(&self) -> f64 {
+        f64::from(self.soc)
+    }
+
     /// Class of SOC, temperature and direction.
     fn class(&self, rated_ah: f64) -> (i32, i32, i32) {
         let rest_a = REST_PER_H * rated_ah;

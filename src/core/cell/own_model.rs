@@ -61,7 +61,7 @@ impl OwnModel {
             capacity: self.capacity.std() / self.capacity.mean,
             drop_sqrt_s: DROP_SQRT_S,
         };
-        let mut model = label.model_of(&curve, &self.factors, &self.drop_std, spread);
+        let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
         model.name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);
         Some(model)
     }

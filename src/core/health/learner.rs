@@ -256,7 +256,7 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
     }
 
-    /// Continues with another model of the cell, whose estimator has adopted it: the present half-cycle begins anew at `soc`, and
+    /// Continues with another model of the cell, whose estimator has adopted it: the present half-cycle begins again at `soc`, and
     /// the capacity at `capacity`, Ah, where that is given.
     pub fn adopt(
         &mut self,

@@ -4,7 +4,7 @@
 //! state in which they continue, and what is known of it ([`ModelView`]). Only a pack whose cells are known by their [`Label`] has
 //! one; that of a model file is given.
 //!
-//! A model is fitted anew when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
+//! A model is fitted again when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
 //! driving. Before that the model in force and the one before it are judged on the new rows, which neither has seen: the
 //! one that predicts them worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
 //! temperature or part of the charge; the capacity is then left to the half-cycles.
@@ -16,8 +16,10 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::fit::{self, Fit};
 use crate::cell::own_model::rows_cost;
 use crate::cell::{
-    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, Label, Notebook, NotebookConfig, OwnModel,
+    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, Notebook, NotebookConfig,
+    OwnModel,
 };
+use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Fewest new rows for which a fit is made: they cover 12 % of the charge, or half an hour.
@@ -26,12 +28,18 @@ const LEAST_NEW_ROWS: usize = 6;
 /// Shortest rest in which a model changes, s: longer than a red light.
 const REST_S: f64 = 120.0;
 
-/// Difference of the costs (minus the logarithms of the posterior densities) from which on another chemistry is the cell's: e^-12
-/// is beyond what errors of a row's voltage explain.
-const CHEMISTRY_MARGIN: f64 = 12.0;
+/// Difference of the costs (minus the logarithms of the probabilities) from which on another chemistry is the cell's: 50 times more
+/// likely; more where the rows deviate from either by more than they should. NCA and NMC differ by 4 to 9 on the drives of four
+/// cells, LFP from all others by hundreds.
+const CHEMISTRY_MARGIN: f64 = 4.0;
 
-/// Residual from which on no chemistry explains the cells, V.
-const UNFIT_V: f64 = 0.030;
+/// Misfit above which a fit is not used: drives that a circuit describes have 0.25 to 0.4; heavy load in the cold, a faulty sensor
+/// or another pack half-way have more.
+const MOST_MISFIT: f64 = 0.45;
+
+/// Deviation of the capacity above which a fit is not used, fraction: the label's is 0.1, and where the rows say little of the
+/// capacity they say little of the curve.
+const MOST_CAPACITY_STD: f64 = 0.05;
 
 /// How well the model of the cells is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,10 +51,23 @@ pub enum ModelState {
     Learning,
     /// Learned: what is left unknown is small.
     Learned,
-    /// The voltages contradict it: the chemistry on the label is wrong, or the cells are of none that is known.
+    /// The voltages contradict it: another chemistry explains them better.
     Unfit,
     /// From a model file: nothing is learned.
     Given,
+}
+
+impl ModelState {
+    /// Its code of the wire.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Prior => 0,
+            Self::Learning => 1,
+            Self::Learned => 2,
+            Self::Unfit => 3,
+            Self::Given => 4,
+        }
+    }
 }
 
 /// What is known of the cells' model.
@@ -113,8 +134,6 @@ pub(super) struct ModellingState {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     chemistry: Option<Chemistry>,
     #[serde(default)]
-    is_unfit: bool,
-    #[serde(default)]
     fits: u32,
     #[serde(default)]
     taken_back: u32,
@@ -136,6 +155,33 @@ impl ModellingState {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.notebook.check()?;
         self.own.iter().chain(&self.before).try_for_each(OwnModel::check)
+    }
+
+    /// What is known of cells with this label; `None` = of a model file.
+    fn view(&self, label: Option<Label>) -> ModelView<'_> {
+        let Self { notebook, own, chemistry, fits, taken_back, .. } = self;
+        let state = match (label, own) {
+            (None, _) => ModelState::Given,
+            _ if chemistry.is_some() => ModelState::Unfit,
+            (_, None) => ModelState::Prior,
+            (_, Some(own)) if own.is_settled() => ModelState::Learned,
+            _ => ModelState::Learning,
+        };
+        ModelView {
+            state,
+            label,
+            own: own.as_ref(),
+            notebook: label.map(|_| notebook),
+            chemistry: *chemistry,
+            fits: *fits,
+            taken_back: *taken_back,
+        }
+    }
+
+    /// What a stored state says; the label is that with which it was learned, else `label`. `None` without either.
+    pub(super) fn stored_view(&self, label: Option<Label>) -> Option<ModelView<'_>> {
+        let label = self.label.or(label)?;
+        Some(self.view(Some(label)))
     }
 
     fn fits_label(&self, label: &Label) -> bool {
@@ -227,8 +273,8 @@ impl Modelling {
 
     /// Whether enough is new for another fit.
     pub(super) fn is_due(&self) -> bool {
-        let ModellingState { notebook, own, is_unfit, .. } = &self.state;
-        let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && !is_unfit;
+        let ModellingState { notebook, own, chemistry, .. } = &self.state;
+        let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && chemistry.is_none();
         self.label.is_some()
             && notebook.unread() >= LEAST_NEW_ROWS
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
@@ -244,9 +290,13 @@ impl Modelling {
         self.state.notebook.mark_read();
         let fitted = fitted?;
         self.state.fits = self.state.fits.saturating_add(1);
-        self.state.chemistry = better_chemistry(&label, fitted.own.capacity.mean, self.state.notebook.rows());
-        self.state.is_unfit = self.state.chemistry.is_some() || fitted.own.residual_v > UNFIT_V;
-        if self.state.is_unfit {
+        self.state.chemistry = better_chemistry(&label, &fitted, self.state.notebook.rows());
+        if self.state.chemistry.is_some() || fitted.misfit > MOST_MISFIT {
+            return self.return_to_label();
+        }
+        // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
+        let is_flat = label.chemistry == Chemistry::LfpGraphite;
+        if is_flat || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
             return None;
         }
         let Fit { own, soc, soc_by_capacity, .. } = fitted;
@@ -257,6 +307,18 @@ impl Modelling {
         self.outcome = FitOutcome::Adopted;
         let (model, config) = self.in_force();
         Some(Adoption { model, config, mean, with_capacity: !was_settled })
+    }
+
+    /// Returns to the label's model from one that is not settled: the rows contradict it. `None` = it is in force.
+    fn return_to_label(&mut self) -> Option<Adoption> {
+        self.state.own.take_if(|own| !own.is_settled())?;
+        self.state.before = None;
+        self.state.taken_back = self.state.taken_back.saturating_add(1);
+        self.outcome = FitOutcome::Returned;
+        let InitialState { capacity_ah, capacity_std_ah, .. } = self.estimator.initial;
+        let capacity = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
+        let mean = AdoptedState { soc: None, soc_by_capacity: 0.0, capacity, log_resistance: 0.0, filtered_a: None };
+        Some(Adoption { model: self.model.clone(), config: self.estimator, mean, with_capacity: true })
     }
 
     /// Returns to the model before when it predicts the new rows better.
@@ -299,23 +361,7 @@ impl Modelling {
 
     /// What is known.
     pub(super) fn view(&self) -> ModelView<'_> {
-        let ModellingState { notebook, own, chemistry, is_unfit, fits, taken_back, .. } = &self.state;
-        let state = match (self.label, own) {
-            (None, _) => ModelState::Given,
-            _ if *is_unfit => ModelState::Unfit,
-            (_, None) => ModelState::Prior,
-            (_, Some(own)) if own.is_settled() => ModelState::Learned,
-            _ => ModelState::Learning,
-        };
-        ModelView {
-            state,
-            label: self.label,
-            own: own.as_ref(),
-            notebook: self.label.map(|_| notebook),
-            chemistry: *chemistry,
-            fits: *fits,
-            taken_back: *taken_back,
-        }
+        self.state.view(self.label)
     }
 
     /// What follows does not hang together with the rows so far.
@@ -328,11 +374,12 @@ impl Modelling {
 }
 
 /// The chemistry that explains the rows clearly better than that of the label, if there is one.
-fn better_chemistry(label: &Label, capacity_ah: f64, rows: &[Row]) -> Option<Chemistry> {
-    let cost = |label: &Label| fit::label_cost(label, rows, capacity_ah);
+fn better_chemistry(label: &Label, fitted: &Fit, rows: &[Row]) -> Option<Chemistry> {
+    let margin = CHEMISTRY_MARGIN * (fitted.misfit / MOST_MISFIT).max(1.0);
+    let cost = |label: &Label| fit::label_cost(label, rows, fitted.own.capacity.mean);
     let own = cost(label)?;
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
     let costs = others.filter_map(|chemistry| Some((chemistry, cost(&label.with_chemistry(chemistry))?)));
     let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
-    best.filter(|(_, cost)| *cost < own - CHEMISTRY_MARGIN).map(|(chemistry, _)| chemistry)
+    best.filter(|(_, cost)| *cost < own - margin).map(|(chemistry, _)| chemistry)
 }

@@ -12,13 +12,13 @@ use super::estimation::Consumed;
 use super::intake::IntakeState;
 use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
-use super::modelling::ModellingState;
+use super::modelling::{ModelView, ModellingState};
 use super::sampling::Identity;
 use super::sender::Schedule;
 use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
-use crate::cell::{CellEstimator, CellModel, CellState, ModelCheck};
+use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp};
@@ -264,6 +264,17 @@ impl Stages {
 }
 
 impl Snapshot {
+    /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
+    /// model file, or the label is not known.
+    ///
+    /// # Errors
+    /// The first number that is out of range.
+    pub fn model(&self, label: Option<Label>) -> Result<Option<ModelView<'_>>, RestoreError> {
+        let Some(stored) = &self.modelling else { return Ok(None) };
+        stored.check()?;
+        Ok(stored.stored_view(label))
+    }
+
     /// Whether the waiting samples are of its cells, each of another, and known to have come.
     fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();

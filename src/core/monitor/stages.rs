@@ -14,7 +14,7 @@ use super::sleep::{BusSleep, Silence};
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
 use crate::alarm::{AlarmInput, CommandOutcome, Observation};
 use crate::can::Frame;
-use crate::can::encode::StatusFields;
+use crate::can::encode::{HealthFields, StatusFields};
 use crate::can::poll::CarState;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
@@ -368,7 +368,10 @@ impl Stages {
             self.sender.send_status(now, &fields, out);
         }
         if is_health_due {
-            let fields = self.learning.health_fields(&self.estimation.bank);
+            let fields = HealthFields {
+                model_state: Some(self.modelling.view().state.code()),
+                ..self.learning.health_fields(&self.estimation.bank)
+            };
             self.sender.send_health(now, &fields, out);
         }
         if is_alarm_due {

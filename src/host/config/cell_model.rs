@@ -3,6 +3,16 @@
 //! A model is refused unless breakpoints rise strictly, SOC runs from 0 to 1, the open-circuit voltage rises
 //! strictly with SOC at every temperature, tables have no hole, and resistances, capacitances and capacities
 //! are positive.
+//!
+//! | file | content |
+//! | --- | --- |
+//! | `source` | where a model comes from |
+//! | `write` | a model as a file |
+//! | `library` | the files in the usual folders |
+
+pub mod library;
+mod source;
+mod write;
 
 use std::path::Path;
 
@@ -16,8 +26,12 @@ use super::setting::ValueRange::{Above, Any, Between, NotEmpty};
 use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
 use super::{ConfigFaults, ConfigFiles, ReadFile, Sources};
 use crate::cell::{
-    AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, NegativeMaterial, PositiveMaterial, Table, Thermal,
+    AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, ModelSpread, NegativeMaterial, PositiveMaterial, Table,
+    Thermal,
 };
+use crate::monitor::ModelState;
+pub use source::{KnownBy, LearnedFrom, MeasuredRange, ModelSource, SourcedModel, state_words};
+pub use write::text;
 
 const INF: f64 = f64::INFINITY;
 
@@ -95,6 +109,24 @@ section! {
     }
 }
 
+section! {
+    /// How far a cell may be from the model, in standard deviations, where it is not of a fit's own type: of a model from a label or of one that the vehicle has learned, as `packwatch model export` writes it. Without it: as cells of one type are.
+    SpreadKeys at "spread" gives ModelSpread, |keys| {
+        /// Constant error of the open-circuit curve, beside its modes.
+        curve_v: f64, "V", Between(0.0, 1.0), Required;
+        /// ln(resistance relative to the model).
+        log_resistance: f64, "", Between(0.0, 5.0), Required;
+        /// Resistance of the slowest branch beside the others.
+        slow_branch: f64, "fraction", Between(0.0, 5.0), Required;
+        /// Capacity.
+        capacity: f64, "fraction", Between(0.0, 1.0), Required;
+        /// Voltage drop: fraction of it over one second.
+        drop_sqrt_s: f64, "", Between(0.0, 100.0), Required;
+        /// Two modes of the open-circuit curve's error, one value per `tables.soc`.
+        curve_modes_v: Vec<Vec<f64>>, "V", Between(-1.0, 1.0), Required =>;
+    }
+}
+
 /// Names of the materials in a cell model.
 macro_rules! material {
     ($material:ty) => {
@@ -142,12 +174,13 @@ pub(super) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Head>(),
     SectionInfo::notes(
         "provenance",
-        "Where the numbers come from: source, method, data, residuals. For people; any keys.",
+        "Where the numbers come from. For people; any keys. `packwatch cells` shows `citation` (or `source`) and `licence`.",
     ),
     SectionInfo::one::<Measured>(),
     SectionInfo::one::<Tables>(),
     SectionInfo::many::<BranchTables>(),
     SectionInfo::one::<ElectrodesKeys>(),
+    SectionInfo::optional::<SpreadKeys>(),
     SectionInfo::one::<ThermalKeys>(),
 ];
 
@@ -156,13 +189,21 @@ pub(super) const SECTIONS: &[SectionInfo] = &[
 /// # Errors
 /// Every fault found, one line each.
 pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
+    load_sourced(path).map(|sourced| sourced.model)
+}
+
+/// As [`load`], with where the model comes from.
+///
+/// # Errors
+/// Every fault found, one line each.
+pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
     let mut faults = Faults::default();
     let model = load_with(path, &super::read_file, &mut faults);
     model.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
 }
 
-/// As [`load`], through `read`; faults are noted with those of other files.
-pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
+/// As [`load_sourced`], through `read`; faults are noted with those of other files.
+pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<SourcedModel> {
     let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
     let document = Document::parse(&sources, faults);
     let mut reader = SchemaReader::new(&document, SECTIONS, faults);
@@ -171,6 +212,7 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let tables = reader.one::<Tables>();
     let branches = reader.many::<BranchTables>();
     let electrodes = reader.optional::<ElectrodesKeys>();
+    let spread = reader.optional::<SpreadKeys>();
     let thermal = reader.optional::<ThermalKeys>();
     let written = reader.count(BranchTables::PATH);
     if let Some(head) = &head {
@@ -183,13 +225,61 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     check_tables(&tables, faults);
     check_branch_count(&tables.place, written, faults);
     check_branches(&tables, &branches, faults);
+    if let Some(spread) = &spread {
+        check_spread(spread, &tables, faults);
+    }
     let head = head?;
-    let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), faults);
-    Some(model(head, tables, aged_ocv, &branches, thermal.as_ref()))
+    let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), spread.as_ref(), faults);
+    let source = ModelSource {
+        state: ModelState::Given,
+        chemistry: head.chemistry.clone(),
+        measured: measured.map_or_else(MeasuredRange::default, |keys| keys.range()),
+        provenance: provenance(path, read),
+        learned: None,
+    };
+    let model = CellModel {
+        spread: spread.map(|keys| keys.config()),
+        ..model(head, tables, aged_ocv, &branches, thermal.as_ref())
+    };
+    Some(SourcedModel { model, source })
 }
 
-/// How the open-circuit curve ages; notes what no cell can have. Only sound tables are used.
-fn aged_ocv(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &mut Faults) -> AgedOcv {
+/// The notes for people; empty when there are none. The file has been parsed before, so that its faults are noted.
+fn provenance(path: &Path, read: ReadFile<'_>) -> toml::Table {
+    let text = read(path).ok().and_then(|bytes| String::from_utf8(bytes).ok()).unwrap_or_default();
+    let notes = text.parse::<toml::Table>().ok().and_then(|mut table| table.remove("provenance"));
+    notes.and_then(|notes| notes.try_into().ok()).unwrap_or_default()
+}
+
+impl Measured {
+    fn range(&self) -> MeasuredRange {
+        let range = |values: &Option<Vec<f64>>| values.as_ref().map(|values| ends(values));
+        MeasuredRange {
+            temperature_c: range(&self.temperature_c),
+            current_a: range(&self.current_a),
+            soc: range(&self.soc),
+        }
+    }
+}
+
+/// How the open-circuit curve ages, with the modes of its spread; notes what no cell can have. Only sound tables are used.
+fn aged_ocv(
+    head: &Head,
+    tables: &Tables,
+    electrodes: Option<&ElectrodesKeys>,
+    spread: Option<&SpreadKeys>,
+    faults: &mut Faults,
+) -> AgedOcv {
+    let mut aged_ocv = ageing(head, tables, electrodes, faults);
+    if faults.is_empty()
+        && let Some([a, b]) = spread.map(|keys| keys.curve_modes_v.as_slice())
+    {
+        aged_ocv.add_spread(&[a.clone(), b.clone()]);
+    }
+    aged_ocv
+}
+
+fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &mut Faults) -> AgedOcv {
     if !faults.is_empty() {
         return AgedOcv::default();
     }
@@ -294,6 +384,15 @@ fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Fault
     for branch in branches {
         check_shape(&branch.place, "r_ohm", &branch.r_ohm, tables, faults);
         check_shape(&branch.place, "c_farad", &branch.c_farad, tables, faults);
+    }
+}
+
+fn check_spread(spread: &SpreadKeys, tables: &Tables, faults: &mut Faults) {
+    let (modes, socs) = (&spread.curve_modes_v, tables.soc.len());
+    if modes.len() != 2 || modes.iter().any(|mode_v| mode_v.len() != socs) {
+        let counts: Vec<String> = modes.iter().map(|mode_v| mode_v.len().to_string()).collect();
+        let what = format!("rows of {} values, must be two rows of {socs}, one value per soc", counts.join(" and "));
+        spread.place.note(faults, "curve_modes_v", &what);
     }
 }
 

@@ -34,7 +34,6 @@
 use std::path::{Path, PathBuf};
 
 use crate::can::dbc::Database;
-use crate::cell::CellModel;
 use crate::monitor::MonitorConfig;
 
 mod alarm;
@@ -65,11 +64,13 @@ mod tables;
 mod threshold;
 mod vehicle;
 
+use cell_model::{ModelSource, SourcedModel};
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 pub(crate) use diagnostic::answers;
 pub(crate) use document::TablePlace;
 use document::{Document, Faults};
 pub(crate) use keys::SignalSource;
+pub use label::{of_label, of_view};
 pub use manual::manual;
 pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;
@@ -90,6 +91,8 @@ pub struct Config {
     pub interfaces: Vec<InterfaceConfig>,
     /// Settings of the core.
     pub monitor: MonitorConfig,
+    /// Where the cell model in them comes from.
+    pub model_source: ModelSource,
     /// Layout of the sent frames, for receivers; `None` = nothing is sent.
     pub output_layout: Option<Database>,
     /// How state and history are kept.
@@ -197,7 +200,8 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let sources = Sources::read(files, read, faults)?;
     let document = Document::parse(&sources, faults);
     let raw = RawTables::read(&document, faults);
-    let model = read_model(path, &document, &raw, read, faults);
+    let sourced = read_model(path, &document, &raw, read, faults);
+    let (model, model_source) = sourced.map(|SourcedModel { model, source }| (model, source)).unzip();
     cross::check(&raw, model.as_ref(), faults);
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
@@ -234,7 +238,16 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?.config();
-    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store, warnings, vehicle };
+    let config = Config {
+        path: path.to_owned(),
+        interfaces,
+        monitor,
+        model_source: model_source?,
+        output_layout,
+        store,
+        warnings,
+        vehicle,
+    };
     let description = describe::describe(files, &raw, &config, &found, outputs);
     Some((config, description))
 }
@@ -246,7 +259,7 @@ fn read_model(
     raw: &RawTables,
     read: ReadFile<'_>,
     faults: &mut Faults,
-) -> Option<CellModel> {
+) -> Option<SourcedModel> {
     match document.text("pack.cell_model") {
         Some(named) => cell_model::load_with(&beside(path, named), read, faults),
         None => label::model(raw, faults),

@@ -42,6 +42,7 @@ impl PartialConfig {
         let raw = RawTables::read(&document, again);
         let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
         let model = read_model(path, &document, &raw, &read_file, again);
+        let model = model.map(|sourced| sourced.model);
         Ok(Self { config, faults, raw, databases, model })
     }
 

@@ -238,7 +238,7 @@ fn pack(monitor: &Monitor) -> PackStatus {
     let view = monitor.pack_view();
     let soc = view.soc.as_ref();
     let edge = |sign: f64| soc.and_then(|soc| finite((soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0)));
-    let (weakest, offset) = (view.weakest.as_ref(), monitor.current_offset());
+    let (weakest, offset, model) = (view.weakest.as_ref(), monitor.current_offset(), monitor.model());
     let normalised = view.normalised_recharge_period.as_ref();
     PackStatus {
         validity: view.validity,
@@ -252,6 +252,8 @@ fn pack(monitor: &Monitor) -> PackStatus {
         current_a: view.current_a.and_then(finite),
         current_offset_a: mean(offset.as_ref()),
         current_offset_std_a: std(offset.as_ref()),
+        model_state: Some(model.state),
+        model_fits_better: model.chemistry,
         temperature_max_c: view.temperature_max_c.and_then(finite),
         weakest_cell: weakest.map(|(cell, _)| cell.0),
         capacity_ah: mean(weakest.map(|(_, capacity)| capacity)),

@@ -16,10 +16,11 @@ use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::cell::Chemistry;
 use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
-use crate::monitor::{BusStatistics, Statistics, Validity};
+use crate::monitor::{BusStatistics, ModelState, Statistics, Validity};
 use crate::quantity::{Mode, Timestamp};
 use crate::sample::ReadingCounts;
 
@@ -138,6 +139,12 @@ pub struct PackStatus {
     /// Its standard deviation.
     #[serde(default)]
     pub current_offset_std_a: Option<f64>,
+    /// How well the model of the cells is known; `None` in documents of earlier programs.
+    #[serde(default)]
+    pub model_state: Option<ModelState>,
+    /// The chemistry that explains the voltages better than that on the label.
+    #[serde(default)]
+    pub model_fits_better: Option<Chemistry>,
     /// Highest temperature, while all sensors are fresh.
     pub temperature_max_c: Option<f64>,
     /// The cell with the least capacity, once the capacity of every cell was learned.

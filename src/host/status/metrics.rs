@@ -258,6 +258,12 @@ fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
             "Standard deviation of the current sensor's offset",
             pack.current_offset_std_a,
         ),
+        (
+            "pack_model_state",
+            "",
+            "Model of the cells: 0 prior, 1 learning, 2 learned, 3 unfit, 4 given",
+            pack.model_state.map(|state| f64::from(state.code())),
+        ),
         ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),

@@ -16,6 +16,7 @@ use super::state_slots::{STATE, read_document};
 use super::verify::{self, ChainReport};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
+use crate::monitor::Snapshot;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
@@ -122,6 +123,11 @@ impl HistoryReader {
     /// When the file cannot be read to the end.
     pub fn verify(&self) -> Result<ChainReport, String> {
         verify::verify(&self.connection).map_err(|error| self.named(&error))
+    }
+
+    /// The stored snapshot; `None` = there is none, or it is damaged.
+    pub fn snapshot(&self) -> Option<Snapshot> {
+        self.state().map(|document| *document.snapshot)
     }
 
     /// The stored state, if it is good.

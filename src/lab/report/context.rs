@@ -2,6 +2,7 @@
 
 use super::reference::Reference;
 use crate::config::Config;
+use crate::config::cell_model::SourcedModel;
 
 /// Content of a page in addition to the data.
 #[derive(Debug, Default)]
@@ -12,6 +13,8 @@ pub struct PageContext<'a> {
     pub config: Option<&'a Config>,
     /// The configuration file's text, for the page's end.
     pub config_text: Option<String>,
+    /// The cells' model, as it was at the end of the data; `None` = not known.
+    pub model: Option<SourcedModel>,
     /// Measured or true values.
     pub reference: Reference,
     /// Lines of the provenance: name and value.

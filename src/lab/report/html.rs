@@ -5,7 +5,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::pictures::{self, NOT_STORED};
-use super::{forecast, summary};
+use super::{forecast, model, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 
@@ -24,7 +24,7 @@ struct Section {
     none: fn(&Data) -> &'static str,
 }
 
-const SECTIONS: [Section; 7] = [
+const SECTIONS: [Section; 8] = [
     Section {
         id: "soc",
         title: "State of charge",
@@ -74,6 +74,14 @@ const SECTIONS: [Section; 7] = [
         },
     },
     Section {
+        id: "model",
+        title: "How well do I know this battery",
+        pictures: &["model_curve", "model_resistance", "model_temperature", "model_soc_error"],
+        note: "The model with which voltages are read as a state of charge. Bands hold a cell of this kind 95 % of the time; every \
+               \u{b1} is one standard deviation. Dashed lines were not measured.",
+        none: |_| "unknown: make this report again with the configuration (-c), which names the cells",
+    },
+    Section {
         id: "estimator",
         title: "Health of the estimator",
         pictures: &["innovation", "coverage"],
@@ -104,6 +112,7 @@ pub fn page(data: &Data, context: &PageContext<'_>) -> String {
                         @match section.id {
                             "capacity" => { (forecast_note(data, &outlook)) }
                             "temperature" => { (alarms(data, &pictures)) }
+                            "model" => { (knowledge(data, context)) }
                             "estimator" => { (estimator(data)) }
                             _ => {}
                         }
@@ -294,6 +303,24 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
         }
         @if count > MAX_ROWS {
             p.soft { "the latest " (MAX_ROWS) " of " (count) "; the others are in the picture" }
+        }
+    }
+}
+
+/// The figures of the cells' model, and what would make it better.
+fn knowledge(data: &Data, context: &PageContext<'_>) -> Markup {
+    let rows = model::rows(data, context);
+    if rows.is_empty() {
+        return html! {};
+    }
+    let advice = model::advice(context);
+    html! {
+        (pairs(&rows))
+        h3 { "What would help most" }
+        @match advice.as_deref() {
+            None => { p.none { "unknown: the model states no error; packwatch fit writes a model that does" } }
+            Some([]) => { p.soft { "No single measurement would make the state of charge much more certain." } }
+            Some(advice) => { ol { @for sentence in advice { li { (sentence) } } } }
         }
     }
 }

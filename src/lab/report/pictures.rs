@@ -13,6 +13,7 @@ use crate::alarm::Rule;
 use crate::chart::{
     self, Axis, Chart, Format, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
 };
+use crate::model_pictures;
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
@@ -43,7 +44,8 @@ pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Res
 pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Picture)> {
     let outlook = forecast::outlook(data, context);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
-    [
+    let of_model = context.model.iter().flat_map(model_pictures::all);
+    let of_data = [
         named("soc", soc(data, context)),
         named("soc_recent", soc_recent(data, context)),
         named("capacity", capacity(data, context, outlook.as_ref().ok())),
@@ -57,10 +59,8 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
         named("cells_resistance", heat(data, "Resistance of every cell", "resistance, times new", series::resistance)),
         named("innovation", innovation(data)),
         named("coverage", coverage(data)),
-    ]
-    .into_iter()
-    .flatten()
-    .collect()
+    ];
+    of_data.into_iter().flatten().chain(of_model).collect()
 }
 
 /// The x axis: dates, or time since the start in a suitable unit.

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::bins::{Bin, Bins};
+use crate::cell::Coverage;
 use crate::monitor::Estimate;
 
 /// Half of a 95 % interval, standard deviations.
@@ -103,6 +104,8 @@ pub(super) struct Trace {
     /// The last half-cycles, each in its own bins.
     pub(super) recent: VecDeque<Bins<TraceBin>>,
     pub(super) cells: Vec<Consistency>,
+    /// SOC and temperatures of all estimates.
+    pub(super) seen: Coverage,
 }
 
 impl Trace {
@@ -115,6 +118,7 @@ impl Trace {
         if let Some(bins) = self.recent.back_mut() {
             bins.at(time_s).take(estimate);
         }
+        self.seen.note(estimate.soc, estimate.measured.temperature_c);
         let cell = estimate.cell.index();
         if self.cells.len() <= cell {
             self.cells.resize(cell + 1, Consistency::default());

@@ -40,7 +40,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
 ];
 
 /// Signals of the health frame, whatever its pages; the first [`HEALTH_REQUIRED`] are required.
-const HEALTH: SignalTable<HealthFields, 17> = [
+const HEALTH: SignalTable<HealthFields, 18> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
     ("Soh", |f| f.soh),
@@ -58,6 +58,7 @@ const HEALTH: SignalTable<HealthFields, 17> = [
     ("LamNeStd", |f| f.lam_ne[1]),
     ("LamPe", |f| f.lam_pe[0]),
     ("LamPeStd", |f| f.lam_pe[1]),
+    ("ModelState", |f| f.model_state.map(f64::from)),
 ];
 const HEALTH_REQUIRED: usize = 8;
 
@@ -135,6 +136,8 @@ pub struct HealthFields {
     pub lam_ne: [Option<f64>; 2],
     /// Of its positive electrode.
     pub lam_pe: [Option<f64>; 2],
+    /// How well the cells' model is known, by its code of the wire.
+    pub model_state: Option<u8>,
 }
 
 /// Contents of one alarm frame.

@@ -85,3 +85,18 @@ fn an_aged_cells_voltage_and_slope_agree_and_invert() {
         assert!((model.soc_of_aged_ocv(&temperature, 1.5, at(soc)) - soc).abs() < 1e-9, "{soc}");
     }
 }
+
+#[test]
+fn a_rebased_model_has_the_curve_of_the_aged_cell_as_its_own() {
+    let model = crate::cell::Label::usual(crate::cell::Chemistry::NcaGraphite, 3.0).model().expect("a model");
+    for capacity_ah in [2.7, 3.0, 3.1] {
+        let rebased = model.rebased(capacity_ah);
+        assert_eq!(rebased.capacity_ah, capacity_ah);
+        for soc in [0.0, 0.3, 0.62, 1.0] {
+            let [old, new] = [&model, &rebased].map(|it| it.aged_ocv_v(&it.grid_position(soc, 20.0), capacity_ah));
+            assert!((old - new).abs() < 1e-12, "{capacity_ah} Ah at {soc}: {old} and {new} V");
+        }
+        assert!(rebased.ocv_v.values.iter().all(|row| row.windows(2).all(|pair| pair[0] < pair[1])));
+    }
+    assert_eq!(model.rebased(3.0), model);
+}

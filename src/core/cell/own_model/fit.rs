@@ -24,11 +24,11 @@ use crate::cell::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C};
 use crate::cell::notebook::Row;
 use crate::filter::ScalarGaussian;
 use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, FACTORS, LOG_CAPACITY};
-use noise::NormalEquations;
+use noise::{NormalEquations, RepeatedErrors};
 
-/// Fewest rows, and least part of the capacity that they span.
+/// Fewest rows, and least part of the capacity that a stretch of them must span.
 const LEAST_ROWS: usize = 12;
-const LEAST_SPAN: f64 = 0.15;
+const LEAST_SPAN: f64 = 0.3;
 /// Least rise of the curve between breakpoints, V.
 const LEAST_RISE_V: f64 = 2e-4;
 /// Most passes of Gauss-Newton, the gain of the cost below which it has converged, and its damping.
@@ -55,6 +55,9 @@ const LEAST_CAPACITY_STD: f64 = 0.015;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
+    /// Root mean square of the rows' residuals in standard deviations: about 1 when the cells are of the label's chemistry and the
+    /// errors of a circuit model as assumed.
+    pub misfit: f64,
     /// Present SOC, fraction; `None` = the present stretch has no rows.
     pub soc: Option<ScalarGaussian>,
     /// Covariance of that with the capacity, Ah.
@@ -69,6 +72,8 @@ struct Conditional {
     normal: DMatrix<f64>,
     /// Minus the logarithm of the capacity's density, up to the prior's constant.
     cost: f64,
+    /// Root mean square of the rows' deviations from what is expected of them.
+    misfit: f64,
 }
 
 /// The fit of one label to rows.
@@ -83,7 +88,7 @@ struct Search<'a> {
 /// Fits; `None` when the rows say too little, or the label has no model. `present` is the number of the present stretch and
 /// the charge taken out in it so far, Ah.
 pub fn fit(label: &Label, rows: &[Row], present: Option<(u32, f64)>) -> Option<Fit> {
-    if rows.len() < LEAST_ROWS || span_ah(rows) / label.rated_ah < LEAST_SPAN {
+    if rows.len() < LEAST_ROWS || span_ah(rows) < LEAST_SPAN * label.rated_ah {
         return None;
     }
     let (search, start) = Search::new(label, rows)?;
@@ -104,8 +109,9 @@ pub(super) fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> 
     let basis = Basis::new(label, rows)?;
     let theta = basis.parameters(label, own);
     let size = basis.size();
-    let mut sums = NormalEquations { normal: DMatrix::zeros(size, size), gradient: DVector::zeros(size), cost: 0.0 };
-    sums.add_rows(&basis, &theta)?;
+    let mut sums =
+        NormalEquations { normal: DMatrix::zeros(size, size), gradient: DVector::zeros(size), cost: 0.0, squares: 0.0 };
+    sums.add_rows(&basis, &theta, &RepeatedErrors::USUAL)?;
     (!rows.is_empty()).then_some(sums.cost)
 }
 
@@ -132,12 +138,12 @@ impl<'a> Search<'a> {
     }
 
     /// Sums of rows and prior at `theta`, without the capacity's.
-    fn sums(&self, theta: &DVector<f64>) -> Option<NormalEquations> {
+    fn sums(&self, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<NormalEquations> {
         let off = theta - &self.expected;
         let gradient = &self.prior * &off;
         let cost = 0.5 * off.dot(&gradient);
-        let mut sums = NormalEquations { normal: self.prior.clone(), gradient, cost };
-        sums.add_rows(&self.basis, theta)?;
+        let mut sums = NormalEquations { normal: self.prior.clone(), gradient, cost, squares: 0.0 };
+        sums.add_rows(&self.basis, theta, errors)?;
         sums.gradient[LOG_CAPACITY] = 0.0;
         sums.normal.row_mut(LOG_CAPACITY).fill(0.0);
         sums.normal.column_mut(LOG_CAPACITY).fill(0.0);
@@ -147,16 +153,20 @@ impl<'a> Search<'a> {
 
     /// The most likely other parameters at a capacity, Ah, from `start` on (Levenberg-Marquardt).
     fn conditional(&self, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
+        self.conditional_with(&RepeatedErrors::USUAL, capacity_ah, start)
+    }
+
+    fn conditional_with(&self, errors: &RepeatedErrors, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         let mut theta = start.clone();
         theta[LOG_CAPACITY] = libm::log(capacity_ah);
-        let mut sums = self.sums(&theta)?;
+        let mut sums = self.sums(&theta, errors)?;
         let mut damping = FIRST_DAMPING;
         for _ in 0..MOST_PASSES {
             let mut damped = sums.normal.clone();
             (0..theta.len()).for_each(|i| damped[(i, i)] *= 1.0 + damping);
             let mut tried = &theta - damped.cholesky()?.solve(&sums.gradient);
             Basis::bound(&mut tried);
-            match self.sums(&tried).filter(|next| next.cost <= sums.cost) {
+            match self.sums(&tried, errors).filter(|next| next.cost <= sums.cost) {
                 Some(next) => {
                     let gained = sums.cost - next.cost;
                     (theta, sums, damping) = (tried, next, (damping * 0.2).max(1e-9));
@@ -169,7 +179,8 @@ impl<'a> Search<'a> {
             }
         }
         let cost = sums.cost + 0.5 * prior::log_determinant(&sums.normal)?;
-        Some(Conditional { theta, normal: sums.normal, cost })
+        let misfit = (sums.squares / self.basis.rows.len() as f64).sqrt();
+        Some(Conditional { theta, normal: sums.normal, cost, misfit })
     }
 
     /// The capacity, Ah.
@@ -203,11 +214,12 @@ impl<'a> Search<'a> {
 
     /// Model, present SOC and their deviations at the capacity that was found.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>, present: Option<(u32, f64)>) -> Option<Fit> {
-        let Conditional { theta, normal, .. } = self.conditional(capacity.mean, start)?;
+        let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
         // Change of all with one standard deviation of the capacity; its own entry is that of ln(capacity).
         let by_capacity = high?.theta - low?.theta;
+        let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
         let last = self.basis.rows.last().zip(self.basis.stretch.last());
         let present = present.zip(last).filter(|((number, _), (row, _))| *number == row.stretch);
@@ -221,6 +233,7 @@ impl<'a> Search<'a> {
         covariance += &by_capacity * by_capacity.transpose();
         Some(Fit {
             own: self.own_model(&theta, &covariance, capacity),
+            misfit,
             soc: soc.map(|(soc, _)| soc),
             soc_by_capacity: soc.map_or(0.0, |(_, by_capacity)| by_capacity),
         })

@@ -96,12 +96,6 @@ impl Estimator {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
 
-    /// Spread of the cells of one type.
-    fn usual_spread(model: &CellModel) -> ModelSpread {
-        let slow_branch = if model.branches.len() > 1 { 0.2 } else { 0.1 };
-        ModelSpread { curve_v: 0.0, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
-    }
-
     /// The parameters these keys stand for; `voltage_step_v` is the resolution of the cells' voltages.
     pub(crate) fn config(
         &self,
@@ -112,7 +106,7 @@ impl Estimator {
     ) -> EstimatorConfig {
         let rounding_v = self.rounding_v(voltage_step_v);
         let initial_ah = pack.initial_capacity_ah.unwrap_or(model.capacity_ah);
-        let spread = model.spread.unwrap_or(Self::usual_spread(model));
+        let spread = model.spread.unwrap_or(ModelSpread::usual(model.branches.len()));
         EstimatorConfig {
             points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
             discretisation: self.discretisation,

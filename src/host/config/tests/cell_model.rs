@@ -78,7 +78,7 @@ fn electrodes_say_how_the_curve_ages() {
     let good = "positive_content = [0.8531, 0.2679]\nnegative_content = [0.0335, 0.9107]";
     let model = with(good).expect("a configuration").0.monitor.model;
     // At SOC 0.5 of a cell that has lost a fifth.
-    let offset_v = |model: &CellModel| {
+    let offset_v = |model: &crate::cell::CellModel| {
         let (aged, new) = (0.8 * model.capacity_ah, model.grid_position(0.5, 25.0));
         model.aged_ocv_v(&new, aged) - model.ocv_v(&new)
     };
@@ -109,4 +109,56 @@ fn electrodes_say_how_the_curve_ages() {
 
 fn good_model() -> crate::cell::CellModel {
     good(PACK).monitor.model
+}
+
+#[test]
+fn a_written_model_is_read_as_the_same_model() {
+    use crate::cell::{AgeingLaw, Chemistry, Label};
+    use crate::config::cell_model::{self, SourcedModel};
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("cell.toml");
+    let same = |sourced: &SourcedModel| {
+        std::fs::write(&path, cell_model::text(sourced, "a test")).expect("written");
+        let found = cell_model::load_sourced(&path).expect("a model");
+        assert_eq!(found.model, sourced.model);
+        assert_eq!(
+            (&found.source.chemistry, &found.source.provenance),
+            (&sourced.source.chemistry, &sourced.source.provenance)
+        );
+        assert_eq!(found.source.measured, sourced.source.measured);
+    };
+    for (chemistry, _) in Chemistry::ALL {
+        same(&crate::config::of_label(&Label::usual(chemistry, 2.9)).expect("a model"));
+    }
+    let shipped = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/cells");
+    let entries = cell_model::library::list(&shipped).expect("a folder");
+    assert!(entries.len() >= 6, "{entries:?}");
+    let models: Vec<SourcedModel> = entries.into_iter().map(|entry| entry.model.expect("a model")).collect();
+    assert!(models.iter().any(|it| matches!(it.model.aged_ocv.law(), AgeingLaw::Electrodes(_))));
+    models.iter().for_each(same);
+}
+
+#[test]
+fn a_spread_widens_the_estimator_as_that_of_a_label_and_its_faults_are_named() {
+    let spread = |modes: &str| {
+        let keys = format!(
+            "[spread]\ncurve_v = 0.01\nlog_resistance = 0.45\nslow_branch = 0.5\ncapacity = 0.07\ndrop_sqrt_s = 4.0\n\
+             curve_modes_v = {modes}\n[provenance]"
+        );
+        read_texts(PACK, &CELL.replacen("[provenance]", &keys, 1), DBC)
+    };
+    let config = spread("[[0.03, 0.02, 0.01], [0.0, -0.01, 0.0]]").expect("a configuration").0;
+    let (estimator, model) = (&config.monitor.estimator, &config.monitor.model);
+    assert_eq!((estimator.initial.log_resistance_std, estimator.sensor.slow_branch), (0.45, 0.5));
+    assert_eq!(estimator.initial.capacity_std_ah, 0.07 * model.capacity_ah);
+    assert_eq!(model.aged_ocv_changes_v(&model.grid_position(0.0, 10.0), model.capacity_ah).1, [0.03, 0.0]);
+    let fault = |modes: &str| spread(modes).expect_err("a fault");
+    assert_eq!(
+        fault("[[0.03, 0.02, 0.01]]"),
+        ["cell.toml:13: spread.curve_modes_v: rows of 3 values, must be two rows of 3, one value per soc"]
+    );
+    assert_eq!(
+        fault("[[0.03, 0.02, 0.01], [0.0]]"),
+        ["cell.toml:13: spread.curve_modes_v: rows of 3 and 1 values, must be two rows of 3, one value per soc"]
+    );
 }

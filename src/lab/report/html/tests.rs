@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
+use crate::cell::{Chemistry, Label};
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
@@ -121,13 +122,19 @@ fn alarm(half: u16, active: bool) -> EventKind {
 
 #[test]
 fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
-    let context = PageContext { title: "pack".into(), ..PageContext::default() };
+    let model = crate::config::of_label(&Label::usual(Chemistry::Nmc811Graphite, 2.6));
+    let context = PageContext { title: "pack".into(), model, ..PageContext::default() };
     let page = page(&life(), &context);
     println!("{} bytes", page.len());
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
-    for part in
-        ["State of charge over", "forecast, 5 to 95 %", "Capacity of every cell", "Recharge period", "Innovation"]
-    {
+    for part in [
+        "State of charge over",
+        "forecast, 5 to 95 %",
+        "Capacity of every cell",
+        "Recharge period",
+        "Innovation",
+        "What would help most",
+    ] {
         assert!(page.contains(part), "no {part}");
     }
     assert!(!page.contains("class=\"none\""), "a part has no picture");

@@ -121,6 +121,7 @@ const HEALTH_VALUES: [(usize, &str, f64, f64); 17] = [
     (4, "LamNeStd", 0.0407, 4.0),
     (4, "LamPe", 0.0391, 4.0),
     (4, "LamPeStd", 0.0512, 5.0),
+    (1, "ModelState", 2.0, 2.0),
 ];
 
 fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
@@ -139,6 +140,7 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
         lli: [of(11), of(12)],
         lam_ne: [of(13), of(14)],
         lam_pe: [of(15), of(16)],
+        model_state: of(17).map(|state| state as u8),
     }
 }
 

@@ -114,10 +114,9 @@ impl<'a> Basis<'a> {
         let own_v = theta[node] + along * (theta[node + 1] - theta[node]);
         let own_slope_v =
             if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
-        let slope_v = self.model.ocv_slope_v(&position, capacity_ah) + own_slope_v;
-        let (per_ah_v, _) = self.model.aged_ocv_changes_v(&position, capacity_ah);
+        let slope_v = self.model.ocv_slope_v(&position, self.model.capacity_ah) + own_slope_v;
         let mut index = vec![node, node + 1, LOG_CAPACITY, beginning];
-        let mut slope = vec![1.0 - along, along, slope_v * moved + per_ah_v * capacity_ah, slope_v];
+        let mut slope = vec![1.0 - along, along, slope_v * moved, slope_v];
         let (low, part) = interval(&FACTOR_SOC, soc);
         let by_temperature = libm::log(arrhenius(temperature_c));
         let by_factor = [1.0 - part, part, by_temperature];
@@ -138,7 +137,7 @@ impl<'a> Basis<'a> {
             slope.extend(by_factor.map(|factor| -factor * part_v));
             ohm
         });
-        let voltage_v = self.model.aged_ocv_v(&position, capacity_ah) + own_v - drop_v;
+        let voltage_v = self.model.ocv_v(&position) + own_v - drop_v;
         Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
     }
 

@@ -11,10 +11,7 @@ use crate::cell::notebook::{CurrentSteps, Row};
 const ROW_V: f64 = 0.006;
 const ROW_DROP: f64 = 0.08;
 const ROW_SOC: f64 = 0.01;
-/// The same of the part that repeats, and the distance of SOC over which it changes.
-const REPEATED_V: f64 = 0.012;
-const REPEATED_DROP: f64 = 0.2;
-const REPEATED_SOC: f64 = 0.01;
+/// Distance of SOC over which the part that repeats changes.
 const ERROR_SOC: f64 = 0.12;
 /// Growth of the drop's relative error with the drop, per V.
 const DROP_GROWTH_PER_V: f64 = 3.0;
@@ -27,11 +24,28 @@ const LEAST_STEPS_A2: f64 = 1e-12;
 /// Most that the steps of one row say of a resistance: its standard deviation of ln.
 const STEPS_LOG_STD: f64 = 0.2;
 
+/// Standard deviations of the part of the errors that repeats: of the voltage, V; of the SOC; of the drop, fraction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct RepeatedErrors {
+    voltage_v: f64,
+    soc: f64,
+    drop: f64,
+}
+
+impl RepeatedErrors {
+    /// As circuits have them: for what the rows say of the capacity.
+    pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
+    /// A third of these, for the tables: what the rows have in common is then in the tables and not in the errors.
+    pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
+}
+
 /// Gauss-Newton's sums: normal matrix, gradient and cost.
 pub(super) struct NormalEquations {
     pub(super) normal: DMatrix<f64>,
     pub(super) gradient: DVector<f64>,
     pub(super) cost: f64,
+    /// Sum of the rows' squared deviations from what is expected of them.
+    pub(super) squares: f64,
 }
 
 impl NormalEquations {
@@ -46,10 +60,10 @@ impl NormalEquations {
     }
 
     /// Adds all rows at the parameters `theta`; `None` when their errors have no covariance: something is no number.
-    pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>) -> Option<()> {
+    pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<()> {
         let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
         let (count, size) = (predictions.len(), theta.len());
-        let lower = covariance(&predictions).cholesky()?.unpack();
+        let lower = covariance(&predictions, errors).cholesky()?.unpack();
         // Residuals and derivatives side by side, whitened together.
         let mut all = DMatrix::zeros(count, size + 1);
         for (at, prediction) in predictions.iter().enumerate() {
@@ -66,6 +80,7 @@ impl NormalEquations {
             let residual = all[(at, size)];
             let deviations = residual.abs();
             let is_usual = deviations <= HUBER;
+            self.squares += deviations * deviations;
             self.cost += libm::log(lower[(at, at)] / ROW_V);
             self.cost += if is_usual { 0.5 * deviations * deviations } else { HUBER * (deviations - 0.5 * HUBER) };
             let weight = if is_usual { 1.0 } else { HUBER / deviations };
@@ -111,7 +126,7 @@ impl NormalEquations {
 }
 
 /// Covariance of the rows' errors, V^2.
-fn covariance(predictions: &[Prediction]) -> DMatrix<f64> {
+fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f64> {
     let drop_v: Vec<f64> =
         predictions.iter().map(|it| it.drop_v * (1.0 + DROP_GROWTH_PER_V * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
@@ -122,6 +137,6 @@ fn covariance(predictions: &[Prediction]) -> DMatrix<f64> {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]
         };
         let own = if a == b { of(ROW_V, ROW_SOC, ROW_DROP) } else { 0.0 };
-        own + near * of(REPEATED_V, REPEATED_SOC, REPEATED_DROP)
+        own + near * of(errors.voltage_v, errors.soc, errors.drop)
     })
 }

@@ -33,7 +33,7 @@ pub(super) fn information(curve: &CurvePrior, size: usize) -> Option<DMatrix<f64
     let curve = (&curve.covariance + own).cholesky()?.inverse();
     prior.view_mut((0, 0), (SOC_NODES, SOC_NODES)).copy_from(&curve);
     let count = RESISTANCES * FACTOR_NODES;
-    let covariance = DMatrix::from_fn(count, count, |a, b| factor_covariance(a, b));
+    let covariance = DMatrix::from_fn(count, count, factor_covariance);
     prior.view_mut((FACTORS, FACTORS), (count, count)).copy_from(&covariance.cholesky()?.inverse());
     let mut near = |i: usize, std: f64| prior[(i, i)] = 1.0 / (std * std);
     (BY_TEMPERATURE..LOG_CAPACITY).for_each(|i| near(i, BY_TEMPERATURE_STD));

@@ -1,0 +1,130 @@
+//! `packwatch model`: a cell model as a table, a picture or a file, and two of them compared.
+
+mod compare;
+mod page;
+mod source;
+
+use std::io::Write as _;
+use std::path::PathBuf;
+
+use super::Failure;
+use super::output::{print, print_json, unless_closed};
+use crate::cell::ModelComparison;
+use crate::config::cell_model;
+use crate::io::result_file::{ResultFile, check_place};
+#[cfg(feature = "lab")]
+use crate::lab::{self, chart};
+use page::ModelPage;
+use source::SourceArgs;
+
+/// Arguments of `model`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: ModelCommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum ModelCommand {
+    /// Show curve, resistances and capacity with their standard deviations, and which measurement would help most
+    Show(ShowArgs),
+    /// Draw curve, slope and resistances with their bands
+    #[cfg(feature = "lab")]
+    Plot(PlotArgs),
+    /// Write a cell model file, which pack.cell_model and score --cell read
+    Export(ExportArgs),
+    /// Compare two cell models: curve, resistances, and what their difference means for the SOC
+    Compare(CompareArgs),
+}
+
+#[derive(Debug, clap::Args)]
+struct ShowArgs {
+    #[command(flatten)]
+    source: SourceArgs,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+#[cfg(feature = "lab")]
+#[derive(Debug, clap::Args)]
+struct PlotArgs {
+    #[command(flatten)]
+    source: SourceArgs,
+    /// Picture to write
+    #[arg(short, long, value_name = "FILE.svg|png")]
+    out: PathBuf,
+}
+
+#[derive(Debug, clap::Args)]
+struct ExportArgs {
+    #[command(flatten)]
+    source: SourceArgs,
+    /// Cell model to write; - is standard output
+    #[arg(short, long, value_name = "FILE.toml", default_value = "-")]
+    out: PathBuf,
+}
+
+#[derive(Debug, clap::Args)]
+struct CompareArgs {
+    /// The first model: as SOURCE of `model show`
+    #[arg(value_name = "A")]
+    first: PathBuf,
+    /// The second model
+    #[arg(value_name = "B")]
+    second: PathBuf,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.what {
+        ModelCommand::Show(args) => show(args),
+        #[cfg(feature = "lab")]
+        ModelCommand::Plot(args) => plot(args),
+        ModelCommand::Export(args) => export(args),
+        ModelCommand::Compare(args) => compare(args),
+    }
+}
+
+fn show(args: &ShowArgs) -> Result<(), Failure> {
+    let (name, sourced) = args.source.load()?;
+    let page = ModelPage::new(name, &sourced);
+    if args.json { unless_closed(print_json(&page)) } else { print(&page.text()) }
+}
+
+#[cfg(feature = "lab")]
+fn plot(args: &PlotArgs) -> Result<(), Failure> {
+    let (_, sourced) = args.source.load()?;
+    check_place(&args.out, args.source.files()).map_err(Failure::new)?;
+    let format = match args.out.extension().and_then(|extension| extension.to_str()) {
+        Some("svg") => chart::Format::Svg,
+        Some("png") => chart::Format::Png,
+        _ => return Err(Failure::new(format!("{}: must end in .svg or .png", args.out.display()))),
+    };
+    let pictures: Vec<_> = lab::model_pictures::all(&sourced).into_iter().map(|(_, picture)| picture).collect();
+    chart::write_stack(&args.out, &pictures, format).map_err(super::output::failure)
+}
+
+fn export(args: &ExportArgs) -> Result<(), Failure> {
+    let (name, sourced) = args.source.load()?;
+    check_place(&args.out, args.source.files()).map_err(Failure::new)?;
+    let head = format!("Written by `packwatch model export` from {name}.").replace(['\n', '\r'], " ");
+    let text = cell_model::text(&sourced, &head);
+    unless_closed(ResultFile::create(&args.out).and_then(|mut file| {
+        file.write_all(text.as_bytes())?;
+        file.finish()
+    }))
+}
+
+fn compare(args: &CompareArgs) -> Result<(), Failure> {
+    let [(first_name, first), (second_name, second)] = [source::load(&args.first)?, source::load(&args.second)?];
+    let comparison = ModelComparison::new(&first.model, &second.model);
+    let named = [(first_name.as_str(), &first), (second_name.as_str(), &second)];
+    match args.json {
+        true => unless_closed(print_json(&compare::document(&comparison, named))),
+        false => print(&compare::page(&comparison, named)),
+    }
+}

@@ -1,0 +1,146 @@
+//! Which cell model: a file, a configuration, a label, or what a vehicle has learned.
+
+use std::path::{Path, PathBuf};
+
+use crate::cell::{Chemistry, Label};
+use crate::cli::Failure;
+use crate::cli::label::LabelArgs;
+use crate::cli::numbers::above_0;
+use crate::config::cell_model::{self, SourcedModel};
+use crate::config::{self, Config, of_label, of_view};
+use crate::io::snapshot_file;
+use crate::monitor::Snapshot;
+use crate::store::HistoryReader;
+
+/// Names a cell model.
+#[derive(Debug, clap::Args)]
+pub(super) struct SourceArgs {
+    /// Cell model file, configuration, snapshot, folder of a service's state, or a label as CHEMISTRY:AH, such as nca-graphite:2.9
+    #[arg(value_name = "SOURCE", required_unless_present_any = ["config", "chemistry", "state"], conflicts_with_all = ["chemistry", "state"])]
+    source: Option<PathBuf>,
+    /// Configuration: the cell model that it names, or its label; with --state or a snapshot the label of cells of which nothing is
+    /// learned yet
+    #[arg(short, long, value_name = "FILE.toml")]
+    config: Option<PathBuf>,
+    /// Folder of state and history of a service: the model that it has learned
+    #[arg(long, value_name = "DIR", conflicts_with = "chemistry")]
+    state: Option<PathBuf>,
+    #[command(flatten)]
+    label: LabelArgs,
+}
+
+impl SourceArgs {
+    /// The model, with its name for people.
+    ///
+    /// # Errors
+    /// When it cannot be read: every fault.
+    pub(super) fn load(&self) -> Result<(String, SourcedModel), Failure> {
+        let config = self.config.as_deref().map(config::load).transpose()?;
+        match (self.state.as_ref().or(self.source.as_ref()), config, self.label.label()) {
+            (Some(source), Some(config), _) => load_with(source, Some(config)),
+            (Some(source), None, _) => load(source),
+            (None, Some(config), _) => Ok((named(&config.path), of_config(config))),
+            (None, None, Some(label)) => {
+                of_label_named(format!("{}:{}", label.chemistry.name(), label.rated_ah), &label)
+            }
+            // The command line is refused before.
+            (None, None, None) => Err(Failure::new("no cell model is named")),
+        }
+    }
+
+    /// Files that are read.
+    pub(super) fn files(&self) -> impl Iterator<Item = &PathBuf> {
+        self.config.iter().chain(&self.source)
+    }
+}
+
+/// The model of a SOURCE, with its name for people.
+///
+/// # Errors
+/// When it cannot be read: every fault.
+pub(super) fn load(path: &Path) -> Result<(String, SourcedModel), Failure> {
+    load_with(path, None)
+}
+
+/// As [`load`]; a state of which nothing is learned yet is of the cells of `config`.
+fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
+    if path.is_dir() {
+        let reader = HistoryReader::open(path).map_err(Failure::new)?;
+        let no_state = || Failure::new(format!("{}: holds no state, or a damaged one", path.display()));
+        return of_snapshot(path, &reader.snapshot().ok_or_else(no_state)?, config);
+    }
+    if path.extension().is_some_and(|extension| extension == "json") {
+        return of_snapshot(path, &snapshot_file::read(path).map_err(Failure::new)?, config);
+    }
+    if config.is_some() {
+        return Err(Failure::new(format!(
+            "{}: is no state and no snapshot; only with these there may be a -c too",
+            path.display()
+        )));
+    }
+    if path.exists() {
+        return match is_configuration(path) {
+            true => Ok((named(path), of_config(config::load(path)?))),
+            false => Ok((named(path), cell_model::load_sourced(path)?)),
+        };
+    }
+    of_label_text(path)
+}
+
+/// What a vehicle has learned; the model of its configuration when that is nothing.
+fn of_snapshot(path: &Path, snapshot: &Snapshot, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
+    let label = config.as_ref().and_then(|config| config.monitor.label);
+    let view = snapshot.model(label).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
+    let learned = view.as_ref().and_then(of_view);
+    match (learned, config) {
+        (Some(learned), _) => Ok((named(path), learned)),
+        (None, Some(config)) => Ok((named(&config.path), of_config(config))),
+        (None, None) => {
+            let what = "no cell model has been learned; name the configuration with -c to see the one in use";
+            Err(Failure::new(format!("{}: {what}", path.display())))
+        }
+    }
+}
+
+/// A label as CHEMISTRY:AH.
+fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
+    let source = named(path);
+    let Some((chemistry, rated)) = source.split_once(':') else {
+        let what = "must be a cell model file, a configuration, a state, or CHEMISTRY:AH such as nca-graphite:2.9";
+        return Err(Failure::new(format!("{source}: there is no such file; {what}")));
+    };
+    let names: Vec<&str> = Chemistry::ALL.iter().map(|(_, name)| *name).collect();
+    let known = Chemistry::ALL.into_iter().find(|(_, name)| *name == chemistry).map(|found| found.0);
+    let known = known.ok_or_else(|| {
+        Failure::new(format!("{source}: {chemistry:?} is no file and no chemistry, must be {}", names.join(" or ")))
+    })?;
+    let rated_ah =
+        above_0(rated).map_err(|what| Failure::new(format!("{source}: rated capacity {rated:?}, {what} (Ah)")))?;
+    of_label_named(source, &Label::usual(known, rated_ah))
+}
+
+/// Whether a file is a configuration: it has a table [pack]. Faults are named when it is read.
+fn is_configuration(path: &Path) -> bool {
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    text.parse::<toml::Table>().is_ok_and(|table| table.contains_key("pack"))
+}
+
+fn of_config(config: Config) -> SourcedModel {
+    SourcedModel { model: config.monitor.model, source: config.model_source }
+}
+
+fn of_label_named(name: String, label: &Label) -> Result<(String, SourcedModel), Failure> {
+    let sourced = of_label(label).ok_or_else(|| {
+        let Label { chemistry, voltage_min_v, voltage_max_v, .. } = label;
+        let (low, high) = chemistry.usual_voltages_v();
+        Failure::new(format!(
+            "{name}: no cell of {} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {low} and {high} V",
+            chemistry.name()
+        ))
+    })?;
+    Ok((name, sourced))
+}
+
+fn named(path: &Path) -> String {
+    path.display().to_string()
+}

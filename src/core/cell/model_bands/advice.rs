@@ -1,0 +1,192 @@
+//! Which measurement would make the SOC of a cell model more certain: computed from its bands.
+//!
+//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the one that helps most first, each with what is left after it and those
+//! before it.
+//!
+//! The expected error is the mean square error of the SOC over SOC and the temperatures of [`USE_C`], by one voltage under a usual
+//! load and by counting charge since the last sure voltage, with the capacity as uncertain as it is. A measurement is a linear
+//! observation of the curve, of ln(resistance) or of the capacity; covariances fall with the distance in SOC and temperature, so that
+//! it shows something of its neighbours too (Gaussian conditioning: p - c^2 / (v + r)).
+
+use std::fmt;
+
+use super::{ModelBands, ResistanceBand, soc_variance, square};
+
+/// Most measurements named.
+const MOST: usize = 3;
+/// Least gain, points of SOC, and as a part of the error.
+const LEAST_POINTS: f64 = 0.1;
+const LEAST_PART: f64 = 0.05;
+
+/// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
+const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
+/// SOC over which errors are averaged.
+const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
+/// SOC of possible rests.
+const REST_SOC: [f64; 9] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+
+/// Distances over which the deviations of a curve, SOC, and of resistances, K, change.
+const CURVE_SOC: f64 = 0.15;
+const RESISTANCE_K: f64 = 20.0;
+/// Error of the voltage after a rest of an hour, V, and of the SOC counted from another rest.
+const REST_V: f64 = 0.005;
+const COUNTED_SOC: f64 = 0.02;
+/// Standard deviation of ln(resistance) that a drive leaves.
+const DRIVE_LOG_STD: f64 = 0.1;
+/// Standard deviation of the capacity that a charge from below 20 % to full leaves, fraction.
+const CHARGE_CAPACITY_STD: f64 = 0.02;
+/// Part of the capacity moved since the last sure voltage, and the error of the SOC counted from there by a right capacity: that of
+/// its beginning and of the current sensor.
+const MOVED: f64 = 0.5;
+const COUNT_STD: f64 = 0.06;
+
+/// Temperature below which a drive is a cold one, and by how much it may be warmer than the grid's, K.
+const COLD_C: f64 = 10.0;
+const COLD_ROOM_K: f64 = 2.0;
+
+/// A measurement that the vehicle makes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Measurement {
+    /// A rest of an hour at this SOC.
+    Rest(f64),
+    /// A drive at this temperature, degrees C.
+    Drive(f64),
+    /// A charge from below 20 % to full.
+    Charge,
+}
+
+impl fmt::Display for Measurement {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
+            // A cold drive may be colder.
+            Self::Drive(temperature_c) if *temperature_c < COLD_C => {
+                write!(f, "a drive below {:.0} \u{b0}C", temperature_c + COLD_ROOM_K)
+            }
+            Self::Drive(temperature_c) => write!(f, "a drive near {temperature_c:.0} \u{b0}C"),
+            Self::Charge => f.write_str("one charge from below 20 % to full"),
+        }
+    }
+}
+
+/// A measurement and what it would bring.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Advice {
+    /// The measurement.
+    pub measurement: Measurement,
+    /// Expected error of the SOC after it and those before it in the list, points.
+    pub left_points: f64,
+}
+
+/// Expected error of the SOC by the model, points, and the measurements that would make it smaller; `None` = the model states no
+/// error. An empty list: no measurement would change much.
+pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
+    let mut belief = Belief::of(bands)?;
+    let first_points = belief.points();
+    let candidates: Vec<Measurement> = (REST_SOC.iter().map(|soc| Measurement::Rest(*soc)))
+        .chain(USE_C.iter().map(|(temperature_c, _)| Measurement::Drive(*temperature_c)))
+        .chain([Measurement::Charge])
+        .collect();
+    let (mut points, mut advice) = (first_points, Vec::new());
+    while advice.len() < MOST {
+        let tried = candidates.iter().map(|measurement| (*measurement, belief.after(measurement)));
+        let best = tried.map(|(measurement, after)| (after.points(), measurement, after));
+        let Some((left_points, measurement, after)) = best.min_by(|a, b| a.0.total_cmp(&b.0)) else { break };
+        if points - left_points < LEAST_POINTS.max(LEAST_PART * first_points) {
+            break;
+        }
+        advice.push(Advice { measurement, left_points });
+        (belief, points) = (after, left_points);
+    }
+    Some((first_points, advice))
+}
+
+/// What is believed of a model: covariances over the grid of use and the places of possible measurements.
+#[derive(Clone)]
+struct Belief {
+    /// Slope of the curve at [`USE_SOC`], V per unit of SOC, and at [`REST_SOC`].
+    slope_v: Vec<f64>,
+    rest_slope_v: Vec<f64>,
+    /// Covariance of the curve, V^2, over [`USE_SOC`] and then [`REST_SOC`].
+    curve: Vec<Vec<f64>>,
+    /// Voltage dropped by a usual load, V, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
+    drop_v: Vec<Vec<f64>>,
+    /// Covariance of ln(resistance) between temperatures of [`USE_C`], at each SOC of [`USE_SOC`].
+    resistance: Vec<Vec<Vec<f64>>>,
+    /// Standard deviation of the capacity, fraction.
+    capacity_std: f64,
+}
+
+impl Belief {
+    fn of(bands: &ModelBands<'_>) -> Option<Self> {
+        let places: Vec<f64> = USE_SOC.iter().chain(&REST_SOC).copied().collect();
+        let rest_v = places.iter().map(|&soc| bands.curve_rest_v(soc)).collect::<Option<Vec<f64>>>()?;
+        let modes_v: Vec<[f64; 2]> = places.iter().map(|&soc| bands.modes_v(soc)).collect();
+        let covariance = |i: usize, k: usize| {
+            let modes: f64 = modes_v[i].iter().zip(modes_v[k]).map(|(a, b)| a * b).sum();
+            modes + rest_v[i] * rest_v[k] * near((places[i] - places[k]) / CURVE_SOC)
+        };
+        let all = 0..places.len();
+        let temperatures = || USE_C.iter().map(|(temperature_c, _)| *temperature_c);
+        let of_soc = |&soc: &f64| -> Vec<Vec<f64>> {
+            let of: Vec<(f64, ResistanceBand)> = temperatures().map(|t| (t, bands.resistance(soc, t))).collect();
+            let covariance = |(t, a): &(f64, ResistanceBand), (u, b): &(f64, ResistanceBand)| {
+                a.common * b.common + a.local * b.local * near((t - u) / RESISTANCE_K)
+            };
+            of.iter().map(|a| of.iter().map(|b| covariance(a, b)).collect()).collect()
+        };
+        let drop_v = |t: f64| USE_SOC.iter().map(move |&soc| bands.usual_drop_v(&bands.model.grid_position(soc, t)));
+        Some(Self {
+            slope_v: USE_SOC.iter().map(|&soc| bands.slope_v(soc)).collect(),
+            rest_slope_v: REST_SOC.iter().map(|&soc| bands.slope_v(soc)).collect(),
+            curve: all.clone().map(|i| all.clone().map(|k| covariance(i, k)).collect()).collect(),
+            drop_v: temperatures().map(|t| drop_v(t).collect()).collect(),
+            resistance: USE_SOC.iter().map(of_soc).collect(),
+            capacity_std: bands.capacity_std(),
+        })
+    }
+
+    /// Expected error of the SOC, points.
+    fn points(&self) -> f64 {
+        let counted = square(COUNT_STD) + square(MOVED * self.capacity_std);
+        let at = |t: usize, s: usize| {
+            let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
+            soc_variance((self.curve[s][s] + of_drop).max(f64::MIN_POSITIVE), self.slope_v[s], counted)
+        };
+        let mean = |t: usize| (0..USE_SOC.len()).map(|s| at(t, s)).sum::<f64>() / USE_SOC.len() as f64;
+        let variance: f64 = USE_C.iter().enumerate().map(|(t, (_, weight))| weight * mean(t)).sum();
+        100.0 * variance.sqrt()
+    }
+
+    /// The belief after a measurement.
+    fn after(&self, measurement: &Measurement) -> Self {
+        let mut after = self.clone();
+        match measurement {
+            Measurement::Rest(soc) => {
+                let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
+                let noise_v = REST_V.hypot(COUNTED_SOC * self.rest_slope_v[place]);
+                condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
+            }
+            Measurement::Drive(temperature_c) => {
+                let place = USE_C.iter().position(|(known, _)| known == temperature_c).unwrap_or(0);
+                after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(DRIVE_LOG_STD)));
+            }
+            Measurement::Charge => after.capacity_std = self.capacity_std.min(CHARGE_CAPACITY_STD),
+        }
+        after
+    }
+}
+
+/// Correlation of two places this many distances apart.
+fn near(distances: f64) -> f64 {
+    libm::exp(-0.5 * distances * distances)
+}
+
+/// Conditions a covariance on an observation of `at` with this variance.
+fn condition(covariance: &mut [Vec<f64>], at: usize, variance: f64) {
+    let column: Vec<f64> = covariance.iter().map(|row| row[at]).collect();
+    let total = column[at] + variance;
+    for (row, a) in covariance.iter_mut().zip(&column) {
+        row.iter_mut().zip(&column).for_each(|(value, b)| *value -= a * b / total);
+    }
+}

@@ -1,0 +1,210 @@
+//! How far two cell models are apart: open-circuit curves in V, resistances as a fraction, and what both mean for the SOC.
+//!
+//! In: two [`CellModel`]s. Out: differences of the second from the first. Resistances are compared per rated capacity, and the load
+//! is C/2 of either, so that cells of different size can be compared.
+
+use super::chemistry::USUAL_LOAD_PER_H;
+use super::model::CellModel;
+use super::model_bands::CURVE_C;
+
+/// Steps of SOC over the curve.
+const CURVE_STEPS: u32 = 100;
+/// Steps of SOC in which a voltage under load is looked up: a multiple of the others.
+const READ_STEPS: u32 = 400;
+/// SOC of compared resistances, steps of 10 %.
+const RESISTANCE_STEPS: std::ops::RangeInclusive<u32> = 1..=9;
+/// Temperatures of compared resistances, degrees C, as far as both models have them.
+const TEMPERATURES_C: [f64; 7] = [-20.0, -10.0, 0.0, 10.0, 25.0, 40.0, 50.0];
+/// SOC between which an error of the SOC counts: beyond, curves are so steep that any model is good.
+const MIDDLE: (f64, f64) = (0.05, 0.95);
+
+/// A quantity at one SOC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AtSoc {
+    /// SOC, fraction.
+    pub soc: f64,
+    /// The second model's less the first's.
+    pub value: f64,
+}
+
+/// Summary of differences.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Difference {
+    /// Root mean square.
+    pub rms: f64,
+    /// Largest, with its sign, and where.
+    pub worst: AtSoc,
+}
+
+/// Differences at one temperature.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AtTemperature {
+    /// Degrees C.
+    pub temperature_c: f64,
+    /// Series resistance per rated capacity, fraction.
+    pub series: Difference,
+    /// Resistance with all branches settled, per rated capacity, fraction.
+    pub settled: Difference,
+    /// SOC by a voltage under C/2, fraction.
+    pub load_soc: Difference,
+}
+
+/// The second model compared with the first.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelComparison {
+    /// Open-circuit voltage at 25 degrees C over SOC, V.
+    pub curve_v: Vec<AtSoc>,
+    /// Summary of it.
+    pub curve: Difference,
+    /// SOC by a voltage at rest, fraction.
+    pub rest_soc: Difference,
+    /// Capacity, fraction.
+    pub capacity: f64,
+    /// Resistances, and the SOC under load, by temperature; empty = the models share no temperature.
+    pub temperatures: Vec<AtTemperature>,
+}
+
+impl Difference {
+    /// Of these values; 0 of none.
+    fn of(values: &[AtSoc]) -> Self {
+        let squares: f64 = values.iter().map(|at| at.value * at.value).sum();
+        let largest = values.iter().copied().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
+        Self {
+            rms: (squares / values.len().max(1) as f64).sqrt(),
+            worst: largest.unwrap_or(AtSoc { soc: 0.0, value: 0.0 }),
+        }
+    }
+}
+
+impl ModelComparison {
+    /// Compares `second` with `first`.
+    pub fn new(first: &CellModel, second: &CellModel) -> Self {
+        let curve_v: Vec<AtSoc> = (0..=CURVE_STEPS)
+            .map(|k| f64::from(k) / f64::from(CURVE_STEPS))
+            .map(|soc| AtSoc { soc, value: ocv_v(second, soc) - ocv_v(first, soc) })
+            .collect();
+        let shared = TEMPERATURES_C.into_iter().filter(|&t| [first, second].iter().all(|model| has(model, t)));
+        Self {
+            curve: Difference::of(&curve_v),
+            rest_soc: soc_difference(first, second, CURVE_C, 0.0),
+            capacity: second.capacity_ah / first.capacity_ah - 1.0,
+            temperatures: shared.map(|t| at_temperature(first, second, t)).collect(),
+            curve_v,
+        }
+    }
+}
+
+fn ocv_v(model: &CellModel, soc: f64) -> f64 {
+    model.ocv_v(&model.grid_position(soc, CURVE_C))
+}
+
+/// Whether a temperature is within the tables of a model; a table of one temperature has that of its curve.
+fn has(model: &CellModel, temperature_c: f64) -> bool {
+    match model.temperature_c[..] {
+        [_] => temperature_c == CURVE_C,
+        [low, .., high] => (low..=high).contains(&temperature_c),
+        [] => false,
+    }
+}
+
+fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> AtTemperature {
+    let ratio = |ohm: fn(&CellModel, f64, f64) -> f64| {
+        let at = |k: u32| {
+            let soc = f64::from(k) / 10.0;
+            let [first, second] = [first, second].map(|model| model.rated_capacity_ah * ohm(model, soc, temperature_c));
+            AtSoc { soc, value: second / first - 1.0 }
+        };
+        Difference::of(&RESISTANCE_STEPS.map(at).collect::<Vec<_>>())
+    };
+    AtTemperature {
+        temperature_c,
+        series: ratio(|model, soc, t| model.r0_ohm(&model.grid_position(soc, t))),
+        settled: ratio(|model, soc, t| model.settled_ohm(&model.grid_position(soc, t))),
+        load_soc: soc_difference(first, second, temperature_c, USUAL_LOAD_PER_H),
+    }
+}
+
+/// SOC that the second model reads in a voltage of the first, less the true one, under a settled load relative to the rated
+/// capacity.
+fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
+    let drop_v = |model: &CellModel, soc: f64| {
+        load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))
+    };
+    let terminal_v =
+        |model: &CellModel, soc: f64| model.ocv_v(&model.grid_position(soc, temperature_c)) - drop_v(model, soc);
+    let places: Vec<f64> = (0..=READ_STEPS).map(|k| f64::from(k) / f64::from(READ_STEPS)).collect();
+    let readings_v: Vec<f64> = places.iter().map(|&soc| terminal_v(second, soc)).collect();
+    let at = |k: u32| {
+        let soc = f64::from(k) / f64::from(CURVE_STEPS);
+        AtSoc { soc, value: nearest(&places, &readings_v, terminal_v(first, soc), soc) - soc }
+    };
+    let middle = (0..=CURVE_STEPS).map(at).filter(|at| (MIDDLE.0..=MIDDLE.1).contains(&at.soc));
+    Difference::of(&middle.collect::<Vec<_>>())
+}
+
+/// SOC nearest to `soc` at which a model reads a voltage; where it reads it nowhere, that of the nearest voltage. Under load a voltage
+/// may be read at several: a resistance that rises with the SOC turns the curve over.
+fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
+    let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
+        let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);
+        match (low == 0.0, high == 0.0) {
+            (true, _) => Some(place[0]),
+            (_, true) => Some(place[1]),
+            _ if low.is_sign_positive() != high.is_sign_positive() => {
+                Some(place[0] + (place[1] - place[0]) * low / (low - high))
+            }
+            _ => None,
+        }
+    });
+    let found = crossings.min_by(|a, b| (a - soc).abs().total_cmp(&(b - soc).abs()));
+    let least =
+        || places.iter().zip(readings_v).min_by(|a, b| (a.1 - voltage_v).abs().total_cmp(&(b.1 - voltage_v).abs()));
+    found.or_else(|| least().map(|(place, _)| *place)).unwrap_or(soc)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::model::tests::small_model;
+    use crate::cell::{Chemistry, Label};
+
+    #[test]
+    fn a_model_is_no_different_from_itself() {
+        for model in [small_model(), Label::usual(Chemistry::LfpGraphite, 100.0).model().expect("a model")] {
+            let found = ModelComparison::new(&model, &model);
+            assert_eq!((found.curve.rms, found.capacity), (0.0, 0.0));
+            assert!(found.rest_soc.worst.value.abs() < 1e-12, "{:?}", found.rest_soc);
+            assert!(!found.temperatures.is_empty());
+            for at in found.temperatures {
+                assert_eq!((at.series.rms, at.settled.worst.value), (0.0, 0.0));
+                assert!(at.load_soc.worst.value.abs() < 1e-12, "{at:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_raised_curve_and_doubled_resistances_are_stated_in_volts_percent_and_soc() {
+        let first = small_model();
+        let mut second = first.clone();
+        second.ocv_v.values.iter_mut().flatten().for_each(|v| *v += 0.012);
+        let found = ModelComparison::new(&first, &second);
+        assert!((found.curve.rms - 0.012).abs() < 1e-12 && (found.curve.worst.value - 0.012).abs() < 1e-12);
+        // 12 mV on slopes of 1.325 and 1.075 V per unit of SOC at 25 degrees C: the second model reads the SOC too low.
+        let worst = found.rest_soc.worst.value;
+        assert!((worst + 0.012 / 1.075).abs() < 2e-4, "{worst}");
+        let mut second = first.clone();
+        second.r0_ohm.values.iter_mut().flatten().for_each(|r| *r *= 2.0);
+        let found = ModelComparison::new(&first, &second);
+        let at = found.temperatures.iter().find(|at| at.temperature_c == 25.0).expect("shared");
+        assert!((at.series.rms - 1.0).abs() < 1e-12 && at.settled.rms > 0.5, "{at:?}");
+        assert!(found.rest_soc.rms < 1e-9 && at.load_soc.worst.value > 0.01, "{at:?}");
+    }
+
+    #[test]
+    fn cells_of_different_size_are_compared_per_capacity() {
+        let of = |rated_ah: f64| Label::usual(Chemistry::NcaGraphite, rated_ah).model().expect("a model");
+        let found = ModelComparison::new(&of(2.9), &of(60.0));
+        assert!(found.capacity > 19.0);
+        assert!(found.temperatures.iter().all(|at| at.settled.rms < 1e-9 && at.load_soc.rms < 1e-6), "{found:?}");
+    }
+}

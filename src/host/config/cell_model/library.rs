@@ -1,0 +1,47 @@
+//! The cell models that are there: files in the usual folders or in folders that are named.
+
+use std::path::{Path, PathBuf};
+
+use super::{SourcedModel, load_sourced};
+use crate::config::ConfigFaults;
+
+/// Folders below the present one and of the computer, in which models are looked for.
+const FOLDERS: [&str; 3] = ["config/cells", "cells", "/etc/packwatch/cells"];
+/// Folder of the shipped models, from the folder of an installed program.
+const SHIPPED: &str = "../share/packwatch/cells";
+/// Most models of a folder.
+const MOST: usize = 1000;
+
+/// A file of a folder.
+#[derive(Debug)]
+pub struct LibraryEntry {
+    /// The file.
+    pub path: PathBuf,
+    /// The model, or every fault.
+    pub model: Result<SourcedModel, ConfigFaults>,
+}
+
+/// The usual folders that exist; `program` is the program's own file.
+pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
+    let shipped = program.and_then(Path::parent).map(|folder| folder.join(SHIPPED));
+    // Without "..", as people write it.
+    let shipped = shipped.and_then(|folder| folder.canonicalize().ok());
+    FOLDERS.iter().map(PathBuf::from).chain(shipped).filter(|folder| folder.is_dir()).collect()
+}
+
+/// The models of a folder, `*.toml` by name.
+///
+/// # Errors
+/// When the folder cannot be listed, or has too many files.
+pub fn list(folder: &Path) -> Result<Vec<LibraryEntry>, String> {
+    let named = |what: String| format!("{}: {what}", folder.display());
+    let entries = std::fs::read_dir(folder).and_then(|entries| entries.collect::<std::io::Result<Vec<_>>>());
+    let entries = entries.map_err(|error| named(format!("cannot be listed: {error}")))?;
+    let mut paths: Vec<PathBuf> = entries.into_iter().map(|entry| entry.path()).collect();
+    paths.retain(|path| path.extension().is_some_and(|extension| extension == "toml"));
+    if paths.len() > MOST {
+        return Err(named(format!("holds {} files *.toml, must be at most {MOST}", paths.len())));
+    }
+    paths.sort();
+    Ok(paths.into_iter().map(|path| LibraryEntry { model: load_sourced(&path), path }).collect())
+}

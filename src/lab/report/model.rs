@@ -1,0 +1,156 @@
+//! How well the cells' model is known: the rows and the advice of the section "How well do I know this battery".
+
+use super::context::PageContext;
+use super::data::Data;
+use crate::cell::model_bands::CURVE_C;
+use crate::cell::{Coverage, ModelBands, advise};
+use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
+
+/// SOC and temperatures, degrees C, that are judged.
+const SOC_STEPS: u32 = 20;
+const TEMPERATURES_C: [f64; 8] = [-20.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0];
+/// SOC between which the curve's error is averaged, steps.
+const MIDDLE: std::ops::RangeInclusive<u32> = 2..=18;
+/// A cold temperature beside that of the curve, degrees C.
+const COLD_C: f64 = 0.0;
+/// SOC at which resistances are stated.
+const HALF: f64 = 0.5;
+
+/// Names and values; empty = the model is not known.
+pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, String)> {
+    let Some(sourced) = &context.model else { return Vec::new() };
+    let bands = ModelBands::new(&sourced.model);
+    let mut rows = vec![
+        ("Model", sourced.model.name.clone()),
+        ("State", state_words(sourced.source.state).to_owned()),
+        ("Open-circuit curve", curve(&bands)),
+        ("Resistance at half charge", resistance(sourced, &bands)),
+        ("Capacity", format!("\u{b1} {:.0} % before it is learned of a cell", 100.0 * bands.capacity_std())),
+    ];
+    if let Some(learned) = &sourced.source.learned {
+        rows.push(("Seen by the data it is learned from", seen(&learned.seen)));
+        let residual = learned.residual_v.map(|v| format!("{} fits, residuals {:.1} mV", learned.fits, 1e3 * v));
+        rows.push(("Learning", residual.unwrap_or_else(|| "nothing fitted yet".to_owned())));
+        let better = learned.chemistry.map(|better| format!("{}: check the label", better.name()));
+        rows.extend(better.map(|better| ("Chemistry that fits better", better)));
+    }
+    rows.push(("Seen in this record", seen(&data.trace.seen)));
+    rows.push(("Not known by data: SOC", unknown_soc(sourced)));
+    rows.push(("Not known by data: temperature", unknown_temperatures(sourced)));
+    let points = advise(&bands).map(|(points, _)| format!("about {points:.1} points"));
+    rows.push((
+        "Expected error of the SOC in use",
+        points.unwrap_or_else(|| "unknown: the model states no error".to_owned()),
+    ));
+    rows.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+/// The measurements that would help most, as sentences; `None` = not known.
+pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
+    let (_, advice) = advise(&ModelBands::new(&context.model.as_ref()?.model))?;
+    let sentence = |it: &crate::cell::Advice| format!("{}: {:.1} points are then left", it.measurement, it.left_points);
+    Some(advice.iter().map(sentence).collect())
+}
+
+fn curve(bands: &ModelBands<'_>) -> String {
+    let std_v = MIDDLE.map(|k| bands.curve_std_v(soc(k))).collect::<Option<Vec<f64>>>();
+    let mean_square = |values: Vec<f64>| values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
+    std_v.map(mean_square).map_or_else(
+        || "unknown: the model states no error".to_owned(),
+        |square| format!("\u{b1} {:.0} mV between 10 and 90 %", 1e3 * square.sqrt()),
+    )
+}
+
+fn soc(step: u32) -> f64 {
+    f64::from(step) / f64::from(SOC_STEPS)
+}
+
+fn resistance(sourced: &SourcedModel, bands: &ModelBands<'_>) -> String {
+    let at = |t: f64| {
+        let milliohm = 1e3 * sourced.model.settled_ohm(&sourced.model.grid_position(HALF, t));
+        format!("{milliohm:.2} m\u{3a9} \u{b1} {:.0} % at {t:.0} \u{b0}C", 100.0 * bands.resistance(HALF, t).std())
+    };
+    format!("{}, {}", at(CURVE_C), at(COLD_C))
+}
+
+fn seen(coverage: &Coverage) -> String {
+    if coverage.is_empty() {
+        return "unknown: nothing was recorded".to_owned();
+    }
+    format!(
+        "{:.0} % of the SOC ({}), {}",
+        100.0 * coverage.soc_share(),
+        ranges(&coverage.soc_ranges(), 100.0, "%"),
+        ranges(&coverage.temperature_ranges_c(), 1.0, "\u{b0}C")
+    )
+}
+
+/// "10 to 40 and 60 to 100 %".
+fn ranges(ranges: &[[f64; 2]], factor: f64, unit: &str) -> String {
+    let words = ranges.iter().map(|[low, high]| format!("{:.0} to {:.0}", factor * low, factor * high));
+    let words: Vec<String> = words.collect();
+    if words.is_empty() { "temperature unknown".to_owned() } else { format!("{} {unit}", words.join(" and ")) }
+}
+
+fn unknown_soc(sourced: &SourcedModel) -> String {
+    let nodes = (0..=SOC_STEPS).map(|k| (soc(k), sourced.curve_known_by(soc(k))));
+    unknown(nodes, 100.0, "%")
+}
+
+fn unknown_temperatures(sourced: &SourcedModel) -> String {
+    unknown(TEMPERATURES_C.into_iter().map(|t| (t, sourced.resistances_known_by(t))), 1.0, "\u{b0}C")
+}
+
+/// Neighbouring places that are not known by data, in words.
+fn unknown(places: impl Iterator<Item = (f64, KnownBy)>, factor: f64, unit: &str) -> String {
+    let places: Vec<(f64, KnownBy)> = places.collect();
+    let is_known = |known_by: &KnownBy| matches!(known_by, KnownBy::Measured | KnownBy::Data);
+    let run = |run: &[(f64, KnownBy)]| match (run.first(), run.last()) {
+        (Some((low, known_by)), Some((high, _))) if !is_known(known_by) => {
+            let (low, high) = (factor * low, factor * high);
+            let place = if low == high { format!("{low:.0}") } else { format!("{low:.0} to {high:.0}") };
+            Some(format!("{place} {unit} ({})", known_by.words()))
+        }
+        _ => None,
+    };
+    let runs: Vec<String> = places.chunk_by(|a, b| a.1 == b.1).filter_map(run).collect();
+    if runs.is_empty() { "none".to_owned() } else { runs.join(", ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::{Chemistry, Label};
+    use crate::config::of_label;
+    use crate::report::Origin;
+
+    #[test]
+    fn a_prior_is_not_known_by_data_and_says_what_would_help() {
+        let model = of_label(&Label::usual(Chemistry::NcaGraphite, 2.9));
+        let context = PageContext { model, ..PageContext::default() };
+        let mut data = Data::new(Origin::Replay);
+        data.trace.seen.note(0.55, 21.0);
+        let rows = rows(&data, &context);
+        let value = |name: &str| rows.iter().find(|row| row.0 == name).map(|row| row.1.clone()).expect("a row");
+        assert_eq!(value("Not known by data: SOC"), "0 to 100 % (prior)");
+        assert_eq!(value("Not known by data: temperature"), "-20 to 50 \u{b0}C (prior)");
+        assert_eq!(value("Seen in this record"), "10 % of the SOC (50 to 60 %), 20 to 30 \u{b0}C");
+        assert!(value("State").starts_with("label alone"));
+        let advice = advice(&context).expect("known");
+        assert!(!advice.is_empty() && advice[0].contains("points are then left"), "{advice:?}");
+    }
+
+    #[test]
+    fn places_that_are_not_known_are_joined_with_their_reason() {
+        use KnownBy::{Extrapolated, Measured};
+        let places = [(0.0, Measured), (0.5, Measured), (0.6, Extrapolated), (0.8, Extrapolated), (1.0, Measured)];
+        assert_eq!(unknown(places.into_iter(), 100.0, "%"), "60 to 80 % (extrapolated)");
+        assert_eq!(unknown(places[..2].iter().copied(), 1.0, "%"), "none");
+    }
+
+    #[test]
+    fn without_a_model_nothing_is_said() {
+        let context = PageContext::default();
+        assert!(rows(&Data::new(Origin::Store), &context).is_empty() && advice(&context).is_none());
+    }
+}
