@@ -18,6 +18,8 @@ const SLOW_S: f64 = 3.0;
 const COARSE_V: f64 = 0.01;
 /// Readings of a stretch of which the step of the voltage is found.
 const STEP_ROWS: usize = 2000;
+/// Temperatures within this are one, K.
+const SAME_K: f64 = 1e-6;
 /// Part of its deviation before the fit that is left of a capacity that the logs do not show.
 const UNSHOWN: f64 = 0.7;
 
@@ -60,8 +62,14 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
             notes.push(format!("no {direction} in the logs: its voltages are a guess"));
         }
     }
-    if parts.iter().all(|part| part.temperature_c.iter().all(|t| t.is_nan())) {
-        notes.push("no temperature in the logs: that of the surroundings is assumed".to_owned());
+    let (low_c, high_c) = parts
+        .iter()
+        .flat_map(|part| &part.temperature_c)
+        .fold((f64::MAX, f64::MIN), |(low, high), t| (low.min(*t), high.max(*t)));
+    if high_c - low_c < SAME_K {
+        let what =
+            "no temperature in the logs, or one that never changes: the resistances follow it as those of usual cells";
+        notes.push(what.to_owned());
     }
     let interval_s =
         median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
