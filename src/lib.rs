@@ -50,6 +50,7 @@
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
+//! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/modelling.rs` (when) |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |
@@ -59,6 +60,8 @@
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
+//! | what is saved of a damaged database | `host/store/carve.rs` (rows by their layout), `host/store/salvage.rs` (checks, order) |
+//! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
 //! | segments of a recording | `host/io/segments.rs` |

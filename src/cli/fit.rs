@@ -26,7 +26,8 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "FILES")]
     files: Vec<PathBuf>,
     /// The files are logs as `replay` reads them, of drives and charges that begin anywhere: the fit starts from the cell model of
-    /// --config, or from --chemistry and --rated, and changes it where the logs show something else
+    /// --config, or from --chemistry and --rated, and changes it where the logs show something else. The store of a service is no
+    /// log: it has no readings of voltage and current
     #[arg(long, requires = "start", conflicts_with_all = ["capacity", "ageing_shift", "ocv", "first_cycles", "GridArgs"])]
     log: bool,
     #[command(flatten)]

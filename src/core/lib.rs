@@ -10,6 +10,7 @@
 //! | intake | frame → readings, command | `monitor/intake.rs` | [`can`]: flood limit, protection, decoding |
 //! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
 //! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
+//! | modelling | steps of the cells, rests → the cells' own model | `monitor/modelling.rs` | [`cell`]: notebook, own model |
 //! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
 //! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
@@ -22,6 +23,7 @@
 //! | a new event, or a field of one | `monitor/event.rs` |
 //! | a new field of the live view | `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
+//! | what is begun with when only a history is left | `monitor/relearn.rs` |
 //! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
 //! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
 //! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
@@ -32,6 +34,7 @@
 //! | what counts as a second sender | `can/rate.rs`, `can/own_frames.rs` |
 //! | a physical bound | `quantity/bounds.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
+//! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | what a cell has lost | `cell/loss_modes.rs` |
 //! | bands of a cell model, which measurement helps most | `cell/model_bands.rs` |

@@ -4,6 +4,9 @@
 //! [`FitOutcome`] with the model's tables, residuals per file and all values of the written TOML ([`toml`]).
 //! One error names all files whose SOC cannot be determined, with the reasons.
 
+mod cells;
+mod chemistry;
+mod evidence;
 mod limits;
 pub mod logs;
 mod nodes;
@@ -17,6 +20,7 @@ use std::path::PathBuf;
 
 use rayon::prelude::*;
 
+pub use cells::CellDeviation;
 pub use picture::write as write_plot;
 pub use range::MeasuredRange;
 pub use toml::text;
@@ -141,10 +145,21 @@ pub struct FitOutcome {
     pub records: Vec<Record>,
     /// The file of each record, as an index into `files`.
     pub file_of_record: Vec<usize>,
+    /// Of a fit to logs: what else they say.
+    pub logs: Option<LogsOutcome>,
     /// Notes and warnings to print.
     pub notes: Vec<String>,
     /// What the model is good for, to print at the end.
     pub verdict: Vec<String>,
+}
+
+/// What logs of a whole pack say beside the model.
+#[derive(Debug, Clone)]
+pub struct LogsOutcome {
+    /// Standard deviation of the capacity, Ah.
+    pub capacity_std_ah: f64,
+    /// Every cell beside the mean; none of a pack of few cells.
+    pub cells: Vec<CellDeviation>,
 }
 
 /// Reads and prepares the files, and fits the model.
@@ -188,6 +203,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         files,
         records,
         file_of_record,
+        logs: None,
         notes: prepared.notes,
         verdict: vec![],
         fit: fitted,

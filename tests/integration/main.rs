@@ -29,6 +29,7 @@ mod e2e_peer;
 mod export_cli;
 mod fit_cli;
 mod fit_logs;
+mod fit_logs_bad;
 #[cfg(feature = "lab")]
 mod gp_measured;
 #[cfg(feature = "lab")]

@@ -178,7 +178,8 @@ fn a_source_that_is_none_is_named_with_what_is_allowed() {
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history there"));
 }
 
-/// A folder with a day of a vehicle of one cell, whose model was learned on board from the label alone.
+/// A folder with the log of a vehicle of one cell, whose model was learned on board from the label alone: deep swings of the load
+/// for most of a day, and the first readings after the night.
 fn learned() -> Place {
     let place = Place::new();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -186,11 +187,21 @@ fn learned() -> Place {
         std::fs::copy(config.join(name), place.path(name)).unwrap();
     }
     let text = std::fs::read_to_string(config.join("paper.toml")).unwrap();
-    let keys = "chemistry = \"nmc-graphite\"\nlearn_model = true";
-    let line = |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { line.to_owned() };
-    std::fs::write(place.path("pack.toml"), text.lines().map(line).collect::<Vec<_>>().join("\n")).unwrap();
-    let log = place.name("day.log.gz");
-    good(&["simulate", "ev-day", "-c", "config/paper.toml", "-o", &log, "--cycles", "1"]);
+    let with_cell = |keys: &str| {
+        let line = |line: &str| if line.starts_with("cell_model") { keys.to_owned() } else { line.to_owned() };
+        text.lines().map(line).collect::<Vec<_>>().join("\n")
+    };
+    std::fs::write(place.path("pack.toml"), with_cell("chemistry = \"nmc811-graphite\"\nlearn_model = true")).unwrap();
+    std::fs::write(place.path("truth.toml"), with_cell("cell_model = \"cell.toml\"")).unwrap();
+    good(&["model", "export", "nmc811-graphite:2.6", "-o", &place.name("cell.toml")]);
+    let log = place.name("day.log");
+    good(&["simulate", "random-walk", "-c", &place.name("truth.toml"), "-o", &log, "--duration", "60000"]);
+    let mut lines = std::fs::read_to_string(&log).unwrap();
+    let last = lines.lines().last().unwrap().to_owned();
+    let (stamp, frame) = last.trim_start_matches('(').split_once(')').unwrap();
+    let evening_s: f64 = stamp.parse().unwrap();
+    lines.extend((0..30).map(|second| format!("({:.6}){frame}\n", evening_s + 20_000.0 + f64::from(second))));
+    std::fs::write(&log, lines).unwrap();
     let (pack, snapshot) = (place.name("pack.toml"), place.name("snapshot.json"));
     good(&["replay", "-c", &pack, &log, "--snapshot", &snapshot, "--state", &place.name("state")]);
     place
@@ -227,7 +238,7 @@ fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
 #[cfg(feature = "lab")]
 fn check_report(place: &Place, document: &Value) {
     let page = place.name("page.html");
-    good(&["report", "-c", &place.name("pack.toml"), &place.name("day.log.gz"), "-o", &page]);
+    good(&["report", "-c", &place.name("pack.toml"), &place.name("day.log"), "-o", &page]);
     let from_log = std::fs::read_to_string(&page).unwrap();
     good(&["report", "--state", &place.name("state"), "-o", &page]);
     let from_store = std::fs::read_to_string(&page).unwrap();

@@ -17,12 +17,12 @@ use crate::io::journal::{self, JournalWriter};
 use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
+use crate::monitor::{Downtime, Input, LearnedCell, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress};
+use crate::store::{DATABASE_SOURCE, HISTORY_SOURCE, StateCandidate, Store, StoreProgress};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]
@@ -44,6 +44,8 @@ pub(super) struct Engine {
     store: Option<Store>,
     /// Whether the store can be written.
     store_works: bool,
+    /// Whether the disk has room for more than what is urgent.
+    has_room: bool,
     /// Whether files can be written, as last reported to the core.
     reported_works: Option<bool>,
     barrier: CommitBarrier,
@@ -74,7 +76,9 @@ impl Engine {
             tracing::info!(away = %service.downtime, stamped_s, "state restored");
             (Some(service.downtime), None)
         } else {
-            restore_first_valid(&mut monitor, found.states, service.record.as_deref())
+            let mut states = found.states;
+            states.extend(state_of_history(&service.config.monitor, &found.learned));
+            restore_first_valid(&mut monitor, states, service.record.as_deref())
         };
         if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
             store.set_state_aside(why, now);
@@ -108,6 +112,7 @@ impl Engine {
             has_lost_file,
             store,
             store_works: found.works && unfit.is_none(),
+            has_room: true,
             reported_works: None,
             barrier: CommitBarrier::default(),
             is_fresh: false,
@@ -117,24 +122,25 @@ impl Engine {
         })
     }
 
-    /// Takes one input; checks the authenticator of a frame first, where it has one.
-    pub(super) fn handle(&mut self, input: &Input<'_>) {
+    /// Takes one input; checks the authenticator of a frame first, where it has one. Returns the ticket of the commit of what
+    /// it changed; `None` = nothing that is stored, or nothing is stored.
+    pub(super) fn handle(&mut self, input: &Input<'_>) -> Option<u64> {
         if let Input::Frame { time, bus, frame } = *input
             && let Some(check) = self.monitor.mac_check(bus, frame)
         {
             let verified = self.key.as_ref().and_then(|key| check.verify(frame.data(), |bytes| key.mac(bytes)));
             return self.take(&Input::SecuredFrame { time, bus, frame, freshness: verified });
         }
-        self.take(input);
+        self.take(input)
     }
 
     /// Journals one input, passes it to the core and dispatches its outputs.
-    fn take(&mut self, input: &Input<'_>) {
+    fn take(&mut self, input: &Input<'_>) -> Option<u64> {
         self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(input));
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
         self.is_fresh |= matches!(input, Input::Frame { .. } | Input::SecuredFrame { .. });
-        self.dispatch_outputs(input.time());
+        self.dispatch_outputs(input.time())
     }
 
     /// Gives the core another configuration, and journals that.
@@ -150,9 +156,10 @@ impl Engine {
         Ok(changed)
     }
 
-    /// Sends the core's frames to the interfaces and its events to the log, and both to their files.
-    fn dispatch_outputs(&mut self, time: Timestamp) {
-        self.commit_learned(time);
+    /// Sends the core's frames to the interfaces and its events to the log, and both to their files. Returns the ticket of
+    /// their commit.
+    fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
+        let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {
             if !self.barrier.hold(transmit) {
                 send(&self.links, self.key.as_ref(), transmit);
@@ -168,15 +175,16 @@ impl Engine {
             self.recent.note(event);
             self.has_lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
+        ticket
     }
 
     /// Commits learned results; their announcement waits for the commit, unless the store has failed.
-    fn commit_learned(&mut self, now: Timestamp) {
-        let Some(store) = &mut self.store else { return };
-        let ticket = store.learned(&self.outputs.events, &self.monitor, now);
-        if let Some(ticket) = ticket.filter(|_| self.store_works) {
+    fn commit_learned(&mut self, now: Timestamp) -> Option<u64> {
+        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
+        if self.store_works {
             self.barrier.begin(ticket, Instant::now());
         }
+        Some(ticket)
     }
 
     /// The progress of the store, with every change; `None` = there is no store.
@@ -187,7 +195,7 @@ impl Engine {
     /// Handles progress or failure of the store.
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
         self.barrier.release(progress.ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
-        self.store_works = progress.works;
+        (self.store_works, self.has_room) = (progress.works, progress.has_room);
         self.progress = Some(progress);
         self.report_store_health(time);
     }
@@ -236,7 +244,7 @@ impl Engine {
     /// Reports to the core whether files can be written, when that has changed.
     pub(super) fn report_store_health(&mut self, time: Timestamp) {
         // The lost file may be the journal; the core gets the input anyway.
-        let works = self.store_works && !self.has_lost_file;
+        let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
             self.handle(&Input::Store { time, works });
@@ -277,6 +285,19 @@ fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
         // Cannot be: the start fails without a key. A frame without its authenticator is never sent.
         (Some(_), None) => {}
     }
+}
+
+/// A new state with what the history knows of the cells; `None` = it knows nothing of these cells.
+fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<StateCandidate> {
+    if learned.is_empty() {
+        return None;
+    }
+    let mut monitor = Monitor::new(config.clone());
+    if !monitor.relearn(learned) {
+        tracing::warn!("the learned values in the history are of other cells: not used");
+        return None;
+    }
+    Some(StateCandidate { snapshot: monitor.snapshot(), downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
 /// Restores the first stored state that validates. Returns its age, and why the database's state does not fit, if it does

@@ -13,16 +13,20 @@ use std::rc::Rc;
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
+use super::cells::{self, CellDistances};
+use super::evidence::{self, Capacity};
 use super::prepare::CREDIBLE_BEYOND_V;
-use super::{ELECTRODES_C, FileResidual, FitOutcome, FitProgress, MeasuredRange, judged, verdict};
+use super::{
+    ELECTRODES_C, FileResidual, FitOutcome, FitProgress, LogsOutcome, MeasuredRange, chemistry, judged, verdict,
+};
 use crate::cell::{AgedOcv, CellModel};
 use crate::error::LabError;
-use crate::ident::fit::{FitSettings, judge};
-use crate::ident::grid::Grid;
+use crate::ident::fit::{FitSettings, FittedTables, judge};
+use crate::ident::grid::{Grid, arrhenius};
 use crate::ident::parameters::ParameterTables;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Limits, Record};
-use crate::ident::unanchored::{self, Known, UnanchoredRecord};
+use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
 use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
 use crate::io::log::{LogOptions, LogSource};
 use crate::monitor::{Estimate, Monitor, MonitorConfig, Outputs};
@@ -34,6 +38,20 @@ const HOLE_S: f64 = 120.0;
 const LEAST_ROWS: usize = 20;
 /// Least standard deviation of the SOC at which a stretch begins.
 const BEGINNING_STD: f64 = 0.02;
+/// A stretch begins full when its open-circuit voltage is at least that of this SOC even with this part of the usual series
+/// resistance; its SOC is then known within this standard deviation.
+const FULL_SOC: f64 = 0.975;
+const LEAST_RESISTANCE: f64 = 0.4;
+const FULL_STD: f64 = 0.01;
+/// Below this SOC, per unit of Arrhenius' factor above 1 and at most, diffusion limits a cold cell and no circuit has its voltage:
+/// read as a circuit's it is lost capacity. Chosen on Panasonic 18650PF.
+const KNEE_SOC: f64 = 0.13;
+const MOST_KNEE_SOC: f64 = 0.35;
+/// A cold cell does not settle within a drive: its voltage is that of a SOC that differs by this, per unit of Arrhenius' factor above
+/// 1 (rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C).
+const COLD_SOC: f64 = 0.03;
+/// Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
+const LEAST_OFFSET_H: f64 = 1000.0;
 /// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
 /// this time, h.
 const HELD_V: f64 = 0.012;
@@ -44,9 +62,9 @@ const NODE_GAP_K: f64 = 5.0;
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
 /// SOC breakpoints of the fitted tables.
-const SOC: [f64; 25] = [
+const SOC: [f64; 26] = [
     0.0, 0.02, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
-    0.9, 0.93, 0.96, 0.98, 1.0,
+    0.9, 0.93, 0.96, 0.98, 0.99, 1.0,
 ];
 
 /// Logs of a pack, and how they are read.
@@ -68,6 +86,7 @@ pub struct LogRequest<'a> {
 struct Stretch {
     log: usize,
     part: MeasuredPart,
+    cells: CellDistances,
     /// SOC at its first row with its standard deviation.
     beginning: (f64, f64),
 }
@@ -76,25 +95,26 @@ struct Stretch {
 #[derive(Debug, Default)]
 struct MeanCell {
     stretches: Vec<Stretch>,
-    seen: Vec<bool>,
+    /// Voltage of each cell that is in the sums; NaN = none yet.
+    voltage_v: Vec<f64>,
     count: f64,
     sums: [f64; 6],
 }
 
 impl MeanCell {
     fn new(cells: usize) -> Self {
-        Self { seen: vec![false; cells], ..Self::default() }
+        Self { voltage_v: vec![f64::NAN; cells], ..Self::default() }
     }
 
     fn take(&mut self, estimate: &Estimate) {
         let cell = estimate.cell.index();
-        if self.seen.get(cell) == Some(&true) {
+        if self.voltage_v.get(cell).is_some_and(|v| v.is_finite()) {
             self.close();
         }
-        if let Some(seen) = self.seen.get_mut(cell) {
-            *seen = true;
-        }
         let measured = &estimate.measured;
+        if let Some(voltage_v) = self.voltage_v.get_mut(cell) {
+            *voltage_v = measured.voltage_v;
+        }
         let values = [
             estimate.time.secs(),
             measured.current_a,
@@ -110,8 +130,8 @@ impl MeanCell {
     fn close(&mut self) {
         let [time_s, current_a, voltage_v, temperature_c, soc, soc_std] = self.sums.map(|sum| sum / self.count);
         (self.count, self.sums) = (0.0, [0.0; 6]);
-        self.seen.fill(false);
         if !(time_s.is_finite() && current_a.is_finite() && voltage_v.is_finite()) {
+            self.voltage_v.fill(f64::NAN);
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
@@ -121,7 +141,9 @@ impl MeanCell {
         }
         if let Some(stretch) = self.stretches.last_mut() {
             stretch.part.push(time_s, current_a, voltage_v, temperature_c, f64::NAN);
+            stretch.cells.push(time_s, voltage_v, &self.voltage_v);
         }
+        self.voltage_v.fill(f64::NAN);
     }
 }
 
@@ -138,8 +160,16 @@ pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> R
     if stretches.is_empty() {
         return Err(LabError(format!("no stretch of {LEAST_ROWS} readings with current and voltage in the logs")));
     }
+    fit_stretches(request, &stretches, progress)
+}
+
+fn fit_stretches(
+    request: &LogRequest<'_>,
+    stretches: &[Stretch],
+    mut progress: impl FnMut(FitProgress),
+) -> Result<FitOutcome, LabError> {
     let model = &request.monitor.model;
-    let grid = Grid { soc: SOC.to_vec(), temperature_c: temperature_nodes(&stretches) };
+    let grid = Grid { soc: SOC.to_vec(), temperature_c: temperature_nodes(stretches) };
     let records: Vec<UnanchoredRecord> = stretches.iter().map(|stretch| unanchored(stretch, &grid, model)).collect();
     let settings = FitSettings {
         grid: grid.clone(),
@@ -155,7 +185,13 @@ pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> R
     let file_of_record: Vec<usize> = stretches.iter().map(|stretch| stretch.log).collect();
     let capacity_ah = fit.capacity_ah;
     let errors_v = error_table::table(&fit.fitted, &judged(&fit.records, &file_of_record), capacity_ah);
-    let voltage_error_v = errors_v.iter().zip(&fit.ocv_std_v).map(|(a, b)| a.hypot(*b)).collect();
+    let cold_v = unsettled_v(&fit.fitted);
+    let voltage_error_v = (0..errors_v.len()).map(|n| errors_v[n].hypot(fit.ocv_std_v[n]).hypot(cold_v[n])).collect();
+    let distances: Vec<&CellDistances> = stretches.iter().map(|stretch| &stretch.cells).collect();
+    let cells =
+        cells::fit(usize::from(request.monitor.sample.cells), &distances, &fit.records, &fit.fitted.tables, &grid.soc);
+    let mut notes = notes(model, stretches, &fit, &known);
+    notes.extend(cells::notes(&cells));
     let found = electrodes::identify(|soc| fit.fitted.ocv_v(soc, ELECTRODES_C));
     let rows: Vec<Vec<f64>> = fit.fitted.tables.ocv_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
     let electrodes =
@@ -172,19 +208,48 @@ pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> R
         files: files(request, &fit.records, &file_of_record, &fit.fitted.tables),
         records: fit.records,
         file_of_record,
-        notes: vec![],
+        notes,
         verdict: vec![],
+        logs: Some(LogsOutcome { capacity_std_ah: fit.capacity_std_ah, cells }),
         fit: fit.fitted,
     };
-    let std_ah = fit.capacity_std_ah;
-    outcome.notes.push(format!(
+    outcome.verdict = verdict::verdict(&outcome);
+    Ok(outcome)
+}
+
+/// What the logs say of the capacity, what they do not show, and of what chemistry they are.
+fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &Known) -> Vec<String> {
+    let (capacity_ah, std_ah) = (fit.capacity_ah, fit.capacity_std_ah);
+    let mut notes = vec![format!(
         "capacity {capacity_ah:.3} +/- {std_ah:.3} Ah per cell, {:+.1} % of the {} Ah of {:?}",
         100.0 * (capacity_ah / model.capacity_ah - 1.0),
         model.capacity_ah,
         model.name
-    ));
-    outcome.verdict = verdict::verdict(&outcome);
-    Ok(outcome)
+    )];
+    let parts: Vec<&MeasuredPart> = stretches.iter().map(|stretch| &stretch.part).collect();
+    let before = Capacity { mean_ah: known.capacity_ah, std_ah: known.capacity_std * known.capacity_ah };
+    notes.extend(evidence::notes(&parts, &fit.records, before, Capacity { mean_ah: capacity_ah, std_ah }));
+    let beginnings = stretches.iter().map(|stretch| (&stretch.part, stretch.beginning.0));
+    notes.extend(chemistry::label_of(model).and_then(|label| chemistry::note(&label, capacity_ah, beginnings)));
+    notes
+}
+
+/// Error of the voltage of a cold cell that does not settle, V, in node order.
+fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
+    let (soc, columns) = (&fitted.grid.soc, fitted.grid.soc.len());
+    let of_node = |node: usize| {
+        let (first, s) = (node - node % columns, node % columns);
+        let (low, high) = (s.saturating_sub(1), (s + 1).min(columns - 1));
+        let ocv_v = &fitted.tables.ocv_v;
+        let slope_v = (ocv_v[first + high] - ocv_v[first + low]) / (soc[high] - soc[low]);
+        slope_v * COLD_SOC * colder(fitted.grid.temperature_c[node / columns])
+    };
+    (0..fitted.tables.ocv_v.len()).map(of_node).collect()
+}
+
+/// Arrhenius' factor above 1; 0 in the warmth.
+fn colder(temperature_c: f64) -> f64 {
+    (arrhenius(temperature_c) - 1.0).max(0.0)
 }
 
 /// The stretches of one log.
@@ -195,7 +260,8 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(Box::new(watch)), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    let monitor = Monitor::new(request.monitor.clone());
+    // The model that is fitted does not change on the way.
+    let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ()).map_err(|error| LabError(error.to_string()))?;
     let mut mean = mean.borrow_mut();
     mean.close();
@@ -214,19 +280,39 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
         voltage_high_v: model.voltage_max_v + CREDIBLE_BEYOND_V.1,
         capacity_ah: 1.0,
     };
-    let record = Record::prepare(&part, &[], grid, &limits);
+    let is_judged = |k: usize| part.voltage_v[k] >= knee_v(model, part.current_a[k], part.temperature_c[k]);
+    let judged: Vec<bool> = (0..part.len()).map(is_judged).collect();
+    let record = Record::prepare(&part, &judged, grid, &limits);
     let scale = record::share(&record) * record::weight(&record) / model.rated_capacity_ah;
-    let full_ah = full_ah(&part, model);
-    UnanchoredRecord { record, scale, beginning: stretch.beginning, full_ah }
+    let full = full(&part, model);
+    let beginning = if begins_full(&part, model) { (1.0, FULL_STD) } else { stretch.beginning };
+    UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Charge taken out where a charge at the highest voltage has faded: the cell is full. The last such row counts.
-fn full_ah(part: &MeasuredPart, model: &CellModel) -> Option<f64> {
+/// Whether a stretch begins with a full cell: its open-circuit voltage is that of one even with the least resistance.
+fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
+    let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
+    let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;
+    voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
+}
+
+/// Voltage below which a cold cell's is not judged, V.
+fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
+    let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
+    if soc <= 0.0 {
+        return f64::NEG_INFINITY;
+    }
+    let position = model.grid_position(soc, temperature_c);
+    model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
+}
+
+/// Charge taken out, Ah, and time, h, where a charge at the highest voltage has faded: the cell is full. The last such row counts.
+fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
         part.voltage_v[k] >= model.voltage_max_v - HELD_V && (-most_a..-0.01 * most_a).contains(&part.current_a[k])
     };
-    (0..part.len()).rev().find(is_full).map(|k| -part.soc[k])
+    (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
 /// A node per group of temperatures; stretches without a temperature have that of the surroundings.
@@ -277,6 +363,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
+        offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / LEAST_OFFSET_H),
     }
 }
 

@@ -80,8 +80,14 @@ impl ModelTables {
         Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
     }
 
-    /// The fitted tables with rows beyond the measured temperatures.
-    pub(super) fn beyond(fitted: &FittedTables, voltage_error_v: &[f64], range: &MeasuredRange) -> Self {
+    /// The fitted tables with rows beyond the measured temperatures. `is_scaled`: the resistances of the fit hold at the nodes, beyond
+    /// them by Arrhenius' law; else out to the measured temperatures.
+    pub(super) fn beyond(
+        fitted: &FittedTables,
+        voltage_error_v: &[f64],
+        range: &MeasuredRange,
+        is_scaled: bool,
+    ) -> Self {
         let grid = Grid { soc: fitted.grid.soc.clone(), temperature_c: vec![] };
         let tables = ParameterTables {
             ocv_v: vec![],
@@ -97,15 +103,16 @@ impl ModelTables {
         let mut add = |row: usize, from_c: f64, to_c: f64| {
             all.add_row((fitted, voltage_error_v), (row, from_c, to_c), range.rms_a);
         };
-        add(0, low_c, low_c - REACH_K);
+        let (from_low_c, from_high_c) = if is_scaled { (nodes[0], nodes[last]) } else { (low_c, high_c) };
+        add(0, from_low_c, low_c - REACH_K);
         if low_c < nodes[0] {
-            add(0, low_c, low_c);
+            add(0, from_low_c, low_c);
         }
         (0..=last).for_each(|row| add(row, nodes[row], nodes[row]));
         if high_c > nodes[last] {
-            add(last, high_c, high_c);
+            add(last, from_high_c, high_c);
         }
-        add(last, high_c, high_c + REACH_K);
+        add(last, from_high_c, high_c + REACH_K);
         all
     }
 
@@ -161,7 +168,7 @@ mod tests {
     #[test]
     fn resistances_follow_arrhenius_beyond_the_measured_temperatures_and_the_error_grows() {
         let range = MeasuredRange { temperature_c: (22.4, 36.1), current_a: (-5.0, 15.0), soc: (0.0, 1.0), rms_a: 2.0 };
-        let all = ModelTables::beyond(&fitted(vec![25.0]), &[0.005; 2], &range);
+        let all = ModelTables::beyond(&fitted(vec![25.0]), &[0.005; 2], &range, false);
         assert_eq!(all.grid.temperature_c, [-18.0, 22.0, 25.0, 37.0, 77.0]);
         let cold = arrhenius(-18.0) / arrhenius(22.0);
         assert!((all.tables.r0_ohm[0] - 0.03 * cold).abs() < 1e-12);

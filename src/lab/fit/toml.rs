@@ -111,8 +111,10 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     // An ageing cell's model is for that cell in its own conditions: its cycles cannot separate temperature from age.
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
-    let ModelTables { grid, tables, voltage_error_v } =
-        if is_ageing { ModelTables::fitted(fit, errors) } else { ModelTables::beyond(fit, errors, &outcome.measured) };
+    let ModelTables { grid, tables, voltage_error_v } = match is_ageing {
+        true => ModelTables::fitted(fit, errors),
+        false => ModelTables::beyond(fit, errors, &outcome.measured, outcome.logs.is_some()),
+    };
     let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
     let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     let beyond = if is_ageing { "" } else { ", the first and the last beyond those measured" };

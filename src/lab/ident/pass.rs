@@ -5,8 +5,10 @@
 //! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives fade with the branch: those below
 //! [`FADED_V`] are dropped, so a row touches a few nodes only and the work per row does not grow with the tables.
 //! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
+//! Where the SOC is not known ([`FreeScale`]), a residual is compared with the error of a circuit at this drop and temperature
+//! ([`circuit_error_v`]): there the capacity must not be read from what the circuit gets wrong in the cold.
 
-use super::grid::{Corners, Grid};
+use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
@@ -18,6 +20,14 @@ pub const HUBER_V: f64 = 0.05;
 const SIGMA_V: f64 = 0.010;
 /// Seconds over which model error repeats itself: one independent residual in this time.
 const REPEATS_S: f64 = 50.0;
+/// The same where the SOC is not known. Chosen on Panasonic 18650PF and on a simulated LG M50, as the two below.
+const FREE_REPEATS_S: f64 = 250.0;
+/// Part of the voltage drop by which a circuit is wrong.
+const DROP_ERROR: f64 = 0.05;
+/// Power of Arrhenius' factor by which a circuit's error grows with cold.
+const COLD_POWER: f64 = 0.7;
+/// Such errors from which on the cost grows linearly.
+const HUBER_ERRORS: f64 = 3.0;
 
 /// Normal equations in the nodes' own parameters.
 #[derive(Debug, Clone)]
@@ -155,13 +165,18 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - charge / capacity, both parameters.
+/// Where the SOC of a record's rows comes from when it is not known: SOC = beginning - (charge - offset x time) / capacity, with
+/// beginning, capacity and the current sensor's offset as parameters.
 #[derive(Debug, Clone, Copy)]
 pub struct FreeScale<'a> {
     /// Breakpoints.
     pub grid: &'a Grid,
     /// Index of ln(capacity).
     pub log_capacity: usize,
+    /// Index of the current sensor's offset, A.
+    pub offset: usize,
+    /// Capacity, Ah.
+    pub capacity_ah: f64,
     /// Index of the record's SOC at its first row.
     pub beginning: usize,
     /// Its value.
@@ -180,8 +195,9 @@ impl FreeScale<'_> {
         let upper_v = if place.along_t == 0.0 { 0.0 } else { place.along_t * rise_v(place.t + 1) };
         let slope_v =
             ((1.0 - place.along_t) * rise_v(place.t) + upper_v) / (self.grid.soc[place.s + 1] - self.grid.soc[place.s]);
-        index.extend([self.log_capacity, self.beginning]);
-        j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v]);
+        index.extend([self.log_capacity, self.offset, self.beginning]);
+        let by_offset = row.time_s / 3600.0 / self.capacity_ah;
+        j.extend([-slope_v * (self.beginning_soc - row.soc), -slope_v * by_offset, -slope_v]);
     }
 }
 
@@ -213,10 +229,16 @@ pub fn accumulate(
                 free.derivatives(row, tables, &mut index, &mut j);
             }
             let residual = row.voltage_v - model_v;
-            let (cost, robust) = huber(residual);
-            let weight = scale * row.weight_s / (SIGMA_V * SIGMA_V * REPEATS_S);
-            normal.cost += weight * cost;
-            normal.add(&index, &j, residual, weight * robust);
+            let (cost, weight) = if free.is_some() {
+                let drop_v = row.ocv.at(&tables.ocv_v) - model_v;
+                free_cost(residual, circuit_error_v(drop_v, row.temperature_c))
+            } else {
+                let (cost, robust) = huber(residual);
+                let scale = 1.0 / (SIGMA_V * SIGMA_V * REPEATS_S);
+                (scale * cost, scale * robust)
+            };
+            normal.cost += scale * row.weight_s * cost;
+            normal.add(&index, &j, residual, scale * row.weight_s * weight);
         }
     }
 }
@@ -248,6 +270,23 @@ fn derivatives(
             push(layout.branch_tau(i) + node, branch.by_tau[node]);
         }
     }
+}
+
+/// Error of a circuit's voltage at a drop and a temperature, V.
+fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
+    SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
+}
+
+/// Cost of a second of a residual with this error, and the weight of its square in the normal equations. The error grows with the
+/// drop, a parameter's doing, so its logarithm counts.
+fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
+    let errors = residual.abs() / error_v;
+    let (cost, robust) = if errors <= HUBER_ERRORS {
+        (0.5 * errors * errors, 1.0)
+    } else {
+        (HUBER_ERRORS * (errors - 0.5 * HUBER_ERRORS), HUBER_ERRORS / errors)
+    };
+    ((cost + libm::log(error_v / SIGMA_V)) / FREE_REPEATS_S, robust / (error_v * error_v * FREE_REPEATS_S))
 }
 
 /// Cost of a residual and the weight its square gets in the normal equations.

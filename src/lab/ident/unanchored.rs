@@ -3,24 +3,28 @@
 //! In: records with the charge taken out since their first row, a prior of the open-circuit curve (V, V^2) and of the
 //! resistances, the label's capacity (Ah). Out: tables, capacity, and the SOC at which each record began.
 //!
-//! SOC = s_k - q / C: the beginning s_k of record k and ln C are parameters beside those of the tables, and all are found
-//! together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
+//! SOC = s_k - (q - o t) / C: the beginning s_k of record k, ln C and the offset o of the current sensor (A) are parameters beside
+//! those of the tables, and all are found together as the most likely ones (maximum a posteriori, Gauss-Newton in [`super::solve`]). What the records do not show stays
 //! as in the prior. Every pass places the rows in the tables again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use super::fit::{FitSettings, FittedTables, MIN_ROWS, judge, space};
+use super::grid::arrhenius;
 use super::parameters::{Layout, ParameterTables};
 use super::pass::{FreeScale, NormalEquations, accumulate, visits};
 use super::prior::Prior;
 use super::record::Record;
-use super::solve::minimise;
+use super::solve::{Space, minimise};
 
 /// Least and largest SOC of a record's beginning.
 const BEGINNING: (f64, f64) = (-0.05, 1.05);
 /// Largest factor between the capacity and the label's.
 const CAPACITY_FACTOR: f64 = 1.6;
+
+/// Largest offset of the current, in its standard deviations.
+const MOST_OFFSETS: f64 = 4.0;
 
 /// Standard deviation of the SOC at the end of a full charge.
 const FULL_STD: f64 = 0.01;
@@ -38,6 +42,8 @@ pub struct Known {
     pub capacity_ah: f64,
     /// Its standard deviation, fraction.
     pub capacity_std: f64,
+    /// Standard deviation of the current sensor's offset, A.
+    pub offset_std_a: f64,
 }
 
 /// A record with the charge of its rows.
@@ -49,8 +55,8 @@ pub struct UnanchoredRecord {
     pub scale: f64,
     /// SOC at the first row, as far as it is known, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out, Ah, at the moment at which a charge ended with a full cell: SOC 1.
-    pub full_ah: Option<f64>,
+    /// Charge taken out, Ah, and time since the first row, h, at the moment at which a charge ended with a full cell: SOC 1.
+    pub full: Option<(f64, f64)>,
 }
 
 /// A fit of tables, capacity and beginnings.
@@ -97,7 +103,119 @@ impl CurvePriorRows {
     }
 }
 
-/// Fits tables, capacity and beginnings; `progress` receives the pass number and the cost.
+/// The unknowns in one vector, those of the tables first, and the cost of their values.
+struct Problem<'a> {
+    settings: &'a FitSettings,
+    known: &'a Known,
+    records: &'a [UnanchoredRecord],
+    layout: Layout,
+    prior: Prior,
+    curve: CurvePriorRows,
+}
+
+impl<'a> Problem<'a> {
+    /// The problem, the values where the search starts, and their bounds.
+    fn new(
+        settings: &'a FitSettings,
+        known: &'a Known,
+        records: &'a [UnanchoredRecord],
+    ) -> Result<(Self, Vec<f64>, Space), String> {
+        let layout = Layout::new(&settings.grid, known.tables.r_ohm.len());
+        let ln = |values: &[f64]| values.iter().map(|&x| libm::log(x)).collect::<Vec<f64>>();
+        let mut start = known.tables.ocv_v.clone();
+        start.extend(ln(&known.tables.r0_ohm));
+        for (r_ohm, tau_s) in known.tables.r_ohm.iter().zip(&known.tables.tau_s) {
+            start.extend(ln(r_ohm));
+            start.extend(ln(tau_s));
+        }
+        let mut space = space(settings, &layout, &start);
+        let prior = Prior::about(&settings.grid, &layout, &start, &settings.deviations);
+        let curve = CurvePriorRows::new(known, &layout)?;
+        let mut push = |value: f64, low: f64, high: f64| {
+            start.push(value);
+            space.low.push(low);
+            space.high.push(high);
+        };
+        let (log_label, reach) = (libm::log(known.capacity_ah), libm::log(CAPACITY_FACTOR));
+        push(log_label, log_label - reach, log_label + reach);
+        push(0.0, -MOST_OFFSETS * known.offset_std_a, MOST_OFFSETS * known.offset_std_a);
+        records.iter().for_each(|record| push(record.beginning.0, BEGINNING.0, BEGINNING.1));
+        Ok((Self { settings, known, records, layout, prior, curve }, start, space))
+    }
+
+    /// Index of ln(capacity).
+    fn log_capacity(&self) -> usize {
+        self.layout.len()
+    }
+
+    /// Index of the current sensor's offset, A.
+    fn offset(&self) -> usize {
+        self.layout.len() + 1
+    }
+
+    /// Index of the SOC at which a record begins.
+    fn beginning(&self, k: usize) -> usize {
+        self.layout.len() + 2 + k
+    }
+
+    /// A record with its SOC.
+    fn placed(&self, theta: &[f64], k: usize) -> Record {
+        let of_all = [theta[self.log_capacity()], theta[self.offset()]];
+        place(&self.records[k].record, self.settings, theta[self.beginning(k)], of_all)
+    }
+
+    /// Cost and its derivatives.
+    fn evaluate(&self, theta: &[f64]) -> NormalEquations {
+        let tables = ParameterTables::new(&self.layout, theta);
+        let of_record = |k: usize| {
+            let mut normal = NormalEquations::new(theta.len());
+            let free = FreeScale {
+                grid: &self.settings.grid,
+                log_capacity: self.log_capacity(),
+                offset: self.offset(),
+                capacity_ah: libm::exp(theta[self.log_capacity()]),
+                beginning: self.beginning(k),
+                beginning_soc: theta[self.beginning(k)],
+            };
+            let scale = self.records[k].scale;
+            accumulate(&self.placed(theta, k), scale, &self.layout, &tables, Some(&free), &mut normal);
+            normal
+        };
+        // Added in the order of the records: the sum does not depend on the threads.
+        let sums: Vec<NormalEquations> = (0..self.records.len()).into_par_iter().map(of_record).collect();
+        let mut normal = NormalEquations::new(theta.len());
+        sums.iter().for_each(|sum| normal.add_all(sum));
+        self.prior.accumulate(theta, &mut normal);
+        self.curve.accumulate(theta, &mut normal);
+        self.add_capacity_and_beginnings(theta, &mut normal);
+        normal
+    }
+
+    /// Adds what is known of the capacity, of the offset and of the records' beginnings and ends.
+    fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
+        let (log_capacity, offset) = (self.log_capacity(), self.offset());
+        let mut near = |at: usize, mean: f64, std: f64| {
+            let residual = (theta[at] - mean) / std;
+            normal.cost += 0.5 * residual * residual;
+            normal.add(&[at], &[1.0 / std], residual, 1.0);
+        };
+        near(log_capacity, libm::log(self.known.capacity_ah), self.known.capacity_std);
+        near(offset, 0.0, self.known.offset_std_a);
+        for (k, record) in self.records.iter().enumerate() {
+            near(self.beginning(k), record.beginning.0, record.beginning.1);
+        }
+        let per_ah = libm::exp(-theta[log_capacity]);
+        for (k, (full_ah, full_h)) in self.records.iter().enumerate().filter_map(|(k, it)| Some((k, it.full?))) {
+            let taken = (full_ah - theta[offset] * full_h) * per_ah;
+            let residual = (theta[self.beginning(k)] - taken - 1.0) / FULL_STD;
+            normal.cost += 0.5 * residual * residual;
+            let j = [taken / FULL_STD, full_h * per_ah / FULL_STD, 1.0 / FULL_STD];
+            normal.add(&[log_capacity, offset, self.beginning(k)], &j, residual, 1.0);
+        }
+    }
+}
+
+/// Fits tables, capacity, offset and beginnings; `progress` receives the pass number and the cost.
 ///
 /// # Errors
 /// Too few rows, or numbers that are not finite.
@@ -111,80 +229,26 @@ pub fn fit(
     if judged < MIN_ROWS {
         return Err(format!("{judged} rows can be judged, at least {MIN_ROWS} are needed"));
     }
-    let grid = &settings.grid;
-    let layout = Layout::new(grid, known.tables.r_ohm.len());
-    let log_capacity = layout.len();
-    let beginning = |k: usize| log_capacity + 1 + k;
-    let ln = |values: &[f64]| values.iter().map(|&x| libm::log(x)).collect::<Vec<f64>>();
-    let mut start = known.tables.ocv_v.clone();
-    start.extend(ln(&known.tables.r0_ohm));
-    for (r_ohm, tau_s) in known.tables.r_ohm.iter().zip(&known.tables.tau_s) {
-        start.extend(ln(r_ohm));
-        start.extend(ln(tau_s));
-    }
-    let mut space = space(settings, &layout, &start);
-    let prior = Prior::about(grid, &layout, &start, &settings.deviations);
-    let curve = CurvePriorRows::new(known, &layout)?;
-    let log_label = libm::log(known.capacity_ah);
-    start.push(log_label);
-    space.low.push(log_label - libm::log(CAPACITY_FACTOR));
-    space.high.push(log_label + libm::log(CAPACITY_FACTOR));
-    for record in records {
-        start.push(record.beginning.0);
-        space.low.push(BEGINNING.0);
-        space.high.push(BEGINNING.1);
-    }
-    let placed =
-        |theta: &[f64], k: usize| place(&records[k].record, settings, theta[beginning(k)], theta[log_capacity]);
-    let evaluate = |theta: &[f64]| {
-        let tables = ParameterTables::new(&layout, theta);
-        let of_record = |k: usize| {
-            let mut normal = NormalEquations::new(theta.len());
-            let free = FreeScale { grid, log_capacity, beginning: beginning(k), beginning_soc: theta[beginning(k)] };
-            accumulate(&placed(theta, k), records[k].scale, &layout, &tables, Some(&free), &mut normal);
-            normal
-        };
-        // Added in the order of the records: the sum does not depend on the threads.
-        let sums: Vec<NormalEquations> = (0..records.len()).into_par_iter().map(of_record).collect();
-        let mut normal = NormalEquations::new(theta.len());
-        sums.iter().for_each(|sum| normal.add_all(sum));
-        prior.accumulate(theta, &mut normal);
-        curve.accumulate(theta, &mut normal);
-        let mut near = |at: usize, mean: f64, std: f64| {
-            let residual = (theta[at] - mean) / std;
-            normal.cost += 0.5 * residual * residual;
-            normal.add(&[at], &[1.0 / std], residual, 1.0);
-        };
-        near(log_capacity, log_label, known.capacity_std);
-        for (k, record) in records.iter().enumerate() {
-            near(beginning(k), record.beginning.0, record.beginning.1);
-        }
-        for (k, full_ah) in records.iter().enumerate().filter_map(|(k, record)| Some((k, record.full_ah?))) {
-            let taken = full_ah * libm::exp(-theta[log_capacity]);
-            let residual = (theta[beginning(k)] - taken - 1.0) / FULL_STD;
-            normal.cost += 0.5 * residual * residual;
-            normal.add(&[log_capacity, beginning(k)], &[taken / FULL_STD, 1.0 / FULL_STD], residual, 1.0);
-        }
-        normal
-    };
-    if !evaluate(&space.inside(&start)).cost.is_finite() {
+    let (problem, start, space) = Problem::new(settings, known, records)?;
+    if !problem.evaluate(&space.inside(&start)).cost.is_finite() {
         return Err("the data or the starting values are not finite".to_owned());
     }
-    let solution = minimise(&space, &start, evaluate, progress);
-    let theta = &solution.theta;
+    let solution = minimise(&space, &start, |theta| problem.evaluate(theta), progress);
+    let (theta, layout) = (&solution.theta, &problem.layout);
     let n = theta.len();
-    let covariance = DMatrix::from_vec(n, n, evaluate(theta).symmetric()).cholesky().map(|factor| factor.inverse());
+    let information = DMatrix::from_vec(n, n, problem.evaluate(theta).symmetric());
+    let covariance = information.cholesky().map(|factor| factor.inverse());
     let std = |at: usize| covariance.as_ref().map_or(f64::INFINITY, |covariance| covariance[(at, at)].sqrt());
-    let tables = ParameterTables::new(&layout, theta);
-    let records: Vec<Record> = (0..records.len()).map(|k| placed(theta, k)).collect();
+    let tables = ParameterTables::new(layout, theta);
+    let records: Vec<Record> = (0..records.len()).map(|k| problem.placed(theta, k)).collect();
     let all: Vec<&Record> = records.iter().collect();
-    let capacity_ah = libm::exp(theta[log_capacity]);
+    let capacity_ah = libm::exp(theta[problem.log_capacity()]);
     Ok(UnanchoredFit {
         capacity_ah,
-        capacity_std_ah: capacity_ah * std(log_capacity),
+        capacity_std_ah: capacity_ah * std(problem.log_capacity()),
         ocv_std_v: (0..layout.nodes).map(std).collect(),
         fitted: FittedTables {
-            grid: grid.clone(),
+            grid: settings.grid.clone(),
             total: judge(&records, &tables),
             visits_s: visits(&all, layout.nodes),
             tables,
@@ -195,16 +259,21 @@ pub fn fit(
     })
 }
 
-/// The record with SOC = beginning - charge / capacity, placed in the tables.
-fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, log_capacity: f64) -> Record {
+/// The record with its SOC, placed in the tables.
+fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capacity, offset_a]: [f64; 2]) -> Record {
     let grid = &settings.grid;
     let per_ah = libm::exp(-log_capacity);
+    let (coldest_c, warmest_c) = (grid.temperature_c[0], grid.temperature_c[grid.temperature_c.len() - 1]);
     let mut placed = record.clone();
     for row in &mut placed.rows {
-        row.soc = beginning_soc + row.soc * per_ah;
+        row.soc = beginning_soc + (row.soc + offset_a * row.time_s / 3600.0) * per_ah;
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
+        // A cell warms up as it is driven: beyond the nodes its resistances follow Arrhenius' law, as between them.
+        let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
+        let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
+        row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);
     }
     placed
 }

@@ -12,6 +12,7 @@ pack       valid: SOC 63.2 % (95 %: 60.8 to 65.6 %), discharge, 10.95 V, 12.50 A
 health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
 reference charger 5432 ± 61 s
 offset     current sensor -0.034 ± 0.011 A (reading less true current)
+model      learning
 losses     lithium 6.1 ± 1.2 %, negative electrode 2.2 ± 2.3 %, positive electrode 2.1 ± 2.4 %
 life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the recent use
 interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times

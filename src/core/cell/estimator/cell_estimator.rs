@@ -22,6 +22,8 @@ use crate::quantity::bounds;
 
 /// Usual load before a start under load, per rated capacity: C/2.
 const USUAL_LOAD_PER_H: f64 = 0.5;
+/// Least and largest SOC at a start by the voltage.
+const FIRST_SOC: (f64, f64) = (-0.05, 1.05);
 
 /// State in which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -138,7 +140,10 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            model.soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
+            // On a flat curve a voltage just beyond its end would be of any SOC.
+            model
+                .soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
+                .clamp(FIRST_SOC.0, FIRST_SOC.1)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = self.first_branch_variance(model, config, step, soc.mean);
@@ -390,6 +395,11 @@ impl CellEstimator {
                 x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
             });
         }
+    }
+
+    /// Sets ln of the resistance relative to new with which the filter begins.
+    pub fn relearn_resistance(&mut self, log_resistance: ScalarGaussian) {
+        self.memory.log_resistance = log_resistance;
     }
 
     /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.

