@@ -140,7 +140,7 @@ fn a_bad_log_makes_no_model_worse_than_the_label() {
         ("no temperature", &[Drive { has_temperature: false, ..DRIVE }], "no temperature in the logs"),
         ("charge only", &[Drive { soc: (0.2, 0.9), ..DRIVE }], "no discharge in the logs"),
         ("gaps", &[Drive { gap: (1000, 3000), ..DRIVE }], ""),
-        ("another pack half-way", &[Drive { soc: (0.9, 0.5), ..DRIVE }, other_pack], ""),
+        ("another pack half-way", &[Drive { soc: (0.9, 0.5), ..DRIVE }, other_pack], "no one cell has these voltages"),
         ("steps of 20 mV", &[Drive { step_v: 0.02, ..DRIVE }], "voltages in steps of 20 mV"),
         ("every 5 s", &[Drive { every_s: 5, ..DRIVE }], "readings every 5 s"),
         ("short", &[Drive { soc: (0.7, 0.62), ..DRIVE }], "the logs do not show the capacity"),

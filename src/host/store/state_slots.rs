@@ -129,7 +129,8 @@ impl StateCopies {
 /// Reads the newest valid state; `None` = none was stored. Damage of all records is an error in words: the history may still be
 /// good.
 pub(super) fn read_state(connection: &Connection) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-    let (mut newest, mut faults): (Option<(i64, JsonParts)>, Vec<(i64, String)>) = (None, Vec::new());
+    let mut newest: Option<(i64, JsonParts)> = None;
+    let mut faults: Vec<(i64, String)> = Vec::new();
     for table in COPIES.into_iter().filter(|table| has_table(connection, table)) {
         let contents = read_copy(connection, table, STATE)?;
         faults.extend(contents.faults);

@@ -50,6 +50,10 @@ const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive: its voltage is that of a SOC that differs by this, per unit of Arrhenius' factor above
 /// 1 (rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C).
 const COLD_SOC: f64 = 0.03;
+/// Residual of a fit from which on the logs are not of one cell, V, and the power of Arrhenius' factor by which it grows with cold:
+/// fits of the cells of `tests/label` leave 5 to 20 mV in the warmth and 27 mV at 0 degrees C.
+const UNFIT_V: f64 = 0.04;
+const COLD_POWER: f64 = 0.7;
 /// Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
 const LEAST_OFFSET_H: f64 = 1000.0;
 /// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
@@ -182,6 +186,9 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError)?;
+    // Two packs, or cells of no known kind: what the fit makes of them is of neither.
+    let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
+    let fit = if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError)? } else { fit };
     let file_of_record: Vec<usize> = stretches.iter().map(|stretch| stretch.log).collect();
     let capacity_ah = fit.capacity_ah;
     let errors_v = error_table::table(&fit.fitted, &judged(&fit.records, &file_of_record), capacity_ah);
@@ -191,6 +198,12 @@ fn fit_stretches(
     let cells =
         cells::fit(usize::from(request.monitor.sample.cells), &distances, &fit.records, &fit.fitted.tables, &grid.soc);
     let mut notes = notes(model, stretches, &fit, &known);
+    notes.extend(unfit_v.map(|rmse_v| {
+        let rmse_mv = 1e3 * rmse_v;
+        format!(
+            "no one cell has these voltages (residual {rmse_mv:.0} mV): the model stays that which the fit started from"
+        )
+    }));
     notes.extend(cells::notes(&cells));
     let found = electrodes::identify(|soc| fit.fitted.ocv_v(soc, ELECTRODES_C));
     let rows: Vec<Vec<f64>> = fit.fitted.tables.ocv_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
@@ -232,6 +245,12 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     let beginnings = stretches.iter().map(|stretch| (&stretch.part, stretch.beginning.0));
     notes.extend(chemistry::label_of(model).and_then(|label| chemistry::note(&label, capacity_ah, beginnings)));
     notes
+}
+
+/// Residual from which on the logs are not of one cell, V.
+fn unfit_v(grid: &Grid) -> f64 {
+    let coldest_c = grid.temperature_c.first().copied().unwrap_or(ELECTRODES_C);
+    UNFIT_V * libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
 /// Error of the voltage of a cold cell that does not settle, V, in node order.

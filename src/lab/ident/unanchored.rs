@@ -16,7 +16,7 @@ use super::parameters::{Layout, ParameterTables};
 use super::pass::{FreeScale, NormalEquations, accumulate, visits};
 use super::prior::Prior;
 use super::record::Record;
-use super::solve::{Space, minimise};
+use super::solve::{Solution, Space, minimise};
 
 /// Least and largest SOC of a record's beginning.
 const BEGINNING: (f64, f64) = (-0.05, 1.05);
@@ -191,6 +191,29 @@ impl<'a> Problem<'a> {
         normal
     }
 
+    /// The fit of a solution; `std`: standard deviation of an unknown, of the tables' open-circuit voltages and ln(capacity).
+    fn outcome(&self, solution: &Solution, std: impl Fn(usize) -> f64) -> UnanchoredFit {
+        let theta = &solution.theta;
+        let tables = ParameterTables::new(&self.layout, theta);
+        let records: Vec<Record> = (0..self.records.len()).map(|k| self.placed(theta, k)).collect();
+        let all: Vec<&Record> = records.iter().collect();
+        let capacity_ah = libm::exp(theta[self.log_capacity()]);
+        UnanchoredFit {
+            capacity_ah,
+            capacity_std_ah: capacity_ah * std(self.log_capacity()),
+            ocv_std_v: (0..self.layout.nodes).map(&std).collect(),
+            fitted: FittedTables {
+                grid: self.settings.grid.clone(),
+                total: judge(&records, &tables),
+                visits_s: visits(&all, self.layout.nodes),
+                tables,
+                passes: solution.passes,
+                converged: solution.converged,
+            },
+            records,
+        }
+    }
+
     /// Adds what is known of the capacity, of the offset and of the records' beginnings and ends.
     fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (log_capacity, offset) = (self.log_capacity(), self.offset());
@@ -234,29 +257,26 @@ pub fn fit(
         return Err("the data or the starting values are not finite".to_owned());
     }
     let solution = minimise(&space, &start, |theta| problem.evaluate(theta), progress);
-    let (theta, layout) = (&solution.theta, &problem.layout);
-    let n = theta.len();
-    let information = DMatrix::from_vec(n, n, problem.evaluate(theta).symmetric());
+    let n = solution.theta.len();
+    let information = DMatrix::from_vec(n, n, problem.evaluate(&solution.theta).symmetric());
     let covariance = information.cholesky().map(|factor| factor.inverse());
     let std = |at: usize| covariance.as_ref().map_or(f64::INFINITY, |covariance| covariance[(at, at)].sqrt());
-    let tables = ParameterTables::new(layout, theta);
-    let records: Vec<Record> = (0..records.len()).map(|k| problem.placed(theta, k)).collect();
-    let all: Vec<&Record> = records.iter().collect();
-    let capacity_ah = libm::exp(theta[problem.log_capacity()]);
-    Ok(UnanchoredFit {
-        capacity_ah,
-        capacity_std_ah: capacity_ah * std(problem.log_capacity()),
-        ocv_std_v: (0..layout.nodes).map(std).collect(),
-        fitted: FittedTables {
-            grid: settings.grid.clone(),
-            total: judge(&records, &tables),
-            visits_s: visits(&all, layout.nodes),
-            tables,
-            passes: solution.passes,
-            converged: solution.converged,
-        },
-        records,
-    })
+    Ok(problem.outcome(&solution, std))
+}
+
+/// The model that is known, as if the records had said nothing.
+///
+/// # Errors
+/// A prior without an inverse.
+pub fn prior(settings: &FitSettings, known: &Known, records: &[UnanchoredRecord]) -> Result<UnanchoredFit, String> {
+    let (problem, theta, _) = Problem::new(settings, known, records)?;
+    let columns = problem.layout.columns;
+    let std = |at: usize| {
+        let variance = |s: usize| known.curve_covariance[(s, s)];
+        if at == problem.log_capacity() { known.capacity_std } else { variance(at % columns).sqrt() }
+    };
+    let solution = Solution { cost: problem.evaluate(&theta).cost, theta, passes: 0, converged: true };
+    Ok(problem.outcome(&solution, std))
 }
 
 /// The record with its SOC, placed in the tables.
