@@ -25,6 +25,8 @@ struct Drive {
     every_s: u32,
     /// Step of the voltages, V.
     step_v: f64,
+    /// Error of the current sensor, A.
+    offset_a: f64,
     /// Seconds without rows: from, to.
     gap: (u32, u32),
 }
@@ -37,6 +39,7 @@ const DRIVE: Drive = Drive {
     has_temperature: true,
     every_s: 1,
     step_v: 0.001,
+    offset_a: 0.0,
     gap: (0, 0),
 };
 
@@ -82,7 +85,8 @@ impl Drive {
             if second.is_multiple_of(self.every_s) && !(self.gap.0..self.gap.1).contains(&(second - from)) {
                 let temperature = if self.has_temperature { "25" } else { "" };
                 let taken_ah = TRUE_AH * (1.0 - soc);
-                writeln!(text, "{second},{current_a:.3},{voltage_v:.4},{temperature},{taken_ah:.6}").unwrap();
+                writeln!(text, "{second},{:.3},{voltage_v:.4},{temperature},{taken_ah:.6}", current_a + self.offset_a)
+                    .unwrap();
             }
             second += 1;
         }
@@ -191,4 +195,17 @@ fn a_wrong_chemistry_on_the_label_is_named() {
         let names = |note: &Value| note.as_str().unwrap().contains(&format!("rather than of {on_label}"));
         assert_eq!(notes.iter().any(names), is_wrong, "{chemistry:?} on a label of {on_label}: {notes:?}");
     }
+}
+
+#[test]
+fn an_offset_of_the_current_over_days_is_found_and_makes_no_other_chemistry_of_the_cell() {
+    let folder = tempfile::tempdir().unwrap();
+    // C/50 over more than two days: the charge that is counted is off by more than the capacity.
+    let drive = Drive { offset_a: TRUE_AH / 50.0, every_s: 10, ..DRIVE };
+    let (out, back) = (Drive { soc: (0.9, 0.2), ..drive }, Drive { soc: (0.2, 0.9), ..drive });
+    let logs = [log(folder.path(), "a.csv", &[out, back].repeat(10))];
+    let notes = notes_of_fit(folder.path(), &logs, &LABEL);
+    let capacity: f64 = notes[0].split(' ').nth(1).unwrap().parse().unwrap();
+    assert!((capacity / TRUE_AH - 1.0).abs() < 0.05, "{notes:?}");
+    assert!(notes.iter().all(|note| !note.contains("rather than")), "{notes:?}");
 }

@@ -27,8 +27,8 @@ pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
 }
 
-/// The rows that the service would note of these stretches, each with its SOC at the beginning.
-fn rows<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
+/// The rows that the service would note of these stretches, each with its SOC at the beginning, with a sensor without offset.
+fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
     let config = NotebookConfig::new(1, label.rated_ah);
     let mut notebook = Notebook::default();
     for (part, beginning) in stretches {
@@ -36,14 +36,14 @@ fn rows<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f6
         for k in 0..part.len() {
             let before = k.saturating_sub(1);
             let measured_s = part.time_s[k] - part.time_s[before];
-            let charge_as = 0.5 * (part.current_a[k] + part.current_a[before]) * measured_s;
+            let charge_as = (0.5 * (part.current_a[k] + part.current_a[before]) - offset_a) * measured_s;
             soc -= charge_as / 3600.0 / label.rated_ah;
             let step = CellStep {
                 measured_s,
                 charge_as,
                 offset_s: measured_s,
                 unmeasured_s: 0.0,
-                current_a: Some(part.current_a[k]),
+                current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
                 ambient_c: AMBIENT_C,
                 voltage_v: part.voltage_v[k],
@@ -57,13 +57,16 @@ fn rows<'a>(label: &Label, stretches: impl Iterator<Item = (&'a MeasuredPart, f6
     notebook.rows().to_vec()
 }
 
-/// What the logs say about the chemistry, of a capacity (Ah) that a fit has found; `None` = nothing against that of the label.
+/// What the logs say about the chemistry, of a capacity (Ah) and an offset of the current (A) that a fit has found; `None` = nothing
+/// against that of the label. `error_ratio`: error of a circuit relative to that in the warmth. With it the logarithms of likelihoods
+/// shrink as its square.
 pub(super) fn note<'a>(
     label: &Label,
-    capacity_ah: f64,
+    (capacity_ah, offset_a): (f64, f64),
+    error_ratio: f64,
     stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>,
 ) -> Option<String> {
-    let rows = rows(label, stretches);
+    let rows = rows(label, offset_a, stretches);
     let cost = |chemistry: Chemistry| {
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
         Some((chemistry, fit::label_cost(&of, &rows, capacity_ah)?))
@@ -73,7 +76,7 @@ pub(super) fn note<'a>(
     };
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
     let (best, least) = others.filter_map(cost).min_by(|a, b| a.1.total_cmp(&b.1))?;
-    (least < own - MARGIN).then(|| {
+    (least < own - MARGIN * error_ratio * error_ratio).then(|| {
         format!(
             "the voltages are those of {} rather than of {}, which is on the label: ln of the likelihood {:+.0}; fit again with it",
             best.name(),

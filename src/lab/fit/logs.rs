@@ -48,7 +48,7 @@ const FULL_STD: f64 = 0.01;
 const KNEE_SOC: f64 = 0.13;
 const MOST_KNEE_SOC: f64 = 0.35;
 /// A cold cell does not settle within a drive: its voltage is that of a SOC that differs by this, per unit of Arrhenius' factor above
-/// 1 (rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C).
+/// 1. Rests of 20 min of Panasonic 18650PF at 10 to -20 degrees C show 0.013 to 0.024; drives have shorter ones.
 const COLD_SOC: f64 = 0.03;
 /// Residual of a fit from which on the logs are not of one cell, V, and the power of Arrhenius' factor by which it grows with cold:
 /// fits of the cells of `tests/label` leave 5 to 20 mV in the warmth and 27 mV at 0 degrees C.
@@ -243,14 +243,21 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     let before = Capacity { mean_ah: known.capacity_ah, std_ah: known.capacity_std * known.capacity_ah };
     notes.extend(evidence::notes(&parts, &fit.records, before, Capacity { mean_ah: capacity_ah, std_ah }));
     let beginnings = stretches.iter().map(|stretch| (&stretch.part, stretch.beginning.0));
-    notes.extend(chemistry::label_of(model).and_then(|label| chemistry::note(&label, capacity_ah, beginnings)));
+    notes.extend(chemistry::label_of(model).and_then(|label| {
+        chemistry::note(&label, (capacity_ah, fit.offset_a), error_ratio(&fit.fitted.grid), beginnings)
+    }));
     notes
 }
 
 /// Residual from which on the logs are not of one cell, V.
 fn unfit_v(grid: &Grid) -> f64 {
+    UNFIT_V * error_ratio(grid)
+}
+
+/// Error of a circuit at the coldest node, relative to that in the warmth.
+fn error_ratio(grid: &Grid) -> f64 {
     let coldest_c = grid.temperature_c.first().copied().unwrap_or(ELECTRODES_C);
-    UNFIT_V * libm::pow(1.0 + colder(coldest_c), COLD_POWER)
+    libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
 /// Error of the voltage of a cold cell that does not settle, V, in node order.

@@ -68,6 +68,8 @@ pub struct UnanchoredFit {
     pub capacity_ah: f64,
     /// Its standard deviation, Ah.
     pub capacity_std_ah: f64,
+    /// Offset of the current sensor, A: measured less true.
+    pub offset_a: f64,
     /// Standard deviation of the open-circuit voltage that the data leave, V, in node order.
     pub ocv_std_v: Vec<f64>,
     /// The records with the SOC found.
@@ -201,6 +203,7 @@ impl<'a> Problem<'a> {
         UnanchoredFit {
             capacity_ah,
             capacity_std_ah: capacity_ah * std(self.log_capacity()),
+            offset_a: theta[self.offset()],
             ocv_std_v: (0..self.layout.nodes).map(&std).collect(),
             fitted: FittedTables {
                 grid: self.settings.grid.clone(),
