@@ -57,6 +57,8 @@
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
+//! | what is saved of a damaged database | `host/store/carve.rs` (rows by their layout), `host/store/salvage.rs` (checks, order) |
+//! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
 //! | segments of a recording | `host/io/segments.rs` |

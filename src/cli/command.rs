@@ -90,7 +90,22 @@ pub(super) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Fail
         ));
     }
     let done: CommandOutcome = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
-    print(&format!("the learned values of the old pack are forgotten; alarms about it that ended: {}\n", done.changed))
+    print(&format!(
+        "the learned values of the old pack are forgotten; alarms about it that ended: {}\n",
+        done.changed
+    ))?;
+    check_stored(&done)
+}
+
+/// A failure when what the command has changed is not on the disk.
+fn check_stored(done: &CommandOutcome) -> Result<(), Failure> {
+    if done.is_stored != Some(false) {
+        return Ok(());
+    }
+    Err(Failure::new(
+        "done, but not on the disk yet: a power cut now would undo it; the daemon stores it when the disk answers again \
+         (`packwatch status`)",
+    ))
 }
 
 fn send(client: &ControlClient, command: Command, word: &str) -> Result<(), Failure> {
@@ -102,7 +117,7 @@ fn send(client: &ControlClient, command: Command, word: &str) -> Result<(), Fail
             changed => format!("{changed} alarms {word}\n"),
         })?;
     }
-    if done.refused == 0 { Ok(()) } else { Err(Failure::new(refusals(&done, word))) }
+    if done.refused == 0 { check_stored(&done) } else { Err(Failure::new(refusals(&done, word))) }
 }
 
 fn refusals(done: &CommandOutcome, word: &str) -> String {

@@ -10,7 +10,7 @@ use super::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
-use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
+use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable, NotedHead};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
@@ -55,6 +55,10 @@ struct ExportArgs {
 
 #[derive(Debug, clap::Args)]
 struct VerifyArgs {
+    /// End of the chain as the daemon logged it ("end of the history's chain"): a history that was written again since does not
+    /// fit it
+    #[arg(long, value_name = "ROWS:HASH")]
+    noted: Vec<NotedHead>,
     /// Print one JSON document
     #[arg(long)]
     json: bool,
@@ -267,6 +271,11 @@ fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
     let verdict = reader.verify().map_err(Failure::new)?;
     if args.json {
         print(&format!("{}\n", json!({ "version": VERSION, "verdict": verdict })))?;
+    }
+    for noted in &args.noted {
+        if let Some(contradiction) = reader.contradiction(noted).map_err(Failure::new)? {
+            return Err(Failure::new(contradiction));
+        }
     }
     match &verdict.broken {
         None if args.json => Ok(()),

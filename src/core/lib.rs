@@ -21,6 +21,7 @@
 //! | a new event, or a field of one | `monitor/event.rs` |
 //! | a new field of the live view | `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
+//! | what is begun with when only a history is left | `monitor/relearn.rs` |
 //! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
 //! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
 //! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |

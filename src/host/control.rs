@@ -11,7 +11,8 @@
 //! * Owner and group may read (mode 0660); commands are executed only for the daemon's own user and for root, as the
 //!   kernel reports them (`SO_PEERCRED`). Others get an error.
 //! * Each connection is a task. It sends the loop one request at a time over a bounded queue; a connection that never
-//!   reads or writes blocks no other and is closed.
+//!   reads or writes blocks no other and is closed. When all places are taken, the one that has been idle longest is closed
+//!   for a new one.
 //! * A command reaches the core as an input, so it is in the journal and replays.
 
 pub mod answer;
@@ -29,6 +30,8 @@ pub use server::{ControlServer, PendingRequest};
 
 /// Connections at once: a person, a display and a script, with room; each is a task and a few kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
+/// Connections of one process at once.
+pub const MAX_PER_PROCESS: usize = 4;
 /// Bytes of a request with the end of its line: the longest valid one has under 200.
 pub const MAX_REQUEST_BYTES: usize = 4096;
 /// Longest time for a request and for reading its answer: a script needs milliseconds, and a client must not keep one of

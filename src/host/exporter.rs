@@ -4,7 +4,8 @@
 //! * `/metrics`: each scrape reads the status socket, within [`STATUS_LIMIT`]; without a fresh document the answer is
 //!   `packwatch_up 0` alone. OpenMetrics 1.0 for clients that accept it, else Prometheus' text 0.0.4.
 //! * `/`: a short page; `/-/healthy`: a sign of life.
-//! * At most [`MAX_CONNECTIONS`]; further ones are closed immediately. Requests of at most [`MAX_REQUEST_BYTES`], with their
+//! * At most [`MAX_CONNECTIONS`], and [`MAX_PER_ADDRESS`] of one client; a further one takes the place of the one that has
+//!   been idle longest ([`crate::io::places`]). Requests of at most [`MAX_REQUEST_BYTES`], with their
 //!   head within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
 
 use std::cell::Cell;
@@ -14,7 +15,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::pin::pin;
 use std::rc::Rc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use http_body_util::Full;
 use hyper::body::{Bytes, Incoming};
@@ -29,6 +30,7 @@ use tokio::net::{TcpListener, TcpStream, UnixStream};
 use tokio::task::{JoinSet, LocalSet};
 use tokio::time::{sleep, timeout};
 
+use super::io::places::{Activity, PlaceLimits, Places};
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::client::{check_length, explain, parse};
@@ -37,6 +39,8 @@ use super::status::metrics::{openmetrics, prometheus_text};
 
 /// Connections at once: two servers and a browser, several times over.
 const MAX_CONNECTIONS: usize = 16;
+/// Connections of one address at once.
+const MAX_PER_ADDRESS: usize = 8;
 /// Longest head of a request, bytes: hyper's least.
 const MAX_REQUEST_BYTES: usize = 8192;
 /// Headers of a request.
@@ -76,17 +80,18 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
     let source = Rc::new(StatusSource { path: socket, is_up: Cell::new(None) });
-    let served = LocalSet::new().block_on(&runtime, serve(listen, source));
+    let served = async { serve(TcpListener::bind(listen).await?, source).await };
+    let served = LocalSet::new().block_on(&runtime, served);
     served.map_err(|error| format!("{listen}: {error}"))
 }
 
-async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
+async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()> {
     let mut stop = Stop::new(None)?;
-    let listener = TcpListener::bind(listen).await?;
     let address = listener.local_addr()?;
     tracing::info!(%address, socket = %source.path.display(), "exporter listens");
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
+    let mut places = Places::new(PlaceLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
@@ -95,9 +100,14 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
             accepted = listener.accept() => accepted,
         };
         match accepted {
-            // Closed: the connections that are served keep their places.
-            Ok(_) if connections.len() >= MAX_CONNECTIONS => tracing::debug!("connection closed: too many at once"),
-            Ok((stream, _)) => drop(connections.spawn_local(serve_connection(stream, Rc::clone(&source)))),
+            Ok((_, client)) if !places.make_room(&client.ip(), Instant::now()) => {
+                tracing::debug!(%client, "connection closed: too many at once");
+            }
+            Ok((stream, client)) => {
+                let activity = Activity::new();
+                let task = connections.spawn_local(serve_connection(stream, Rc::clone(&source), activity.clone()));
+                places.take(client.ip(), activity, task);
+            }
             Err(error) => {
                 tracing::warn!(%error, "connection not accepted");
                 sleep(ACCEPT_PAUSE).await;
@@ -113,10 +123,15 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
     Ok(())
 }
 
-async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>) {
+async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity: Activity) {
     let answer = service_fn(move |request| {
-        let source = Rc::clone(&source);
-        async move { Ok::<_, Infallible>(answer(&request, &source).await) }
+        let (source, activity) = (Rc::clone(&source), activity.clone());
+        async move {
+            activity.begin_request();
+            let answer = answer(&request, &source).await;
+            activity.end_request();
+            Ok::<_, Infallible>(answer)
+        }
     });
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);
@@ -212,6 +227,34 @@ impl StatusSource {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn slow_clients_give_way_to_a_scrape() {
+        use tokio::io::AsyncWriteExt as _;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let address = listener.local_addr().unwrap();
+            let source = StatusSource { path: PathBuf::from("/nonexistent/status.sock"), is_up: Cell::new(None) };
+            let server = tokio::task::spawn_local(serve(listener, Rc::new(source)));
+            let mut slow = Vec::new();
+            for _ in 0..2 * MAX_CONNECTIONS {
+                let mut client = TcpStream::connect(address).await.unwrap();
+                // It may be refused already.
+                let _ = client.write_all(b"GET /met").await;
+                slow.push(client);
+            }
+            sleep(crate::io::places::GRACE).await;
+            let began = Instant::now();
+            let mut scrape = TcpStream::connect(address).await.unwrap();
+            scrape.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").await.unwrap();
+            let mut answer = String::new();
+            scrape.read_to_string(&mut answer).await.unwrap();
+            assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("packwatch_up 0"), "{answer}");
+            assert!(began.elapsed() < STATUS_LIMIT, "{:?}", began.elapsed());
+            server.abort();
+        });
+    }
 
     #[test]
     fn openmetrics_is_for_clients_that_accept_version_1() {

@@ -7,6 +7,7 @@
 mod engine;
 mod j1939_carrier;
 mod live;
+mod pending_answers;
 pub mod readiness;
 mod reload;
 mod status_publisher;
@@ -141,6 +142,7 @@ impl Service {
             engine,
             inbox,
             requests,
+            pending_answers: pending_answers::PendingAnswers::default(),
             reload,
             clock,
             batch: Vec::new(),

@@ -5,10 +5,14 @@
 //!   everything that was announced.
 //! * The state is also checkpointed every `[store] checkpoint_s` and on stop, and every second in the runtime folder,
 //!   which is in memory.
+//! * The state has two copies, written in turn (`state_slots`). Without a good one, the capacities in the history are
+//!   used (`learned`). Damage of the file is healed from its pages (`carve`).
+//! * On a full disk a reserve makes room for learned results and alarms (`reserve`).
 //! * The loop never touches the disk: a separate thread does (`writer`).
 //! * The daemon keeps running whatever is wrong with disk, folder or file, and reports it to the core (`store_failed`).
 
 mod backlog;
+mod carve;
 mod chain;
 pub mod commit_barrier;
 mod database;
@@ -16,12 +20,15 @@ mod delta_encoder;
 mod document;
 mod folder;
 mod history_filter;
+mod learned;
 mod meta;
 mod packed;
+mod pages;
 mod parts;
 mod reader;
 mod recorder;
 mod replace;
+mod reserve;
 mod retention;
 mod row_sql;
 mod rows;
@@ -43,13 +50,14 @@ use tokio::sync::watch;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
-use crate::monitor::{Downtime, Event, Monitor, Snapshot};
+use crate::monitor::{Command, Downtime, Event, EventKind, LearnedCell, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::StateDocument;
 use folder::{Folder, OpenedDatabase, SET_ASIDE};
 use history_filter::HistoryFilter;
 use reader::MAX_DAEMON_COPY_BYTES;
+use reserve::Reserve;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
 use stamp::{BootId, Stamp, WallClock};
@@ -59,7 +67,7 @@ pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
 pub use rows::HistoryTable;
-pub use verify::{BrokenRow, ChainReport};
+pub use verify::{BrokenRow, ChainReport, NotedHead};
 pub use writer::StoreProgress;
 
 /// State folder of a daemon that systemd did not start.
@@ -77,6 +85,9 @@ pub fn standard_folder() -> (PathBuf, bool) {
 /// Source of the state that the next checkpoint overwrites.
 pub const DATABASE_SOURCE: &str = "database";
 
+/// Source of a state that begins with the capacities in the history.
+pub const HISTORY_SOURCE: &str = "learned values in the history";
+
 /// A stored state that may be restored.
 #[derive(Debug)]
 pub struct StateCandidate {
@@ -93,6 +104,8 @@ pub struct StateCandidate {
 pub struct StoredStates {
     /// Stored states, the newest first.
     pub states: Vec<StateCandidate>,
+    /// What the history knows of the cells of the connected pack, when the database has no good state.
+    pub learned: Vec<LearnedCell>,
     /// Whether the store could be read and can be written.
     pub works: bool,
 }
@@ -122,7 +135,7 @@ impl Store {
         config: &StoreConfig,
         vehicle: &VehicleIdentity,
     ) -> Result<(Option<Self>, StoredStates), String> {
-        let none = |works| (None, StoredStates { states: Vec::new(), works });
+        let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone(), config.max_half_cycles);
@@ -163,11 +176,12 @@ impl Store {
         let path = folder.path().to_owned();
         let runtime_file = first_folder("RUNTIME_DIRECTORY").map(|folder| folder.join(runtime::FILE_NAME));
         let mut retry = Retry::default();
-        let mut found =
-            StoredStates { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
+        let works = opening.as_ref().is_some_and(|opening| opening.is_sound);
+        let mut found = StoredStates { states: Vec::new(), learned: Vec::new(), works };
         let mut reset_ns = None;
         let (database, rows, state, aside, is_unreadable) = match opening {
-            Some(OpenedDatabase { database, rows, state, aside, is_unreadable, .. }) => {
+            Some(OpenedDatabase { database, rows, state, aside, learned, is_unreadable, .. }) => {
+                found.learned = learned;
                 let counts = database.counts();
                 tracing::info!(
                     folder = %path.display(),
@@ -192,7 +206,8 @@ impl Store {
         let wall = WallClock::assess(now);
         found.states = candidates(running, state, now, wall);
         found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
-        let (sender, progress) = watch::channel(StoreProgress { works: found.works, ..StoreProgress::default() });
+        let (sender, progress) =
+            watch::channel(StoreProgress { works: found.works, has_room: true, ..StoreProgress::default() });
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
             // They are written with the first state.
@@ -203,6 +218,8 @@ impl Store {
             write_queue: Arc::clone(&write_queue),
             vehicle: vehicle.clone(),
             is_vehicle_noted: false,
+            reserve: Reserve::new(&path),
+            head_day: None,
             keep_years: config.keep_years,
             folder,
             database,
@@ -250,7 +267,12 @@ impl Store {
     /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = self.history_filter.take(events)?;
+        let rows = match self.history_filter.take(events) {
+            Some(rows) => rows,
+            // Its sender gets an answer when it is stored.
+            None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
+            None => return None,
+        };
         self.checkpointed = Some(now);
         Some(self.submit(rows, monitor, now, false))
     }
@@ -309,6 +331,11 @@ impl Store {
         let folder = self.folder.to_string_lossy().into_owned();
         StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot().for_restart()) }
     }
+}
+
+/// Whether an event is a command that has changed alarms.
+fn is_command_with_effect(kind: &EventKind) -> bool {
+    matches!(kind, EventKind::Command { command: Command::Acknowledge(_) | Command::Clear(_), changed: 1.., .. })
 }
 
 /// Reads the state of a folder that cannot be written.

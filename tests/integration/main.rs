@@ -51,6 +51,7 @@ mod monitor_reconfigure;
 mod monitor_restart;
 mod monitor_scenarios;
 mod monitor_statistics;
+mod on_board_model;
 mod other_cell;
 mod output_dbc;
 mod paper_scenario;

@@ -174,10 +174,14 @@ impl Maker {
             lli: losses[0].map(Some),
             lam_ne: losses[1].map(Some),
             lam_pe: losses[2].map(Some),
+            model_state: Some(2),
         };
         let mut wanted = match page {
             0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
-            1 => self.wanted("Health", &[("RechargePeriod", period), ("NormalizedRechargePeriod", normalised)]),
+            1 => self.wanted(
+                "Health",
+                &[("RechargePeriod", period), ("NormalizedRechargePeriod", normalised), ("ModelState", 2.0)],
+            ),
             2 => self.wanted(
                 "Health",
                 &[("UsableCapacity", usable), ("UsableCapacityStd", usable_std), ("ResistanceRatio", 100.0 * ratio)],

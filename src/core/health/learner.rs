@@ -130,6 +130,20 @@ impl Learner {
         }
     }
 
+    /// Continues from a capacity that was measured in an earlier run and is already in the cell's filter.
+    pub fn relearn(
+        &mut self,
+        config: &CapacityConfig,
+        cell: usize,
+        capacity: ScalarGaussian,
+        estimator: &CellEstimator,
+    ) {
+        self.drift[cell] = DriftFilter::new(config, capacity);
+        self.capacity[cell] = capacity;
+        self.prior[cell] = estimator.capacity();
+        self.learned[cell] = true;
+    }
+
     /// Adds a cell's sample to its totals.
     ///
     /// `measured_s` and `gap_s` are the times since the sample before with and without a measured current, s; the gap is

@@ -12,7 +12,7 @@
 //! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
 //! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
 //! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
-//! * `stages` wires all of these; `clock`, `snapshot`, `reconfigure`, `statistics`, `view` go with the whole.
+//! * `stages` wires all of these; `clock`, `snapshot`, `relearn`, `reconfigure`, `statistics`, `view` go with the whole.
 
 mod alarm_queue;
 mod alarming;
@@ -33,6 +33,7 @@ mod modelling;
 mod outputs;
 mod publisher;
 mod reconfigure;
+mod relearn;
 mod sampling;
 mod sender;
 mod sleep;
@@ -63,6 +64,7 @@ pub use j1939::{AlarmCode, J1939Config};
 pub use modelling::{ModelState, ModelView};
 pub use outputs::{Estimate, MeasuredValues, Outputs, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
+pub use relearn::LearnedCell;
 pub use sender::{MAX_TEST_S, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
 pub use statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};

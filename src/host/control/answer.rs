@@ -69,14 +69,22 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// The outcome of a command, from the events it caused and the alarms after it.
-pub fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event], time: Timestamp) -> Answer {
+/// The outcome of a command, from the events it caused and the alarms after it; `is_stored` is left to the caller.
+///
+/// # Errors
+/// When the core has reported none.
+pub fn outcome(
+    engine: &AlarmEngine,
+    command: &Command,
+    events: &[Event],
+    time: Timestamp,
+) -> Result<CommandOutcome, Answer> {
     let counts = events.iter().rev().find_map(|event| match event.kind {
         EventKind::Command { source: Source::Local, changed, refused, .. } => Some((changed, refused)),
         _ => None,
     });
     let Some((changed, refused)) = counts else {
-        return Answer::Error("the daemon's core did not report the outcome".to_owned());
+        return Err(Answer::Error("the daemon's core did not report the outcome".to_owned()));
     };
     let mut refused_alarms: Vec<Alarm> = match command {
         Command::Clear(which) if refused > 0 => {
@@ -85,7 +93,7 @@ pub fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event], time: 
         _ => Vec::new(),
     };
     shorten(&mut refused_alarms);
-    Answer::Outcome(CommandOutcome { time, changed, refused, refused_alarms })
+    Ok(CommandOutcome { time, changed, refused, refused_alarms, is_stored: None })
 }
 
 /// Why an alarm was not cleared, in words.
@@ -177,11 +185,11 @@ mod tests {
         let command = Command::Clear(Selector::default());
         let kind = EventKind::Command { source: Source::Local, command, changed: 0, refused: 1 };
         let events = [Event { time: Timestamp::ZERO, kind }];
-        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Ok(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!((done.changed, done.refused, done.refused_alarms.len()), (0, 1, 1));
         assert_eq!(refusal(&done.refused_alarms[0]), "still beyond its threshold");
         see(&mut engine, Rule::TemperatureHigh, None, None);
-        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Ok(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!(refusal(&done.refused_alarms[0]), "its value is not known");
     }
 }

@@ -10,8 +10,10 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// Longest wait for an answer: a daemon answers between two ticks, so one that needs longer hangs.
+/// Longest wait for a list: a daemon answers between two ticks, so one that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
+/// Longest wait for the outcome of a command, which waits up to 30 s for a slow disk.
+const COMMAND_PATIENCE: Duration = Duration::from_secs(35);
 /// Longest answer, bytes: a thousand alarms of 400 bytes, ten times over.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
 
@@ -38,7 +40,7 @@ impl ControlClient {
     /// # Errors
     /// When no daemon answers: names the socket and the remedy.
     pub fn ask_line(&self, request: Request) -> Result<Vec<u8>, String> {
-        self.exchange(request).map_err(|error| self.explain(&error))
+        self.exchange(request).map_err(|error| self.explain(request, &error))
     }
 
     /// Sends a request; returns the contents of the answer.
@@ -51,7 +53,7 @@ impl ControlClient {
 
     fn exchange(&self, request: Request) -> io::Result<Vec<u8>> {
         let mut stream = UnixStream::connect(&self.path)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
         // A daemon without a free place may have answered and closed already.
         let written = stream.write_all(request.to_line().as_bytes());
@@ -63,7 +65,7 @@ impl ControlClient {
         written.and(Err(ErrorKind::UnexpectedEof.into()))
     }
 
-    fn explain(&self, error: &io::Error) -> String {
+    fn explain(&self, request: Request, error: &io::Error) -> String {
         let path = self.path.display();
         match error.kind() {
             ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
@@ -74,7 +76,7 @@ impl ControlClient {
                 format!("{path}: permission denied; the daemon's own user, its group and root may connect")
             }
             ErrorKind::WouldBlock | ErrorKind::TimedOut => {
-                format!("{path}: no answer within {} s", PATIENCE.as_secs())
+                format!("{path}: no answer within {} s", patience(request).as_secs())
             }
             ErrorKind::UnexpectedEof | ErrorKind::BrokenPipe | ErrorKind::ConnectionReset => {
                 format!("{path}: the daemon closed the connection without an answer")
@@ -82,4 +84,8 @@ impl ControlClient {
             _ => format!("{path}: {error}"),
         }
     }
+}
+
+const fn patience(request: Request) -> Duration {
+    if request.changes_something() { COMMAND_PATIENCE } else { PATIENCE }
 }

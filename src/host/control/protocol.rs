@@ -90,6 +90,10 @@ pub struct CommandOutcome {
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,
+    /// Whether its changes are on the disk: a power cut does not undo them. `None` = nothing changed that is stored, or no
+    /// state is kept.
+    #[serde(default)]
+    pub is_stored: Option<bool>,
 }
 
 /// The keys of every answer, with its contents.
@@ -276,8 +280,13 @@ mod tests {
 
     #[test]
     fn an_answer_is_its_contents_or_its_error() {
-        let done =
-            CommandOutcome { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
+        let done = CommandOutcome {
+            time: Timestamp::from_secs(1.5),
+            changed: 2,
+            refused: 1,
+            refused_alarms: Vec::new(),
+            is_stored: Some(true),
+        };
         assert_eq!(contents::<CommandOutcome>(&Answer::Outcome(done.clone()).to_line()), Ok(done.clone()));
         assert_eq!(
             contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()),

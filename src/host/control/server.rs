@@ -1,18 +1,18 @@
 //! The server of the control socket: accepts connections, passes requests to the loop and sends its answers back.
 
-use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
-use tokio::net::unix::OwnedWriteHalf;
+use tokio::net::unix::{OwnedWriteHalf, UCred};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
-use super::{MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
+use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
 use crate::io::place::PlaceSetting;
+use crate::io::places::{Activity, PlaceLimits, Places};
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
@@ -73,7 +73,7 @@ struct ConnectionContext {
 }
 
 async fn accept(listener: UnixListener, context: ConnectionContext) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut places = Places::new(PlaceLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_PROCESS });
     let mut connections = JoinSet::new();
     loop {
         while connections.try_join_next().is_some() {}
@@ -85,16 +85,21 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
                 continue;
             }
         };
-        match Arc::clone(&places).try_acquire_owned() {
-            Ok(place) => {
-                let context = context.clone();
-                connections.spawn(async move {
-                    serve_connection(stream, &context).await;
-                    drop(place);
-                });
+        let peer = match stream.peer_cred() {
+            Ok(peer) => peer,
+            Err(error) => {
+                tracing::warn!(%error, "the kernel does not identify a client of the control socket");
+                continue;
             }
-            Err(_) => refuse(&stream),
+        };
+        if !places.make_room(&peer.pid(), Instant::now()) {
+            refuse(&stream);
+            continue;
         }
+        let (context, activity) = (context.clone(), Activity::new());
+        let of_task = activity.clone();
+        let task = connections.spawn(async move { serve_connection(stream, peer, &context, &of_task).await });
+        places.take(peer.pid(), activity, task);
     }
 }
 
@@ -105,11 +110,7 @@ fn refuse(stream: &UnixStream) {
     let _ = stream.try_write(&Answer::Error(error).to_line());
 }
 
-async fn serve_connection(stream: UnixStream, context: &ConnectionContext) {
-    let peer = match stream.peer_cred() {
-        Ok(peer) => peer,
-        Err(error) => return tracing::warn!(%error, "the kernel does not identify a client of the control socket"),
-    };
+async fn serve_connection(stream: UnixStream, peer: UCred, context: &ConnectionContext, activity: &Activity) {
     let may_change = peer.uid() == context.own_uid || peer.uid() == 0;
     let (read, mut write) = stream.into_split();
     let mut reader = BufReader::new(read);
@@ -142,7 +143,10 @@ async fn serve_connection(stream: UnixStream, context: &ConnectionContext) {
                 if request.changes_something() {
                     tracing::info!(uid = peer.uid(), pid = peer.pid(), ?request, "command over the control socket");
                 }
-                ask(context, request).await
+                activity.begin_request();
+                let answer = ask(context, request).await;
+                activity.end_request();
+                answer
             }
         };
         if send(&mut write, answer, context).await.is_err() {

@@ -1,16 +1,19 @@
 //! The program's one reader of CSV tables: columns by name, rows streamed, every fault with its place.
 //!
 //! In: CSV with one header line, plain, gzip or zstd. Out: [`Row`]s of fields that are read as text, numbers or stamps.
-//! Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header: a field that a
+//! A row of more than a megabyte ends the reading. Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header: a field that a
 //! row lacks reads as empty. A fault reads `FILE:LINE: column NAME: found X, must be ALLOWED`; it never ends the reading,
 //! so that the caller may skip the row.
 
 use std::borrow::Cow;
+use std::cell::Cell;
 use std::io::Read;
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::rc::Rc;
 use std::sync::Arc;
 
+use super::row_limit::RowLimit;
 use super::{lines, stamp};
 use crate::quantity::Timestamp;
 
@@ -37,7 +40,9 @@ pub enum Quotes {
 
 /// A table being read.
 pub struct Table {
-    reader: csv::Reader<Box<dyn Read>>,
+    reader: csv::Reader<RowLimit>,
+    /// Bytes read since the last row.
+    since_row: Rc<Cell<usize>>,
     record: csv::ByteRecord,
     header: Header,
 }
@@ -77,11 +82,12 @@ impl Table {
     pub fn new(source: Box<dyn Read>, file: String, quotes: Quotes) -> Result<Self, TableError> {
         let mut builder = csv::ReaderBuilder::new();
         builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All);
+        let (source, since_row) = RowLimit::new(source);
         let mut reader = builder.from_reader(source);
         let fields = reader.byte_headers().map_err(|error| damaged(&file, &error))?;
         let name = |field| String::from_utf8_lossy(field).trim_start_matches('\u{feff}').trim_matches('"').to_owned();
         let names = fields.iter().map(name).collect();
-        Ok(Self { reader, record: csv::ByteRecord::new(), header: Header { file, names } })
+        Ok(Self { reader, since_row, record: csv::ByteRecord::new(), header: Header { file, names } })
     }
 
     /// The file's name and its columns.
@@ -94,6 +100,7 @@ impl Table {
     /// # Errors
     /// The source fails, as a damaged compressed file does.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
+        self.since_row.set(0);
         let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
         let line = self.record.position().map_or(0, csv::Position::line);
         Ok(more.then_some(Row { line, record: &self.record, header: &self.header }))
@@ -248,6 +255,24 @@ mod tests {
                 "t.csv:4: column name: found no such field, must be a name",
             ]
         );
+    }
+
+    #[test]
+    fn a_row_without_an_end_is_an_error_and_takes_little_memory() {
+        for (start, quotes) in [("a\n", Quotes::Literal), ("a\n\"", Quotes::Enclose), ("", Quotes::Literal)] {
+            let endless = Box::new(start.as_bytes().chain(std::io::repeat(b'7')));
+            let error = match Table::new(endless, "t.csv".to_owned(), quotes) {
+                Ok(mut table) => table.next_row().expect_err("never ends"),
+                Err(error) => error,
+            };
+            assert_eq!(error.0, "t.csv: damaged: a row of more than 1048576 bytes, must be at most that many");
+        }
+        // Rows of the allowed length follow each other.
+        let row = format!("{}\n", "7".repeat(crate::io::row_limit::MAX_ROW_BYTES - 10_000));
+        let mut table = table(&row.repeat(4), Quotes::Literal);
+        for _ in 0..3 {
+            assert!(table.next_row().expect("reads").is_some());
+        }
     }
 
     #[test]

@@ -16,12 +16,12 @@ use crate::io::journal::{self, JournalWriter};
 use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
+use crate::monitor::{Downtime, Input, LearnedCell, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress};
+use crate::store::{DATABASE_SOURCE, HISTORY_SOURCE, StateCandidate, Store, StoreProgress};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]
@@ -41,6 +41,8 @@ pub(super) struct Engine {
     store: Option<Store>,
     /// Whether the store can be written.
     store_works: bool,
+    /// Whether the disk has room for more than what is urgent.
+    has_room: bool,
     /// Whether files can be written, as last reported to the core.
     reported_works: Option<bool>,
     barrier: CommitBarrier,
@@ -71,7 +73,9 @@ impl Engine {
             tracing::info!(away = %service.downtime, stamped_s, "state restored");
             (Some(service.downtime), None)
         } else {
-            restore_first_valid(&mut monitor, found.states, service.record.as_deref())
+            let mut states = found.states;
+            states.extend(state_of_history(&service.config.monitor, &found.learned));
+            restore_first_valid(&mut monitor, states, service.record.as_deref())
         };
         if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
             store.set_state_aside(why, now);
@@ -104,6 +108,7 @@ impl Engine {
             has_lost_file,
             store,
             store_works: found.works && unfit.is_none(),
+            has_room: true,
             reported_works: None,
             barrier: CommitBarrier::default(),
             is_fresh: false,
@@ -113,13 +118,14 @@ impl Engine {
         })
     }
 
-    /// Journals one input, passes it to the core and dispatches its outputs.
-    pub(super) fn handle(&mut self, input: &Input<'_>) {
+    /// Journals one input, passes it to the core and dispatches its outputs. Returns the ticket of the commit of what it
+    /// changed; `None` = nothing that is stored, or nothing is stored.
+    pub(super) fn handle(&mut self, input: &Input<'_>) -> Option<u64> {
         self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(input));
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
         self.is_fresh |= matches!(input, Input::Frame { .. });
-        self.dispatch_outputs(input.time());
+        self.dispatch_outputs(input.time())
     }
 
     /// Gives the core another configuration, and journals that.
@@ -135,9 +141,10 @@ impl Engine {
         Ok(changed)
     }
 
-    /// Sends the core's frames to the interfaces and its events to the log, and both to their files.
-    fn dispatch_outputs(&mut self, time: Timestamp) {
-        self.commit_learned(time);
+    /// Sends the core's frames to the interfaces and its events to the log, and both to their files. Returns the ticket of
+    /// their commit.
+    fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
+        let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {
             if !self.barrier.hold(transmit) {
                 send(&self.links, transmit);
@@ -153,15 +160,16 @@ impl Engine {
             self.recent.note(event);
             self.has_lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
+        ticket
     }
 
     /// Commits learned results; their announcement waits for the commit, unless the store has failed.
-    fn commit_learned(&mut self, now: Timestamp) {
-        let Some(store) = &mut self.store else { return };
-        let ticket = store.learned(&self.outputs.events, &self.monitor, now);
-        if let Some(ticket) = ticket.filter(|_| self.store_works) {
+    fn commit_learned(&mut self, now: Timestamp) -> Option<u64> {
+        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
+        if self.store_works {
             self.barrier.begin(ticket, Instant::now());
         }
+        Some(ticket)
     }
 
     /// The progress of the store, with every change; `None` = there is no store.
@@ -172,7 +180,7 @@ impl Engine {
     /// Handles progress or failure of the store.
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
         self.barrier.release(progress.ticket, |transmit| send(&self.links, transmit));
-        self.store_works = progress.works;
+        (self.store_works, self.has_room) = (progress.works, progress.has_room);
         self.progress = Some(progress);
         self.report_store_health(time);
     }
@@ -221,7 +229,7 @@ impl Engine {
     /// Reports to the core whether files can be written, when that has changed.
     pub(super) fn report_store_health(&mut self, time: Timestamp) {
         // The lost file may be the journal; the core gets the input anyway.
-        let works = self.store_works && !self.has_lost_file;
+        let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
             self.handle(&Input::Store { time, works });
@@ -257,6 +265,19 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
     if let Some(link) = links.get(transmit.bus.index()) {
         link.send(transmit.frame);
     }
+}
+
+/// A new state with what the history knows of the cells; `None` = it knows nothing of these cells.
+fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<StateCandidate> {
+    if learned.is_empty() {
+        return None;
+    }
+    let mut monitor = Monitor::new(config.clone());
+    if !monitor.relearn(learned) {
+        tracing::warn!("the learned values in the history are of other cells: not used");
+        return None;
+    }
+    Some(StateCandidate { snapshot: monitor.snapshot(), downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
 /// Restores the first stored state that validates. Returns its age, and why the database's state does not fit, if it does

@@ -9,10 +9,11 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
+use super::pending_answers::PendingAnswers;
 use super::reload::{Reload, ReloadStep, log_outcome};
 use super::status_publisher::StatusPublisher;
 use super::{INBOX, ServiceError, notify};
-use crate::control::protocol::{Answer, Request};
+use crate::control::protocol::{Answer, CommandOutcome, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
 use crate::io::record::Record;
@@ -38,6 +39,7 @@ pub(super) struct ServiceLoop {
     pub(super) engine: Engine,
     pub(super) inbox: mpsc::Receiver<Record>,
     pub(super) requests: mpsc::Receiver<PendingRequest>,
+    pub(super) pending_answers: PendingAnswers,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) batch: Vec<Record>,
@@ -60,6 +62,7 @@ impl ServiceLoop {
                 () = stop.wait() => return,
                 now = ticks.tick() => {
                     self.status_publisher.note_tick(now);
+                    self.pending_answers.note_time(now);
                     let time = self.tick().await;
                     self.notify_manager(now);
                     self.status_publisher.publish(&self.engine, now, time);
@@ -73,6 +76,7 @@ impl ServiceLoop {
                     }
                 }
                 progress = next_progress(&mut stored) => {
+                    self.pending_answers.note_progress(&progress);
                     self.engine.handle_store_progress(progress, self.clock.now());
                 }
                 // At most one request per connection waits.
@@ -115,27 +119,33 @@ impl ServiceLoop {
         time
     }
 
-    /// Answers a request of the control socket.
-    async fn answer(&mut self, pending: PendingRequest) {
+    /// Answers a request of the control socket; a command that changes what is stored, when that is on the disk.
+    async fn answer(&mut self, PendingRequest { request, answer: client }: PendingRequest) {
         let alarms = self.engine.monitor.alarms();
-        let answer = match pending.request {
+        let answer = match request {
             Request::Alarms { all } => answer::list(alarms, self.clock.now(), all),
             Request::Command(command) => match answer::meaningless(alarms, &command) {
                 Some(error) => error,
-                None => self.apply_command(command).await,
+                None => match self.apply_command(command).await {
+                    (Err(error), _) => error,
+                    (Ok(outcome), None) => Answer::Outcome(outcome),
+                    (Ok(outcome), Some(ticket)) => {
+                        return self.pending_answers.hold(ticket, outcome, client, Instant::now());
+                    }
+                },
             },
         };
         // The client may have closed the connection.
-        let _ = pending.answer.send(answer);
+        let _ = client.send(answer);
     }
 
-    /// Passes a command to the core, after the input received before it.
-    async fn apply_command(&mut self, command: Command) -> Answer {
+    /// Passes a command to the core, after the input received before it. Returns its outcome and the ticket of its commit.
+    async fn apply_command(&mut self, command: Command) -> (Result<CommandOutcome, Answer>, Option<u64>) {
         self.drain().await;
         let time = self.clock.now();
-        self.engine.handle(&Input::Command { time, command });
+        let ticket = self.engine.handle(&Input::Command { time, command });
         let Engine { monitor, outputs, .. } = &self.engine;
-        answer::outcome(monitor.alarms(), &command, &outputs.events, time)
+        (answer::outcome(monitor.alarms(), &command, &outputs.events, time), ticket)
     }
 
     /// Handles everything that the interfaces have received so far.

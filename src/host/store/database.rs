@@ -4,27 +4,27 @@
 //!   not return leaves no trace.
 //! * A damaged file, a file of a newer program and a file that cannot be reached are three different errors.
 
+use std::fs::File;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, TransactionBehavior};
+use rusqlite::{Connection, ErrorCode, MAIN_DB, OpenFlags, OptionalExtension, TransactionBehavior};
 
-use super::delta_encoder::DeltaEncoder;
+use super::chain::hex;
 use super::document::StateDocument;
+use super::learned;
 use super::meta::{self, Meta};
 use super::retention;
 use super::row_sql::write_batch;
 use super::rows::{HistoryRow, RowBatch};
 use super::schema::{self, MIGRATIONS};
 use super::stamp::{BootId, Stamp};
-use super::state_slots::{
-    ASIDE, STATE, StateRecord, StoredState, read_base, read_document, read_state, set_aside, write_state,
-};
+use super::state_slots::{self, StateCopies, StateRecord, StoredState, read_aside, read_state};
 use crate::config::VehicleIdentity;
-use crate::monitor::EventKind;
+use crate::monitor::{EventKind, LearnedCell};
 
 /// Bytes of a page: a checkpoint changes few bytes, and whole pages are written.
-const PAGE_BYTES: u32 = 1024;
+pub(super) const PAGE_BYTES: u32 = 1024;
 /// Pages in the write-ahead log after which SQLite copies them into the main file: half a megabyte, some seventy
 /// checkpoints of a pack of 96 cells, which change a dozen pages of the main file.
 const AUTOCHECKPOINT_PAGES: u32 = 512;
@@ -64,15 +64,24 @@ impl From<rusqlite::Error> for OpenError {
     }
 }
 
-/// Whether an error means that the file's contents are wrong.
+/// Whether an error means that the file's contents are wrong: every error that neither the disk nor another process
+/// causes. One that is missed would end in a store that is never written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
-        rusqlite::Error::SqliteFailure(failure, text) => match failure.code {
-            ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase => true,
-            // A table of this version is missing.
-            ErrorCode::Unknown => text.as_deref().is_some_and(|text| text.starts_with("no such")),
-            _ => false,
-        },
+        rusqlite::Error::SqliteFailure(failure, _) => !matches!(
+            failure.code,
+            ErrorCode::SystemIoFailure
+                | ErrorCode::DiskFull
+                | ErrorCode::CannotOpen
+                | ErrorCode::PermissionDenied
+                | ErrorCode::ReadOnly // of a writable file: `Database::open`
+                | ErrorCode::DatabaseBusy
+                | ErrorCode::DatabaseLocked
+                | ErrorCode::FileLockingProtocolFailed
+                | ErrorCode::OperationAborted
+                | ErrorCode::OperationInterrupted
+                | ErrorCode::OutOfMemory
+        ),
         rusqlite::Error::QueryReturnedNoRows
         | rusqlite::Error::InvalidColumnType(..)
         | rusqlite::Error::FromSqlConversionFailure(..)
@@ -87,7 +96,7 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
 pub(super) struct Database {
     connection: Connection,
     meta: Meta,
-    delta_encoder: DeltaEncoder,
+    copies: StateCopies,
     max_half_cycles: i64,
     /// Half-cycles before this wall clock are deleted, ns since 1970; `None` = none.
     horizon_ns: Option<i64>,
@@ -124,8 +133,14 @@ impl Database {
         connection.busy_timeout(BUSY_TIMEOUT)?;
         let version = schema::version(&connection)?;
         let known = schema::known(migrations);
+        if !schema::is_confirmed(&connection, version) {
+            return Err(OpenError::Damaged(format!("layout version {version}, not the one noted in the table meta")));
+        }
         if version > known {
             return Err(OpenError::Newer { found: version, known });
+        }
+        if connection.is_readonly(MAIN_DB)? && File::options().write(true).open(path).is_ok() {
+            return Err(OpenError::Damaged("the file is marked as read-only".to_owned()));
         }
         if version == 0 && !is_new && has_tables(&connection)? {
             return Err(OpenError::Damaged("a database, but not one of packwatch".to_owned()));
@@ -135,16 +150,24 @@ impl Database {
             check(&mut connection)?;
         }
         schema::migrate(&mut connection, version, migrations)?;
-        let meta = open_pack(&connection, now)?;
+        let mut meta = open_pack(&connection, now)?;
+        if let Some(fault) = meta.fault(&connection, known)? {
+            return Err(OpenError::Damaged(fault));
+        }
         // A damaged record is reported by [`Self::state`].
-        let delta_encoder = read_base(&connection, STATE)?;
-        Ok(Self { connection, meta, delta_encoder, max_half_cycles: i64::from(max_half_cycles), horizon_ns: None })
+        let copies = StateCopies::read(&connection, known)?;
+        Ok(Self { connection, meta, copies, max_half_cycles: i64::from(max_half_cycles), horizon_ns: None })
     }
 
     /// Rows so far.
     pub(super) fn counts(&self) -> Counts {
         let Meta { head, half_cycles, pack, .. } = self.meta;
         Counts { chained: head.count, half_cycles, packs: pack }
+    }
+
+    /// The chain's end: number of rows, hash of the last.
+    pub(super) fn head(&self) -> (i64, String) {
+        (self.meta.head.count, hex(&self.meta.head.hash))
     }
 
     /// Sets the wall clock before which checkpoints delete half-cycles, ns since 1970; `None` = they delete none.
@@ -173,16 +196,13 @@ impl Database {
                 retention::expire(&transaction, &mut meta, horizon_ns)?;
             }
         }
-        let packed = match state {
+        let written = match state {
             None => None,
             Some(StateRecord { parts, exact, sets_aside }) => {
                 if sets_aside {
-                    set_aside(&transaction)?;
-                    self.delta_encoder = DeltaEncoder::default();
+                    self.copies.set_aside(&transaction)?;
                 }
-                let packed = self.delta_encoder.encode(parts, exact);
-                write_state(&transaction, &packed)?;
-                Some(packed)
+                Some(self.copies.write(&transaction, parts, exact)?)
             }
         };
         if meta != self.meta {
@@ -190,18 +210,23 @@ impl Database {
         }
         transaction.commit()?;
         self.meta = meta;
-        packed.into_iter().for_each(|packed| self.delta_encoder.note_stored(packed));
+        written.into_iter().for_each(|written| self.copies.note_stored(written));
         Ok(())
     }
 
     /// The latest state, as [`read_state`] reads it.
     pub(super) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-        read_state(&self.connection, &self.delta_encoder, STATE)
+        read_state(&self.connection)
     }
 
     /// The state that was set aside; `None` = there is no good one.
     pub(super) fn state_aside(&self) -> Option<StateDocument> {
-        read_document(&self.connection, ASIDE)
+        read_aside(&self.connection)
+    }
+
+    /// What the history knows of the cells of the connected pack.
+    pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
+        learned::read(&self.connection, self.meta.pack)
     }
 
     /// Boot time at which another pack was connected last in this boot, ns.
@@ -230,11 +255,11 @@ impl Database {
         let (capacity_ah, capacity_std_ah) = learned.unwrap_or_default();
         let row = HistoryRow::Event(EventKind::PackReplaced { capacity_ah, capacity_std_ah });
         write_batch(&transaction, &mut meta, &RowBatch { stamp: *now, rows: vec![row] })?;
-        transaction.execute("DELETE FROM state", [])?;
+        state_slots::forget_all(&transaction)?;
         meta.write(&transaction)?;
         transaction.commit()?;
         self.meta = meta;
-        self.delta_encoder = DeltaEncoder::default();
+        self.copies = StateCopies::default();
         Ok(meta.pack)
     }
 
@@ -275,6 +300,8 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "cache_size", -i64::from(CACHE_KIB))?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
+    // What is deleted is overwritten: a salvage must not find it.
+    connection.query_row("PRAGMA secure_delete = ON", [], |_| Ok(()))?;
     connection.query_row(&format!("PRAGMA journal_size_limit = {MAX_LOG_BYTES}"), [], |_| Ok(()))?;
     connection.query_row(&format!("PRAGMA wal_autocheckpoint = {AUTOCHECKPOINT_PAGES}"), [], |_| Ok(()))
 }

@@ -31,8 +31,8 @@ struct BaseRecord {
 /// A state, encoded for the database.
 #[derive(Debug)]
 pub(super) struct EncodedState {
-    /// Number of the full record that it is or that it is based on.
-    pub(super) serial: i64,
+    /// Number of the record.
+    pub(super) number: i64,
     /// Whether it is a full record.
     pub(super) is_full: bool,
     /// Bytes of the record.
@@ -44,9 +44,9 @@ pub(super) struct EncodedState {
 }
 
 impl DeltaEncoder {
-    /// Resumes after a start, from the stored full record.
+    /// Resumes after a start, from the stored full record of number `serial`.
     pub(super) fn with_base(serial: i64, record: &[u8], delta_room: usize) -> Result<Self, DamagedRecord> {
-        let parts = packed::read_full(record)?;
+        let parts = packed::read_full(record, serial)?;
         let base = BaseRecord { serial, parts, full_bytes: record.len(), least_delta: usize::MAX, excess: 0 };
         Ok(Self { base: Some(base), delta_room })
     }
@@ -56,27 +56,26 @@ impl DeltaEncoder {
         self.base.as_ref().map(|base| (base.serial, &base.parts))
     }
 
-    /// Encodes a state; `exact` asks for a full record.
-    pub(super) fn encode(&self, parts: JsonParts, exact: bool) -> EncodedState {
-        let serial = self.base.as_ref().map_or(0, |base| base.serial);
+    /// Encodes a state as the record of number `number`; `exact` asks for a full record.
+    pub(super) fn encode(&self, parts: JsonParts, number: i64, exact: bool) -> EncodedState {
         let delta = self.base.as_ref().filter(|base| !exact && base.excess <= base.full_bytes);
         let record = delta.and_then(|base| {
-            let record = packed::delta(&parts, &base.parts, base.serial);
+            let record = packed::delta(&parts, &base.parts, base.serial, number);
             ((record.len() as f64) <= MAX_DELTA * base.full_bytes as f64).then_some(record)
         });
         let is_full = record.is_none();
-        let mut bytes = record.unwrap_or_else(|| packed::full(&parts));
+        let mut bytes = record.unwrap_or_else(|| packed::full(&parts, number));
         let length = bytes.len();
         let room = length.next_multiple_of(ROOM_STEP);
         bytes.resize(if is_full { room } else { room.max(self.delta_room) }, 0);
-        EncodedState { serial: serial + i64::from(is_full), is_full, length, bytes, parts }
+        EncodedState { number, is_full, length, bytes, parts }
     }
 
     /// Notes that a record is on the disk.
     pub(super) fn note_stored(&mut self, packed: EncodedState) {
         if packed.is_full {
             let full_bytes = packed.length;
-            let (serial, parts) = (packed.serial, packed.parts);
+            let (serial, parts) = (packed.number, packed.parts);
             self.base = Some(BaseRecord { serial, parts, full_bytes, least_delta: usize::MAX, excess: 0 });
         } else if let Some(base) = &mut self.base {
             base.least_delta = base.least_delta.min(packed.length);
@@ -104,7 +103,7 @@ mod tests {
             // Half of the numbers move now and then, and then stay.
             let mut parts = state(minute / 60 * 60, 1000);
             parts.bits[..300].copy_from_slice(&state(minute, 300).bits);
-            let packed = delta_encoder.encode(parts, false);
+            let packed = delta_encoder.encode(parts, i64::from(minute) + 1, false);
             fulls += u32::from(packed.is_full);
             delta_encoder.note_stored(packed);
         }
@@ -114,11 +113,11 @@ mod tests {
     #[test]
     fn a_delta_as_large_as_a_full_record_is_written_in_full() {
         let mut delta_encoder = DeltaEncoder::default();
-        let first = delta_encoder.encode(state(1, 10), false);
+        let first = delta_encoder.encode(state(1, 10), 1, false);
         assert!(first.is_full && first.bytes.len() == ROOM_STEP);
         delta_encoder.note_stored(first);
-        assert!(delta_encoder.encode(state(99, 2000), false).is_full);
-        assert!(!delta_encoder.encode(state(1, 10), false).is_full);
-        assert!(delta_encoder.encode(state(1, 10), true).is_full);
+        assert!(delta_encoder.encode(state(99, 2000), 2, false).is_full);
+        assert!(!delta_encoder.encode(state(1, 10), 2, false).is_full);
+        assert!(delta_encoder.encode(state(1, 10), 2, true).is_full);
     }
 }

@@ -7,7 +7,7 @@
 //!
 //! | in the folder | time of the cut | action |
 //! | --- | --- | --- |
-//! | `packwatch.db.part` | while it was filled | deleted, filled again |
+//! | `packwatch.db.part`, `packwatch.db.pages` | while it was filled | deleted, filled again |
 //! | `packwatch.db.new` | after it was complete | takes the place of the database |
 //!
 //! So the damaged database is moved only when its saved rows, its state and the report are on the disk.
@@ -26,11 +26,14 @@ use super::stamp::Stamp;
 use super::state_slots::StateRecord;
 use super::wal::{self, Fault};
 use crate::io::place::with_suffix;
+use crate::monitor::LearnedCell;
 
 /// Name of the database.
 pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of its replacement while that is filled.
 const PART: &str = "packwatch.db.part";
+/// Name of the database of a salvage with the rows as they were found.
+const PAGES: &str = "packwatch.db.pages";
 /// Name of its replacement that is complete.
 const NEW: &str = "packwatch.db.new";
 /// Name of the file that a daemon locks while it uses the folder.
@@ -69,6 +72,8 @@ pub(super) struct OpenedDatabase {
     pub state: Option<StateDocument>,
     /// A state that was set aside earlier.
     pub aside: Option<StateDocument>,
+    /// What the history knows of the cells, when there is no good state.
+    pub learned: Vec<LearnedCell>,
     /// Whether it holds a state that this program cannot read and must not overwrite.
     pub is_unreadable: bool,
     /// Whether nothing had to be set aside and nothing was lost.
@@ -160,8 +165,10 @@ impl Folder {
         }
         self.replaced = Some(Instant::now());
         let part = self.path.join(PART);
-        remove(&part);
+        let pages = self.path.join(PAGES);
+        [&part, &pages].into_iter().for_each(|path| remove(path));
         let filled = self.fill(&part, why, now);
+        remove(&pages);
         if filled.is_err() {
             // Frees the space for the next attempt and for other programs.
             remove(&part);
@@ -172,7 +179,7 @@ impl Folder {
 
     fn fill(&self, part: &Path, why: &str, now: &Stamp) -> Result<(), OpenError> {
         let mut database = Database::open(part, now, self.max_half_cycles)?;
-        let saved = salvage::salvage(&self.path.join(DATABASE), &mut database)?;
+        let saved = salvage::salvage(&self.path.join(DATABASE), &self.path.join(PAGES), &mut database)?;
         tracing::error!(
             error = why,
             capacities = saved.capacities,
@@ -263,14 +270,15 @@ impl Folder {
                         report("state_unfit", format!("{why}; {SET_ASIDE}"));
                     }
                 }
-                if let Some(why) = stored.lost_later {
-                    report("state_damaged", format!("{why}; an earlier state is used"));
+                if let Some(why) = stored.fault {
+                    report("state_damaged", why);
                 }
             }
             Err(why) => report("state_damaged", why),
         }
         let aside = database.state_aside();
-        Ok(OpenedDatabase { database, rows, state, aside, is_unreadable, is_sound })
+        let learned = if state.is_none() { database.learned()? } else { Vec::new() };
+        Ok(OpenedDatabase { database, rows, state, aside, learned, is_unreadable, is_sound })
     }
 }
 

@@ -1,8 +1,9 @@
 //! The row of `meta`: the end of the chain, the counts of half-cycles, which pack is connected, and the vehicle.
 
-use rusqlite::{Connection, params};
+use rusqlite::{Connection, OptionalExtension, params};
 
-use super::chain::ChainHead;
+use super::chain::{ChainHead, Hash};
+use super::rows::HistoryTable;
 use crate::config::VehicleIdentity;
 
 /// The vehicle that the history is of. A text that cannot be read states none.
@@ -41,6 +42,24 @@ impl Meta {
             let head = ChainHead { count: row.get(0)?, hash: row.get(1)? };
             Ok(Self { head, half_cycles: row.get(2)?, thinned: row.get(3)?, thinned_to: row.get(4)?, pack })
         })
+    }
+
+    /// Compares it with the tables of layout `version`; returns what contradicts it. The number of half-cycles is counted again.
+    pub(super) fn fault(&mut self, connection: &Connection, version: i32) -> rusqlite::Result<Option<String>> {
+        self.half_cycles = connection.query_row("SELECT count(*) FROM half_cycle", [], |row| row.get(0))?;
+        let packs: i64 = connection.query_row("SELECT count(*) FROM pack", [], |row| row.get(0))?;
+        if packs != self.pack {
+            return Ok(Some(format!("{packs} packs, the last of number {}", self.pack)));
+        }
+        let mut last: (i64, Hash) = (0, [0; 32]);
+        for table in HistoryTable::CHAINED.into_iter().filter(|table| table.is_in(version)) {
+            let sql = format!("SELECT seq, hash FROM {} ORDER BY seq DESC LIMIT 1", table.name());
+            let row = connection.query_row(&sql, [], |row| Ok((row.get(0)?, row.get(1)?))).optional()?;
+            last = last.max(row.unwrap_or(last));
+        }
+        let ChainHead { count, hash } = self.head;
+        Ok((last != (count, hash))
+            .then(|| format!("the history ends with row {}, not with row {count} as noted", last.0)))
     }
 
     /// Writes it, without the pack.

@@ -44,16 +44,16 @@ const MANTISSA_BITS: i32 = 52;
 #[error("stored state is damaged: {0}")]
 pub(super) struct DamagedRecord(&'static str);
 
-/// Encodes the whole state.
-pub(super) fn full(parts: &JsonParts) -> Vec<u8> {
+/// Encodes the whole state as the record of number `number`.
+pub(super) fn full(parts: &JsonParts, number: i64) -> Vec<u8> {
     let mut record = vec![FULL];
     push_section(&mut record, &parts.skeleton, &[]);
     push_numbers(&mut record, parts, &vec![0; parts.bits.len()], |bits| bits);
-    sealed(record, 0)
+    sealed(record, &[number])
 }
 
-/// Encodes the difference to `base`, the full record of number `serial`.
-pub(super) fn delta(parts: &JsonParts, base: &JsonParts, serial: i64) -> Vec<u8> {
+/// Encodes the difference to `base`, the full record of number `serial`, as the record of number `number`.
+pub(super) fn delta(parts: &JsonParts, base: &JsonParts, serial: i64, number: i64) -> Vec<u8> {
     let mut record = vec![DELTA];
     if parts.skeleton == base.skeleton {
         push_section(&mut record, &[], &[]);
@@ -62,21 +62,28 @@ pub(super) fn delta(parts: &JsonParts, base: &JsonParts, serial: i64) -> Vec<u8>
         push_section(&mut record, &parts.skeleton, &base.skeleton);
         push_numbers(&mut record, parts, &base.aligned_to(&parts.skeleton), rounded);
     }
-    sealed(record, serial)
+    sealed(record, &[serial, number])
 }
 
-/// Reads a full record.
-pub(super) fn read_full(record: &[u8]) -> Result<JsonParts, DamagedRecord> {
-    let mut reader = RecordReader::open(record, FULL, 0)?;
+/// Reads the full record of number `number`. Records of layouts before 5 are sealed without it.
+pub(super) fn read_full(record: &[u8], number: i64) -> Result<JsonParts, DamagedRecord> {
+    let mut reader = RecordReader::open(record, FULL, &[number]).or_else(|_| RecordReader::open(record, FULL, &[0]))?;
     let mut parts = JsonParts::of_skeleton(reader.section(&[])?);
     let zeros = vec![0; parts.bits.len()];
     reader.numbers(&mut parts, &zeros, |bits| bits)?;
     Ok(parts)
 }
 
-/// Reads a delta record to `base`, the full record of number `serial`.
-pub(super) fn read_delta(record: &[u8], base: &JsonParts, serial: i64) -> Result<JsonParts, DamagedRecord> {
-    let mut reader = RecordReader::open(record, DELTA, serial)?;
+/// Reads the delta record of number `number` to `base`, the full record of number `serial`. Layouts before 5 gave both the
+/// same number.
+pub(super) fn read_delta(
+    record: &[u8],
+    base: &JsonParts,
+    serial: i64,
+    number: i64,
+) -> Result<JsonParts, DamagedRecord> {
+    let numbers = [serial, number];
+    let mut reader = RecordReader::open(record, DELTA, if serial == number { &numbers[..1] } else { &numbers })?;
     let skeleton = reader.section(&base.skeleton)?;
     if skeleton.is_empty() {
         let mut parts = JsonParts { bits: vec![0; base.bits.len()], ..base.clone() };
@@ -170,15 +177,16 @@ fn push_section(record: &mut Vec<u8>, bytes: &[u8], dictionary: &[u8]) {
     record.extend_from_slice(stored);
 }
 
-/// Appends the hash of the record and of the number of its base.
-fn sealed(mut record: Vec<u8>, serial: i64) -> Vec<u8> {
-    let seal = seal(&record, serial);
+/// Appends the hash of the record, of the number of its base and of its own number.
+fn sealed(mut record: Vec<u8>, numbers: &[i64]) -> Vec<u8> {
+    let seal = seal(&record, numbers);
     record.extend_from_slice(&seal);
     record
 }
 
-fn seal(body: &[u8], serial: i64) -> [u8; HASH_BYTES] {
-    let hash = Sha256::new().chain_update(serial.to_le_bytes()).chain_update(body).finalize();
+fn seal(body: &[u8], numbers: &[i64]) -> [u8; HASH_BYTES] {
+    let hasher = numbers.iter().fold(Sha256::new(), |hasher, number| hasher.chain_update(number.to_le_bytes()));
+    let hash = hasher.chain_update(body).finalize();
     std::array::from_fn(|index| hash[index])
 }
 
@@ -188,10 +196,10 @@ struct RecordReader<'a> {
 }
 
 impl<'a> RecordReader<'a> {
-    fn open(record: &'a [u8], kind: u8, serial: i64) -> Result<Self, DamagedRecord> {
+    fn open(record: &'a [u8], kind: u8, numbers: &[i64]) -> Result<Self, DamagedRecord> {
         let (body, hash) =
             record.len().checked_sub(HASH_BYTES).map(|at| record.split_at(at)).ok_or(DamagedRecord("too short"))?;
-        if seal(body, serial) != *hash {
+        if seal(body, numbers) != *hash {
             return Err(DamagedRecord("its hash differs"));
         }
         match body.split_first() {
@@ -277,6 +285,14 @@ impl<'a> RecordReader<'a> {
     }
 }
 
+/// A delta as layouts before 5 wrote it.
+#[cfg(test)]
+pub(super) fn old_delta(parts: &JsonParts, base: &JsonParts, serial: i64) -> Vec<u8> {
+    let mut record = delta(parts, base, serial, serial);
+    record.truncate(record.len() - HASH_BYTES);
+    sealed(record, &[serial])
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -320,7 +336,7 @@ mod tests {
         #[test]
         fn a_full_record_gives_the_state_exactly(value in document()) {
             let parts = parts(&value);
-            let read = read_full(&full(&parts)).unwrap();
+            let read = read_full(&full(&parts, 5), 5).unwrap();
             prop_assert_eq!(&read, &parts);
             prop_assert_eq!(serde_json::from_slice::<Value>(&read.join()).unwrap(), value);
         }
@@ -328,14 +344,14 @@ mod tests {
         #[test]
         fn a_delta_record_gives_the_state_rounded_whatever_its_base(value in document(), base in document()) {
             let (parts, base) = (parts(&value), parts(&base));
-            prop_assert_eq!(read_delta(&delta(&parts, &base, 3), &base, 3).unwrap(), near(parts));
+            prop_assert_eq!(read_delta(&delta(&parts, &base, 3, 4), &base, 3, 4).unwrap(), near(parts));
         }
 
         #[test]
         fn any_bytes_are_an_error_or_a_state(bytes in prop::collection::vec(any::<u8>(), 0..300), seal in any::<bool>()) {
-            let bytes = if seal { sealed(bytes, 0) } else { bytes };
-            let _ = read_full(&bytes);
-            let _ = read_delta(&bytes, &parts(&json!({"a": [1.5, 2]})), 0);
+            let bytes = if seal { sealed(bytes, &[0]) } else { bytes };
+            let _ = read_full(&bytes, 1);
+            let _ = read_delta(&bytes, &parts(&json!({"a": [1.5, 2]})), 0, 0);
         }
 
         #[test]
@@ -349,12 +365,13 @@ mod tests {
 
     #[test]
     fn a_flipped_bit_is_found() {
-        let good = full(&parts(&json!({"cells": [1.5, 2.5, {"x": 3}]})));
+        let good = full(&parts(&json!({"cells": [1.5, 2.5, {"x": 3}]})), 7);
         for bit in 0..8 * good.len() {
             let mut bad = good.clone();
             bad[bit / 8] ^= 1 << (bit % 8);
-            assert!(read_full(&bad).is_err(), "bit {bit}");
+            assert!(read_full(&bad, 7).is_err(), "bit {bit}");
         }
+        assert!(read_full(&good, 6).is_err(), "of another number");
     }
 
     #[test]
@@ -362,8 +379,10 @@ mod tests {
         let numbers: Vec<f64> = (1..1000).map(|n| 1.0 / f64::from(n)).collect();
         let base = parts(&json!({ "a": numbers, "b": vec![0.5; 999] }));
         let same = parts(&json!({ "a": numbers, "b": numbers }));
-        let delta = delta(&same, &base, 1);
+        let delta = delta(&same, &base, 1, 2);
         assert!(delta.len() < 150, "{}", delta.len());
-        assert!(read_delta(&delta, &base, 2).is_err(), "to another base");
+        assert!(read_delta(&delta, &base, 1, 2).is_ok());
+        assert!(read_delta(&delta, &base, 2, 3).is_err(), "to another base");
+        assert!(read_delta(&delta, &base, 1, 3).is_err(), "of another number");
     }
 }

@@ -12,8 +12,8 @@ use super::folder::DATABASE;
 use super::meta;
 use super::rows::HistoryTable;
 use super::schema;
-use super::state_slots::{STATE, read_document};
-use super::verify::{self, ChainReport};
+use super::state_slots::read_document;
+use super::verify::{self, ChainReport, NotedHead};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
@@ -125,6 +125,22 @@ impl HistoryReader {
         verify::verify(&self.connection).map_err(|error| self.named(&error))
     }
 
+    /// What contradicts the chain's end as it was noted elsewhere; `None` = nothing.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
+        let found = verify::hash_at(&self.connection, noted).map_err(|error| self.named(&error))?;
+        let NotedHead { rows, hash } = noted;
+        Ok(match found {
+            Some(found) if found == *hash => None,
+            Some(found) => {
+                Some(format!("row {rows} has the hash {found}, noted was {hash}: the history was written again"))
+            }
+            None => Some(format!("there is no row {rows}, which was noted: the history was written again or cut off")),
+        })
+    }
+
     /// The stored snapshot; `None` = there is none, or it is damaged.
     pub fn snapshot(&self) -> Option<Snapshot> {
         self.state().map(|document| *document.snapshot)
@@ -132,7 +148,7 @@ impl HistoryReader {
 
     /// The stored state, if it is good.
     pub(super) fn state(&self) -> Option<StateDocument> {
-        read_document(&self.connection, STATE)
+        read_document(&self.connection)
     }
 
     /// The selected rows in the order in which they were written.

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::database::is_damage;
 use super::folder::{self, DATABASE, Folder, OpenedDatabase};
 use super::rows::RowBatch;
 use super::stamp::{BootId, Stamp};
@@ -33,5 +34,14 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     if !rows.is_empty() {
         database.commit(&[RowBatch { stamp: now, rows }], None).map_err(|error| named(error.to_string()))?;
     }
-    database.replace_pack(&now).map_err(|error| named(error.to_string()))
+    match database.replace_pack(&now) {
+        Err(error) if is_damage(&error) => {
+            drop(database);
+            folder.mark_damaged(&error.to_string());
+            let mut rebuilt = folder.open(&now).map_err(|error| named(error.to_string()))?.database;
+            rebuilt.replace_pack(&now)
+        }
+        replaced => replaced,
+    }
+    .map_err(|error| named(error.to_string()))
 }

@@ -1,8 +1,9 @@
 //! SQL of the history's rows: reading with their moment, writing with number and hash.
 
 use rusqlite::types::Value;
-use rusqlite::{Connection, Transaction, params};
+use rusqlite::{Connection, OptionalExtension, Transaction, params};
 
+use super::chain::Hash;
 use super::meta::Meta;
 use super::rows::{HistoryTable, RowBatch};
 use super::stamp::Stamp;
@@ -98,4 +99,19 @@ fn replace_pack(connection: &Connection, meta: &mut Meta, stamp: &Stamp) -> rusq
     // A state of the old pack must not come back.
     state_slots::forget_aside(connection)?;
     connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns]).map(drop)
+}
+
+/// The hash of row `seq` of the chain in a database of layout `version`; zeros before the first; `None` = the row is missing.
+pub(super) fn hash_of(connection: &Connection, seq: i64, version: i32) -> rusqlite::Result<Option<Hash>> {
+    if seq == 0 {
+        return Ok(Some([0; 32]));
+    }
+    for table in HistoryTable::CHAINED.into_iter().filter(|table| table.is_in(version)) {
+        let sql = format!("SELECT hash FROM {} WHERE seq = ?1", table.name());
+        let hash = connection.prepare_cached(&sql)?.query_row([seq], |row| row.get(0)).optional()?;
+        if hash.is_some() {
+            return Ok(hash);
+        }
+    }
+    Ok(None)
 }

@@ -1,7 +1,7 @@
 //! Copies the readable rows of a damaged database.
 //!
-//! Copies rows from the front to the damage and from the back to the damage, a few at a time: a history of any length
-//! needs the same memory. A chained row whose hash does not match its contents was changed by the damage; it is rejected
+//! The rows are those that `carve` finds on the pages of the file, whatever its schema and its inner pages
+//! look like. They are copied in their order, a few at a time: a history of any length needs the same memory. A chained row whose hash does not match its contents was changed by the damage; it is rejected
 //! and counted. The copies get numbers and hashes of the new chain.
 //!
 //! The number of packs comes from rows with a good hash and from the table `pack`; an unchecked row that names a further
@@ -12,8 +12,9 @@ use std::fmt;
 use std::path::Path;
 
 use rusqlite::types::Value;
-use rusqlite::{Connection, OpenFlags, Row, params};
+use rusqlite::{Connection, Row, params};
 
+use super::carve::{Carved, carve};
 use super::chain::{self, Hash};
 use super::database::Database;
 use super::document::StateDocument;
@@ -21,7 +22,6 @@ use super::meta::Meta;
 use super::row_sql::{MOMENT_COLUMNS, rows_sql, write_moment, write_row};
 use super::rows::HistoryTable;
 use super::stamp::{BootId, Stamp};
-use super::state_slots::{STATE, read_document};
 use crate::quantity::Timestamp;
 
 /// Rows of a table in memory at once.
@@ -38,7 +38,7 @@ pub(super) struct SalvageReport {
     pub(super) alarms: usize,
     pub(super) resets: usize,
     pub(super) half_cycles: usize,
-    /// Rows that the damage has changed.
+    /// Rows that the damage has changed or made unreadable.
     pub(super) refused: usize,
     pub(super) state: Option<StateDocument>,
 }
@@ -68,22 +68,21 @@ impl SalvageReport {
     }
 }
 
-/// Copies the good rows into a new database that is not used before this returns.
+/// Copies the good rows into a new database that is not used before this returns. `pages`: a name for a temporary database.
 ///
 /// # Errors
-/// When the new database cannot be written.
-pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Result<SalvageReport> {
-    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let Ok(old) = Connection::open_with_flags(damaged, flags) else { return Ok(SalvageReport::default()) };
-    let packs = read_packs(&old);
+/// When a new database cannot be written.
+pub(super) fn salvage(damaged: &Path, pages: &Path, database: &mut Database) -> rusqlite::Result<SalvageReport> {
+    let Carved { connection: old, lost, state } = carve(damaged, pages)?;
+    let packs = read_packs(&old)?;
     let (connection, meta) = database.parts_mut();
-    let saved = SalvageReport { state: read_document(&old, STATE), ..SalvageReport::default() };
+    let saved = SalvageReport { state, refused: lost, ..SalvageReport::default() };
     let count = i64::try_from(packs.len()).unwrap_or(1).max(1);
     let mut copier = Copier { connection, meta, moment: None, before: Some((0, [0; 32])), packs: count, saved };
-    let mut sources = HistoryTable::ALL.map(|table| TableSource::new(&old, table));
+    let mut sources = HistoryTable::ALL.map(TableSource::new);
     connection.execute_batch("BEGIN IMMEDIATE")?;
     let mut rows = 0_usize;
-    while let Some((table, row)) = next(&old, &mut sources) {
+    while let Some((table, row)) = next(&old, &mut sources)? {
         copier.copy_checked(table, &row)?;
         rows += 1;
         if rows.is_multiple_of(STEP_ROWS) {
@@ -107,27 +106,24 @@ struct PackRow {
     identity: Option<String>,
 }
 
-/// The rows of `pack` that can be read.
-fn read_packs(old: &Connection) -> Vec<PackRow> {
-    let Ok(mut statement) = old.prepare("SELECT id, opened_ns, closed_ns, reason, identity FROM pack ORDER BY id")
-    else {
-        return Vec::new();
-    };
-    let of = |row: &Row<'_>| {
+/// The rows of `pack`.
+fn read_packs(old: &Connection) -> rusqlite::Result<Vec<PackRow>> {
+    let mut statement = old.prepare("SELECT id, opened_ns, closed_ns, reason, identity FROM pack ORDER BY id")?;
+    let packs = statement.query_map([], |row: &Row<'_>| {
         let (id, opened_ns, closed_ns) = (row.get(0)?, row.get(1)?, row.get(2)?);
         Ok(PackRow { id, opened_ns, closed_ns, reason: row.get(3)?, identity: row.get(4)? })
-    };
-    statement.query_map([], of).map(|packs| packs.filter_map(Result::ok).collect()).unwrap_or_default()
+    })?;
+    packs.collect()
 }
 
 /// The key of a row in its table: its number; of a half-cycle its moment and its cell.
 type RowKey = (i64, i64);
 
-/// A row read from the damaged file.
+/// A row of the damaged file.
 struct SalvagedRow {
     key: RowKey,
     hash: Option<Hash>,
-    /// Both are empty when a value in them cannot be read.
+    /// Empty when its moment is lost.
     moment: Vec<Value>,
     values: Vec<Value>,
 }
@@ -136,52 +132,21 @@ struct SalvagedRow {
 struct TableSource {
     table: HistoryTable,
     page: VecDeque<SalvagedRow>,
-    /// The key at which reading continues. A search for the key before it could end in a damaged page.
+    /// The key at which reading continues.
     from: RowKey,
-    /// The key of the table's last row.
-    end: RowKey,
-    phase: ReadPhase,
-}
-
-/// The part of a table that is being read.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum ReadPhase {
-    /// Before the damage.
-    Front,
-    /// After the damage.
-    Back,
-    Done,
+    is_read: bool,
 }
 
 impl TableSource {
-    fn new(old: &Connection, table: HistoryTable) -> Self {
-        let mut source = Self {
-            table,
-            page: VecDeque::new(),
-            from: (i64::MIN, i64::MIN),
-            end: (i64::MAX, i64::MAX),
-            phase: ReadPhase::Front,
-        };
-        source.end = source.back_keys(old, Some(1)).unwrap_or(source.end);
-        source
+    const fn new(table: HistoryTable) -> Self {
+        Self { table, page: VecDeque::new(), from: (i64::MIN, i64::MIN), is_read: false }
     }
 
-    /// Reads the next page when the present one is empty.
-    fn fill(&mut self, old: &Connection) {
-        while self.page.is_empty() && self.phase != ReadPhase::Done {
-            match (self.read_page(old), self.phase) {
-                (Ok(PAGE_ROWS), _) => {}
-                (Err(_), ReadPhase::Front) => {
-                    self.phase = ReadPhase::Back;
-                    self.from = self.back_keys(old, None).unwrap_or((i64::MAX, i64::MAX));
-                }
-                _ => self.phase = ReadPhase::Done,
-            }
+    /// Reads the next rows when there are none in memory.
+    fn fill(&mut self, old: &Connection) -> rusqlite::Result<()> {
+        if !self.page.is_empty() || self.is_read {
+            return Ok(());
         }
-    }
-
-    /// Reads the next rows and returns their number. Rows read before an error are in the page.
-    fn read_page(&mut self, old: &Connection) -> rusqlite::Result<usize> {
         let (which, bound): (&str, &[i64]) = match self.table {
             HistoryTable::HalfCycle => {
                 ("WHERE (r.moment, r.cell) >= (?1, ?2) ORDER BY r.moment, r.cell", &[self.from.0, self.from.1])
@@ -191,40 +156,19 @@ impl TableSource {
         let sql = rows_sql(self.table, &format!("{which} LIMIT {PAGE_ROWS}"));
         let mut statement = old.prepare_cached(&sql)?;
         let mut rows = statement.query(rusqlite::params_from_iter(bound))?;
-        let mut count = 0;
         while let Some(row) = rows.next()? {
             let key = key_of(self.table, row)?;
-            if key < self.from || key > self.end {
-                // Out of order: reading from there would loop, or skip the rest.
-                return Err(rusqlite::Error::QueryReturnedMoreThanOneRow);
-            }
-            self.from = match self.table {
-                HistoryTable::HalfCycle => (key.0, key.1.saturating_add(1)),
-                _ => (key.0.saturating_add(1), key.1),
-            };
             self.page.push_back(found(self.table, key, row));
-            count += 1;
+            let after = match self.table {
+                HistoryTable::HalfCycle => key.1.checked_add(1).map(|cell| (key.0, cell)),
+                _ => key.0.checked_add(1).map(|seq| (seq, key.1)),
+            };
+            // No row follows the greatest key.
+            self.is_read = after.is_none();
+            self.from = after.unwrap_or(self.from);
         }
-        Ok(count)
-    }
-
-    /// The lowest key that can be reached from the back within `rows` rows; `None` = not even the last row can be read.
-    fn back_keys(&self, old: &Connection, rows: Option<usize>) -> Option<RowKey> {
-        let order = match self.table {
-            HistoryTable::HalfCycle => "ORDER BY r.moment DESC, r.cell DESC",
-            _ => "ORDER BY r.seq DESC",
-        };
-        let mut statement = old.prepare(&rows_sql(self.table, order)).ok()?;
-        let mut found = statement.query([]).ok()?;
-        let mut lowest = None;
-        for _ in 0..rows.unwrap_or(usize::MAX) {
-            let Ok(Some(row)) = found.next() else { break };
-            match key_of(self.table, row) {
-                Ok(key) if lowest.is_none_or(|lowest| key < lowest) && key >= self.from => lowest = Some(key),
-                _ => break,
-            }
-        }
-        lowest
+        self.is_read |= self.page.len() < PAGE_ROWS;
+        Ok(())
     }
 }
 
@@ -243,8 +187,8 @@ fn found(table: HistoryTable, key: RowKey, row: &Row<'_>) -> SalvagedRow {
 }
 
 /// The next row: chained rows in the order of their numbers, half-cycles with the rows of their moment.
-fn next(old: &Connection, sources: &mut [TableSource]) -> Option<(HistoryTable, SalvagedRow)> {
-    sources.iter_mut().for_each(|source| source.fill(old));
+fn next(old: &Connection, sources: &mut [TableSource]) -> rusqlite::Result<Option<(HistoryTable, SalvagedRow)>> {
+    sources.iter_mut().try_for_each(|source| source.fill(old))?;
     let heads = || sources.iter().enumerate().filter_map(|(at, source)| Some((source.page.front()?, source.table, at)));
     let chained = heads().filter(|(_, table, _)| *table != HistoryTable::HalfCycle).min_by_key(|(row, ..)| row.key);
     let half_cycle = heads().find(|(_, table, _)| *table == HistoryTable::HalfCycle);
@@ -254,10 +198,10 @@ fn next(old: &Connection, sources: &mut [TableSource]) -> Option<(HistoryTable, 
             if row.key.0 <= moment { at } else { later }
         }
         (Some((.., at)), None) | (None, Some((.., at))) => at,
-        (None, None) => return None,
+        (None, None) => return Ok(None),
     };
-    let source = sources.get_mut(at)?;
-    source.page.pop_front().map(|row| (source.table, row))
+    let source = &mut sources[at];
+    Ok(source.page.pop_front().map(|row| (source.table, row)))
 }
 
 /// Writes the new file.

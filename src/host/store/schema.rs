@@ -6,21 +6,26 @@
 //! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | always |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
 //! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
-//! | `state` | the core's state: slot 0 in full, slot 1 the changes since | the latest |
-//! | `meta` | one row: the chain's end, counts, the vehicle | |
+//! | `state`, `state_b` | the core's state, two copies written in turn: slot 0 in full, slot 1 the changes since | the latest two |
+//! | `meta` | one row: the chain's end, counts, the vehicle, the layout's version | |
 //!
-//! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the layout's version.
+//! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the layout's version; from version 5 on `meta` has it
+//! too, so that a damaged bit does not pass for a newer program.
 
-use rusqlite::{Connection, TransactionBehavior};
+use rusqlite::{Connection, OptionalExtension, TransactionBehavior};
 
 /// "pkwt": marks the file for file(1).
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// The statements that lead to each version from the one before; the first starts from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5];
 
 /// The first version that names the vehicle.
 pub(super) const VERSION_WITH_VEHICLE: i32 = 4;
+/// The first version with two copies of the state.
+pub(super) const VERSION_WITH_COPIES: i32 = 5;
+/// The first version that `meta` states.
+const VERSION_WITH_LAYOUT: i32 = 5;
 
 const VERSION_1: &str = "
 CREATE TABLE meta (
@@ -142,6 +147,17 @@ const VERSION_4: &str = "
 ALTER TABLE meta ADD COLUMN vehicle TEXT;
 ";
 
+/// The second copy of the state, and the second place of the layout's version.
+const VERSION_5: &str = "
+CREATE TABLE state_b (
+    slot INTEGER PRIMARY KEY,
+    serial INTEGER NOT NULL,
+    length INTEGER NOT NULL,
+    bytes BLOB NOT NULL
+) STRICT;
+ALTER TABLE meta ADD COLUMN layout INTEGER;
+";
+
 /// The version of an open database; 0 = an empty file.
 pub(super) fn version(connection: &Connection) -> rusqlite::Result<i32> {
     connection.query_row("PRAGMA user_version", [], |row| row.get(0))
@@ -150,6 +166,16 @@ pub(super) fn version(connection: &Connection) -> rusqlite::Result<i32> {
 /// The version this program writes.
 pub(super) fn known(migrations: &[&str]) -> i32 {
     i32::try_from(migrations.len()).unwrap_or(i32::MAX)
+}
+
+/// The version in `meta`; `None` = an older layout, or damage.
+pub(super) fn noted_version(connection: &Connection) -> Option<i32> {
+    connection.query_row("SELECT layout FROM meta WHERE id = 1", [], |row| row.get(0)).optional().ok()??
+}
+
+/// Whether `version` is not damaged, as far as that is known.
+pub(super) fn is_confirmed(connection: &Connection, version: i32) -> bool {
+    (0..VERSION_WITH_LAYOUT).contains(&version) || noted_version(connection) == Some(version)
 }
 
 /// Brings the layout from `version` to the latest, all or nothing.
@@ -163,6 +189,10 @@ pub(super) fn migrate(connection: &mut Connection, version: i32, migrations: &[&
         transaction.execute_batch(migration)?;
     }
     transaction.pragma_update(None, "application_id", APPLICATION_ID)?;
-    transaction.pragma_update(None, "user_version", known(migrations))?;
+    let version = known(migrations);
+    transaction.pragma_update(None, "user_version", version)?;
+    if version >= VERSION_WITH_LAYOUT {
+        transaction.execute("UPDATE meta SET layout = ?1", [version])?;
+    }
     transaction.commit()
 }

@@ -1,5 +1,7 @@
 //! A real state through the store and back.
 
+mod flips;
+mod healing;
 mod rounding;
 
 use std::fmt::Write as _;
@@ -79,10 +81,10 @@ fn restored(snapshot: Snapshot) -> Monitor {
 fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
     let parts = |snapshot: &Snapshot| JsonParts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
     let (early, late) = (snapshot(Some(1500), None), snapshot(Some(5000), None));
-    let full = packed::read_full(&packed::full(&parts(&late))).unwrap();
+    let full = packed::read_full(&packed::full(&parts(&late), 1), 1).unwrap();
     assert_eq!(full.join(), serde_json::to_vec(&late).unwrap());
-    let delta = packed::delta(&parts(&late), &parts(&early), 1);
-    let read = packed::read_delta(&delta, &parts(&early), 1).unwrap().join();
+    let delta = packed::delta(&parts(&late), &parts(&early), 1, 2);
+    let read = packed::read_delta(&delta, &parts(&early), 1, 2).unwrap().join();
     let near = restored(serde_json::from_slice(&read).unwrap());
     let exact = restored(late);
     let (near, exact) = (near.capacity(CellIndex(0)), exact.capacity(CellIndex(0)));

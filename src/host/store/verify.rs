@@ -1,12 +1,14 @@
 //! Checks the hash chain of the history, row by row, up to the first row that was changed.
 
+use std::str::FromStr;
+
 use rusqlite::types::Value;
 use rusqlite::{Connection, Statement};
 use serde::Serialize;
 
 use super::chain::{Hash, hex, link};
 use super::meta::Meta;
-use super::row_sql::{MOMENT_COLUMNS, rows_sql};
+use super::row_sql::{MOMENT_COLUMNS, hash_of, rows_sql};
 use super::rows::HistoryTable;
 use super::schema;
 
@@ -34,6 +36,33 @@ pub struct BrokenRow {
     pub expected: String,
     /// The hash or row in its place.
     pub found: String,
+}
+
+/// The chain's end as it was noted elsewhere, written `ROWS:HASH`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NotedHead {
+    /// Rows at that time.
+    pub rows: i64,
+    /// Hash of the last, 64 hexadecimal digits.
+    pub hash: String,
+}
+
+impl FromStr for NotedHead {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts = text.split_once(':').and_then(|(rows, hash)| Some((rows.parse().ok()?, hash.to_ascii_lowercase())));
+        let is_hash = |hash: &str| hash.len() == 64 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
+        match parts {
+            Some((rows, hash)) if rows >= 0 && is_hash(&hash) => Ok(Self { rows, hash }),
+            _ => Err("must be ROWS:HASH, a number and 64 hexadecimal digits".to_owned()),
+        }
+    }
+}
+
+/// The hash of the row at which the chain ended when `noted` was written; `None` = there is no such row.
+pub(super) fn hash_at(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
+    Ok(hash_of(connection, noted.rows, schema::version(connection)?)?.map(|hash| hex(&hash)))
 }
 
 /// A row of the chain as it is stored.

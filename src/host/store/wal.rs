@@ -1,4 +1,4 @@
-//! Finds pages of SQLite's write-ahead log that SQLite will not read.
+//! Reads SQLite's write-ahead log: finds pages that SQLite will not read, and gives a salvage those that it would.
 //!
 //! SQLite reads a log up to the first page with a wrong checksum and drops the rest silently: after a power cut the rest is
 //! a transaction that was never completed, but after damage it is the results learned last. In: the log next to the
@@ -7,6 +7,7 @@
 //!
 //! The format is that of <https://www.sqlite.org/fileformat2.html#walformat>.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 /// First four bytes without the last bit, which is the byte order of the checksums.
@@ -34,19 +35,59 @@ pub(super) fn fault(path: &Path) -> Option<Fault> {
     check(&log)
 }
 
+/// The pages of a log's complete transactions by their numbers in the database, each in its last version; empty without a
+/// readable log.
+pub(super) fn pages(path: &Path) -> HashMap<u32, Vec<u8>> {
+    let Ok(log) = std::fs::read(path) else { return HashMap::new() };
+    let mut pages = HashMap::new();
+    let Some(Header { page_bytes, mut sum, is_big }) = Header::read(&log) else { return pages };
+    let mut uncommitted = Vec::new();
+    for frame in log[HEADER..].chunks_exact(FRAME_HEADER + page_bytes) {
+        sum = frame_sum(sum, frame, is_big);
+        if frame[8..16] != log[16..24] || sum != (word(frame, 16), word(frame, 20)) {
+            break;
+        }
+        uncommitted.push((word(frame, 0), frame[FRAME_HEADER..].to_vec()));
+        if word(frame, 4) != 0 {
+            pages.extend(uncommitted.drain(..));
+        }
+    }
+    pages
+}
+
+/// The header of a log.
+struct Header {
+    page_bytes: usize,
+    sum: (u32, u32),
+    is_big: bool,
+}
+
+impl Header {
+    /// `None` = its checksum is wrong, or no log has that page size.
+    fn read(log: &[u8]) -> Option<Self> {
+        let header = log.get(..HEADER)?;
+        let is_big = word(header, 0) == MAGIC | 1;
+        let sum = checksum((0, 0), &header[..24], is_big);
+        let is_good = word(header, 0) & !1 == MAGIC && sum == (word(header, 24), word(header, 28));
+        let page_bytes = usize::try_from(word(header, 8)).ok().filter(|bytes| (512..=65_536).contains(bytes))?;
+        is_good.then_some(Self { page_bytes, sum, is_big })
+    }
+}
+
+fn frame_sum(sum: (u32, u32), frame: &[u8], is_big: bool) -> (u32, u32) {
+    checksum(checksum(sum, &frame[..FRAME_COVERED], is_big), &frame[FRAME_HEADER..], is_big)
+}
+
 fn check(log: &[u8]) -> Option<Fault> {
     let (header, frames) = log.split_at_checked(HEADER)?;
     if header.iter().all(|&byte| byte == 0) {
         return None; // space that was never written
     }
-    let is_big = word(header, 0) == MAGIC | 1;
-    let mut sum = checksum((0, 0), &header[..24], is_big);
-    if word(header, 0) & !1 != MAGIC || sum != (word(header, 24), word(header, 28)) {
+    let Some(Header { page_bytes, mut sum, is_big }) = Header::read(log) else {
         return Some(Fault::Damaged(
             "the header of the write-ahead log is damaged: what was stored last is lost".to_owned(),
         ));
-    }
-    let page_bytes = usize::try_from(word(header, 8)).ok().filter(|&bytes| (512..=65_536).contains(&bytes))?;
+    };
     let mut first_bad = None;
     let mut later_commits = 0_u32;
     for (number, frame) in frames.chunks_exact(FRAME_HEADER + page_bytes).enumerate() {
@@ -57,7 +98,7 @@ fn check(log: &[u8]) -> Option<Fault> {
             later_commits += u32::from(word(frame, 4) != 0);
             continue;
         }
-        let next = checksum(checksum(sum, &frame[..FRAME_COVERED], is_big), &frame[FRAME_HEADER..], is_big);
+        let next = frame_sum(sum, frame, is_big);
         if frame[8..16] == header[16..24] && next == (word(frame, 16), word(frame, 20)) {
             sum = next;
         } else {

@@ -13,6 +13,7 @@ use super::backlog::Backlog;
 use super::database::{Database, is_damage};
 use super::document::StateDocument;
 use super::folder::{Folder, OpenedDatabase};
+use super::reserve::Reserve;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::{BootId, Stamp};
 use super::state_slots::StateRecord;
@@ -21,6 +22,8 @@ use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// Nanoseconds in a day.
+const NS_PER_DAY: i64 = 86_400_000_000_000;
 /// Longest pause: a working disk is found within this.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
@@ -31,6 +34,8 @@ pub struct StoreProgress {
     pub ticket: u64,
     /// The last attempt succeeded.
     pub works: bool,
+    /// The disk has room: the reserve is there.
+    pub has_room: bool,
     /// Size of the database and its log after the last success, bytes; `None` = none so far.
     pub file_bytes: Option<u64>,
     /// Commits done.
@@ -145,6 +150,10 @@ pub(super) struct Writer {
     /// The open database has the vehicle.
     pub(super) is_vehicle_noted: bool,
     pub(super) folder: Folder,
+    /// Space for a full disk.
+    pub(super) reserve: Reserve,
+    /// The day, UTC since 1970, for which the chain's end is in the log.
+    pub(super) head_day: Option<i64>,
     /// `None` = not open.
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<StoreProgress>,
@@ -181,12 +190,14 @@ impl Retry {
 impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
+        self.reserve.make();
         loop {
             let work = self.write_queue.take(self.retry.at);
             let PendingWrite { batches, state, exact, sets_aside, ticket, stop } = work;
             self.sets_aside |= sets_aside;
-            // The last attempt before the end does not wait for the pause.
-            let works = if self.retry.is_due() || stop {
+            // The last attempt before the end does not wait for the pause, nor does one that the reserve may help.
+            let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
+            let works = if self.retry.is_due() || is_urgent {
                 self.write(batches, state, exact)
             } else {
                 self.write_queue.put_back(batches, state);
@@ -194,7 +205,9 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let progress = StoreProgress { ticket, works, file_bytes, commits: self.commits, failures: self.failures };
+            let has_room = self.reserve.is_whole();
+            let (commits, failures) = (self.commits, self.failures);
+            let progress = StoreProgress { ticket, works, has_room, file_bytes, commits, failures };
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
@@ -207,7 +220,14 @@ impl Writer {
     fn write(&mut self, batches: Vec<RowBatch>, state: Option<StateDocument>, exact: bool) -> bool {
         let begun = Instant::now();
         let written = match &state {
-            Some(document) => self.commit(&batches, document, exact),
+            Some(document) => self.commit(&batches, document, exact).or_else(|error| {
+                if batches.is_empty() {
+                    return Err(error);
+                }
+                // What is learned is tried again at once: with the reserve's space, or because space has come back.
+                self.reserve.release_if_full();
+                self.commit(&batches, document, exact)
+            }),
             None if self.retry.pause.is_none() => return true,
             None => self.reopen(&Stamp::now(Timestamp::ZERO, BootId::current())).map(|database| {
                 self.database = Some(database);
@@ -222,6 +242,7 @@ impl Writer {
                 self.retry = Retry::default();
                 self.commits += u64::from(state.is_some());
                 self.write_queue.lock().backlog.commit();
+                self.reserve.restore();
                 true
             }
             Err(why) => {
@@ -254,6 +275,7 @@ impl Writer {
         match database.commit(batches, Some(record)) {
             Ok(()) => {
                 self.sets_aside = false;
+                self.log_head(&database, &document.stamp);
                 self.database = Some(database);
                 Ok(())
             }
@@ -265,6 +287,19 @@ impl Writer {
             }
             // A connection that failed is opened again: its file may have been deleted.
             Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// Logs the chain's end with each day's first commit: a chain that was written again does not fit it.
+    fn log_head(&mut self, database: &Database, now: &Stamp) {
+        let day = now.wall_ns.div_euclid(NS_PER_DAY);
+        if self.head_day.replace(day) != Some(day) {
+            let (rows, hash) = database.head();
+            tracing::info!(
+                rows,
+                hash,
+                "end of the history's chain; to be compared: packwatch history verify --noted ROWS:HASH"
+            );
         }
     }
 

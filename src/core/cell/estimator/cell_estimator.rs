@@ -392,6 +392,11 @@ impl CellEstimator {
         }
     }
 
+    /// Sets ln of the resistance relative to new with which the filter begins.
+    pub fn relearn_resistance(&mut self, log_resistance: ScalarGaussian) {
+        self.memory.log_resistance = log_resistance;
+    }
+
     /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;

@@ -16,7 +16,13 @@ fn block_on(test: impl Future<Output = ()>) {
 }
 
 fn done(changed: u32) -> Answer {
-    Answer::Outcome(CommandOutcome { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
+    Answer::Outcome(CommandOutcome {
+        time: Timestamp::ZERO,
+        changed,
+        refused: 0,
+        refused_alarms: Vec::new(),
+        is_stored: None,
+    })
 }
 
 /// A server whose loop answers everything with the number of requests so far.
@@ -127,30 +133,25 @@ fn a_client_that_never_reads_blocks_no_other_and_is_dropped() {
 }
 
 #[test]
-fn nine_clients_are_one_too_many_until_one_closes() {
+fn silent_clients_give_way_to_one_that_asks() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve(&folder).await;
-        let mut clients = Vec::new();
-        for _ in 0..MAX_CONNECTIONS {
-            let mut client = connect(&path).await;
-            client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            assert!(line(&mut client).await.contains("\"ok\":true"));
-            clients.push(client);
+        let mut silent = Vec::new();
+        // All of this process, which is one client.
+        for _ in 0..MAX_PER_PROCESS {
+            silent.push(connect(&path).await);
         }
-        let mut ninth = connect(&path).await;
-        let refused = line(&mut ninth).await;
-        assert!(refused.contains("\"ok\":false") && refused.contains("8 connections"), "{refused}");
-        clients.pop();
-        loop {
-            let mut next = connect(&path).await;
-            // Refused ones are closed at once; the write may find that.
-            let _ = next.write_all(REPLACED.to_line().as_bytes()).await;
-            if line(&mut next).await.contains("\"ok\":true") {
-                break;
-            }
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
+        let mut next = connect(&path).await;
+        let refused = line(&mut next).await;
+        assert!(refused.contains("\"ok\":false") && refused.contains("try again later"), "{refused}");
+        tokio::time::sleep(crate::io::places::GRACE).await;
+        let began = tokio::time::Instant::now();
+        let mut next = connect(&path).await;
+        next.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+        assert!(line(&mut next).await.contains("\"ok\":true"));
+        assert!(began.elapsed() < MAX_SILENCE / 10, "{:?}", began.elapsed());
+        assert_eq!(line(&mut silent[0]).await, "", "the one that was silent longest is closed");
     });
 }
 

@@ -6,7 +6,7 @@ use crate::can::poll::PollSilence;
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
-use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
+use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, ModelState, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
@@ -114,6 +114,8 @@ fn interface(name: &str, state: LinkState) -> InterfaceStatus {
 
 fn pack(cells: u16) -> PackStatus {
     PackStatus {
+        model_state: Some(ModelState::Learning),
+        model_fits_better: None,
         validity: Validity::Valid,
         mode: Mode::Discharge,
         soc: Some(0.632),

@@ -1,6 +1,7 @@
 //! Commits, restores, the chain and its faults, thinning, migration and damaged files, on real databases.
 
 use super::super::folder::{DATABASE, Folder};
+use super::super::packed;
 use super::super::parts::JsonParts;
 use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::rows::HistoryTable;
@@ -61,7 +62,7 @@ fn a_commit_is_there_after_reopening() {
     let database = open(folder.path());
     assert_eq!(database.counts(), counts);
     let stored = database.state().unwrap().unwrap().unwrap();
-    assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![1.5; 300]).unwrap(), None));
+    assert_eq!((stored.json, stored.fault), (serde_json::to_vec(&vec![1.5; 300]).unwrap(), None));
     assert_eq!(broken_row(folder.path()), (String::new(), 0));
 }
 
@@ -213,7 +214,7 @@ fn an_older_layout_is_migrated_with_its_rows() {
     // Now it is a newer layout, which the present program must not touch.
     let before = std::fs::read(&path).unwrap();
     let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
-    assert_eq!(newer, OpenError::Newer { found: 5, known: 4 });
+    assert_eq!(newer, OpenError::Newer { found: 6, known: 5 });
     assert_eq!(std::fs::read(&path).unwrap(), before);
 }
 
@@ -252,7 +253,7 @@ fn a_failed_migration_changes_nothing() {
         MIGRATIONS.iter().copied().chain(["CREATE TABLE added (id); INSERT INTO nowhere VALUES (1);"]).collect();
     Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap_err();
     let database = open(folder.path());
-    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (4, 200));
+    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (5, 200));
 }
 
 #[test]
@@ -373,29 +374,123 @@ fn a_history_can_be_read_while_it_is_written() {
     assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
 }
 
+/// Numbers of the records of each copy.
+fn numbers(database: &Database) -> [Vec<i64>; 2] {
+    state_slots::COPIES.map(|table| {
+        let mut statement =
+            database.connection().prepare(&format!("SELECT serial FROM {table} ORDER BY slot")).unwrap();
+        statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
+    })
+}
+
+fn stored(database: &Database) -> (Vec<f64>, Option<String>) {
+    let stored = database.state().unwrap().unwrap().unwrap();
+    (serde_json::from_slice(&stored.json).unwrap(), stored.fault)
+}
+
 #[test]
-fn a_delta_never_fits_another_full_record_of_its_number() {
+fn each_state_overwrites_the_older_copy_and_the_newest_is_read() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
-    let mut numbers: Vec<f64> = (0..300).map(|n| f64::from(n).sqrt()).collect();
-    database.commit(&[], Some(state(&numbers))).unwrap();
-    numbers[7] = 0.5;
-    database.commit(&[], Some(state(&numbers))).unwrap();
-    let serials = |database: &Database| -> Vec<i64> {
-        let mut statement = database.connection().prepare("SELECT serial FROM state ORDER BY slot").unwrap();
-        statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
-    };
-    assert_eq!(serials(&database), [1, 1]);
-    // The full record can no longer be read: numbers restart.
-    database.connection().execute("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", []).unwrap();
-    drop(database);
+    for number in 1..=7_i32 {
+        let mut values = vec![0.5; 300];
+        values[7] = f64::from(number);
+        database.commit(&[], Some(state(&values))).unwrap();
+        assert_eq!(stored(&database), (values.clone(), None));
+        drop(database);
+        database = open(folder.path());
+        assert_eq!(stored(&database), (values, None), "after a start");
+    }
+    assert_eq!(numbers(&database), [vec![1, 7], vec![2, 6]]);
+}
+
+#[test]
+fn a_damaged_copy_leaves_the_other_and_is_written_next() {
+    for (damage, newer_is_lost) in [
+        ("UPDATE state SET bytes = zeroblob(length) WHERE slot = 1", true),
+        ("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", true),
+        ("UPDATE state SET serial = serial + 1 WHERE slot = 1", true),
+        ("UPDATE state SET length = length - 1 WHERE slot = 0", true),
+        ("DELETE FROM state WHERE slot = 0", true),
+        ("UPDATE state_b SET bytes = zeroblob(length) WHERE slot = 1", false),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut database = open(folder.path());
+        // Short in binary: a delta rounds.
+        let values = |number: i32| -> Vec<f64> {
+            (0..300).map(|n| if n == 7 { f64::from(number) } else { 0.5 + f64::from(n) }).collect()
+        };
+        (1..=5).for_each(|number| database.commit(&[], Some(state(&values(number)))).unwrap());
+        assert_eq!(database.connection().execute(damage, []).unwrap(), 1);
+        drop(database);
+        let mut database = open(folder.path());
+        let (found, fault) = stored(&database);
+        let fault = fault.unwrap();
+        assert_eq!(found, values(if newer_is_lost { 4 } else { 5 }), "{damage}");
+        let outcome = if newer_is_lost { "an earlier state is used" } else { "a newer state is good and used" };
+        assert!(fault.ends_with(outcome), "{damage}: {fault}");
+        database.commit(&[], Some(state(&values(6)))).unwrap();
+        drop(database);
+        assert_eq!(stored(&open(folder.path())), (values(6), None), "{damage}");
+    }
+}
+
+#[test]
+fn a_state_of_layout_4_is_restored_and_becomes_the_first_copy() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    let old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..4]).unwrap();
+    let parts = |number: f64| state(&[number; 300]).parts;
+    // As that layout wrote them: sealed without their own number, which is that of the full record.
+    for (slot, record) in [(0, packed::full(&parts(1.5), 0)), (1, packed::old_delta(&parts(2.5), &parts(1.5), 3))] {
+        let values = rusqlite::params![slot, i64::try_from(record.len()).unwrap(), record];
+        old.connection().execute("INSERT INTO state VALUES (?1, 3, ?2, ?3)", values).unwrap();
+    }
+    drop(old);
+    assert!(HistoryReader::open(folder.path()).unwrap().verify().is_ok());
     let mut database = open(folder.path());
-    assert!(database.state().unwrap().is_err());
+    assert_eq!(stored(&database), (vec![2.5; 300], None));
     database.commit(&[], Some(state(&[3.5; 300]))).unwrap();
-    assert_eq!(serials(&database)[0], 1);
+    assert_eq!(numbers(&database), [vec![3, 3], vec![4]]);
     drop(database);
-    let stored = open(folder.path()).state().unwrap().unwrap().unwrap();
-    assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![3.5; 300]).unwrap(), None));
+    assert_eq!(stored(&open(folder.path())), (vec![3.5; 300], None));
+}
+
+#[test]
+fn a_flipped_bit_of_the_version_is_damage_and_a_newer_program_is_not() {
+    for bit in 0..32 {
+        let place = tempfile::tempdir().unwrap();
+        let database = filled(place.path());
+        let version: i32 = 5 ^ (1 << bit);
+        database.connection().pragma_update(None, "user_version", version).unwrap();
+        database.close().unwrap();
+        let error = Database::open(&place.path().join(DATABASE), &stamp(1.0), 1000).unwrap_err();
+        assert!(matches!(error, OpenError::Damaged(_)), "{version}: {error}");
+        let opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        assert_eq!(opening.database.counts(), Counts { chained: 201, half_cycles: 160, packs: 1 }, "{version}");
+    }
+}
+
+#[test]
+fn what_meta_says_of_the_history_is_compared_with_it() {
+    for (change, is_damage) in [
+        ("UPDATE meta SET chained = chained + 64", true),
+        ("UPDATE meta SET head = zeroblob(32)", true),
+        ("UPDATE pack SET id = 3", true),
+        ("UPDATE meta SET half_cycles = 1000000", false),
+        ("UPDATE meta SET half_cycles = -1", false),
+    ] {
+        let place = tempfile::tempdir().unwrap();
+        let database = filled(place.path());
+        assert_eq!(database.connection().execute(change, []).unwrap(), 1);
+        drop(database);
+        let opened = Database::open(&place.path().join(DATABASE), &stamp(1.0), 1000);
+        assert_eq!(matches!(opened, Err(OpenError::Damaged(_))), is_damage, "{change}");
+        drop(opened);
+        let opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        let rows = if is_damage { 201 } else { 200 };
+        assert_eq!(opening.database.counts(), Counts { chained: rows, half_cycles: 160, packs: 1 }, "{change}");
+    }
 }
 
 #[test]

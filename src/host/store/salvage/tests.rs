@@ -32,7 +32,7 @@ fn the_number_of_a_pack_is_accepted_from_rows_with_a_good_hash() {
         }
         database.close().unwrap();
         let mut database = open(&new);
-        let saved = salvage(&path, &mut database).unwrap();
+        let saved = salvage(&path, &place.path().join("pages.db"), &mut database).unwrap();
         assert_eq!((saved.half_cycles, saved.capacities, saved.resets, saved.refused), (0, 1, 2, 4), "{odd}");
         assert_eq!(database.counts().packs, 2, "{odd}");
         let packs: Vec<Option<String>> = database
@@ -60,7 +60,7 @@ fn all_rows_of_a_sound_file_are_copied_in_their_order() {
     let counts = database.counts();
     database.close().unwrap();
     let mut database = open(&new);
-    let saved = salvage(&path, &mut database).unwrap();
+    let saved = salvage(&path, &place.path().join("pages.db"), &mut database).unwrap();
     assert_eq!((database.counts(), saved.refused), (counts, 0));
     let moments: i64 = database.connection().query_row("SELECT count(*) FROM moment", [], |row| row.get(0)).unwrap();
     assert_eq!(moments, 100, "a moment is copied once");
@@ -90,7 +90,7 @@ fn a_long_history_needs_no_more_memory_than_a_short_one() {
     let mut database = open(&new);
     peak_kb();
     let before = peak_kb();
-    let saved = salvage(&path, &mut database).unwrap();
+    let saved = salvage(&path, &place.path().join("pages.db"), &mut database).unwrap();
     let after = peak_kb();
     assert_eq!(i64::try_from(saved.half_cycles).unwrap(), ROWS);
     // All in memory were 40 MB. Other tests of this process may take some.

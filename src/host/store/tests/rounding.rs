@@ -9,8 +9,8 @@ use super::*;
 fn from_the_disk(early: &StateDocument, late: &StateDocument) -> StateDocument {
     let parts = |document: &StateDocument| JsonParts::of(&serde_json::to_vec(document).unwrap()).unwrap();
     let base = parts(early);
-    let stored = packed::delta(&parts(late), &base, 7);
-    StateDocument::parse(&packed::read_delta(&stored, &base, 7).unwrap().join()).unwrap()
+    let stored = packed::delta(&parts(late), &base, 7, 8);
+    StateDocument::parse(&packed::read_delta(&stored, &base, 7, 8).unwrap().join()).unwrap()
 }
 
 fn numbers(value: &Value) -> Vec<f64> {

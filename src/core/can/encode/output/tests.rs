@@ -103,7 +103,7 @@ fn status_reads_back_within_half_a_bit() {
 }
 
 /// Fields of the health frame with the page each is on, a value inside, and what it reads.
-const HEALTH_VALUES: [(usize, &str, f64, f64); 17] = [
+const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
     (0, "Soh", 0.871, 87.1),

@@ -1,0 +1,148 @@
+//! Places of a server's connections: bounded in total and for each client. A new connection takes the place of the one that
+//! has been idle longest, so that silent and slow clients cannot keep others out.
+//!
+//! A connection is idle while the client has to act: to send a request, or to read the answer. One whose request is being
+//! worked on is never closed. A connection is not closed within [`GRACE`] of becoming idle; when every place is taken by
+//! such connections, the new one is refused.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::task::AbortHandle;
+
+/// Time for a client to send its request or to read its answer before another takes the place: far more than a working client
+/// needs.
+pub(crate) const GRACE: Duration = Duration::from_millis(250);
+
+/// Connections at once.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PlaceLimits {
+    /// Of all clients.
+    pub total: usize,
+    /// Of one client.
+    pub per_client: usize,
+}
+
+/// The places; a client is known by `K`.
+#[derive(Debug)]
+pub(crate) struct Places<K> {
+    limits: PlaceLimits,
+    taken: Vec<Place<K>>,
+}
+
+#[derive(Debug)]
+struct Place<K> {
+    client: K,
+    activity: Activity,
+    task: AbortHandle,
+}
+
+/// Since when a connection is idle; `None` = its request is being worked on.
+#[derive(Debug, Clone)]
+pub(crate) struct Activity(Arc<Mutex<Option<Instant>>>);
+
+impl Activity {
+    /// A new connection is idle.
+    pub(crate) fn new() -> Self {
+        Self(Arc::new(Mutex::new(Some(Instant::now()))))
+    }
+
+    /// A request has been received.
+    pub(crate) fn begin_request(&self) {
+        self.set(None);
+    }
+
+    /// The answer is there to be sent.
+    pub(crate) fn end_request(&self) {
+        self.set(Some(Instant::now()));
+    }
+
+    fn set(&self, idle_since: Option<Instant>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = idle_since;
+    }
+
+    fn idle_since(&self) -> Option<Instant> {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<K: PartialEq> Places<K> {
+    /// Places without a connection.
+    pub(crate) fn new(limits: PlaceLimits) -> Self {
+        Self { limits, taken: Vec::new() }
+    }
+
+    /// Makes room for a connection of `client`; `false` = there is none.
+    pub(crate) fn make_room(&mut self, client: &K, now: Instant) -> bool {
+        self.taken.retain(|place| !place.task.is_finished());
+        let of_client = self.taken.iter().filter(|place| place.client == *client).count();
+        if of_client >= self.limits.per_client {
+            return self.close_idlest(now, |place| place.client == *client);
+        }
+        self.taken.len() < self.limits.total || self.close_idlest(now, |_| true)
+    }
+
+    /// Notes the connection for which there is room.
+    pub(crate) fn take(&mut self, client: K, activity: Activity, task: AbortHandle) {
+        self.taken.push(Place { client, activity, task });
+    }
+
+    fn close_idlest(&mut self, now: Instant, is_eligible: impl Fn(&Place<K>) -> bool) -> bool {
+        let idle = |place: &Place<K>| place.activity.idle_since().filter(|since| now.duration_since(*since) >= GRACE);
+        let places = self.taken.iter().enumerate().filter(|(_, place)| is_eligible(place));
+        let idlest = places.filter_map(|(at, place)| Some((idle(place)?, at))).min();
+        idlest.map(|(_, at)| self.taken.swap_remove(at).task.abort()).is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A connection that never ends by itself.
+    fn connect(places: &mut Places<u32>, client: u32, now: Instant) -> Option<(Activity, tokio::task::JoinHandle<()>)> {
+        if !places.make_room(&client, now) {
+            return None;
+        }
+        let (activity, task) = (Activity::new(), tokio::spawn(std::future::pending()));
+        places.take(client, activity.clone(), task.abort_handle());
+        Some((activity, task))
+    }
+
+    #[tokio::test]
+    async fn the_longest_idle_connection_gives_way_and_a_busy_one_does_not() {
+        let mut places = Places::new(PlaceLimits { total: 3, per_client: 2 });
+        let now = Instant::now();
+        let (busy, mut busy_task) = connect(&mut places, 1, now).unwrap();
+        busy.begin_request();
+        let (_, first) = connect(&mut places, 2, now).unwrap();
+        let (_, second) = connect(&mut places, 3, now).unwrap();
+        assert!(connect(&mut places, 4, now).is_none(), "none has been idle for long");
+        let later = Instant::now() + GRACE;
+        let (fourth, _task) = connect(&mut places, 4, later).unwrap();
+        assert!(first.await.unwrap_err().is_cancelled());
+        let _fifth = connect(&mut places, 5, later).unwrap();
+        assert!(second.await.unwrap_err().is_cancelled());
+        fourth.begin_request();
+        assert!(
+            tokio::time::timeout(Duration::from_millis(20), &mut busy_task).await.is_err(),
+            "a request is under way"
+        );
+        busy_task.abort();
+        assert!(busy_task.await.is_err());
+        assert!(connect(&mut places, 6, now).is_some(), "one has ended");
+    }
+
+    #[tokio::test]
+    async fn a_client_with_many_connections_closes_its_own() {
+        let mut places = Places::new(PlaceLimits { total: 3, per_client: 2 });
+        let now = Instant::now();
+        let (_other, mut other_task) = connect(&mut places, 1, now).unwrap();
+        let (_, first) = connect(&mut places, 2, now).unwrap();
+        let _second = connect(&mut places, 2, now).unwrap();
+        let later = Instant::now() + GRACE;
+        let _third = connect(&mut places, 2, later).unwrap();
+        assert!(first.await.unwrap_err().is_cancelled());
+        assert!(tokio::time::timeout(Duration::from_millis(20), &mut other_task).await.is_err());
+    }
+}

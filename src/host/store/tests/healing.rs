@@ -1,0 +1,143 @@
+//! What is left of a store whose states are lost, and what must not come back.
+
+use super::folder::Folder;
+use super::rows::tests::{alarm, capacity};
+use super::*;
+use crate::alarm::{Change, Selector};
+use crate::monitor::{LearnedCell, Source};
+
+/// A store in a folder of its own, with the state in which its replay ended.
+fn replayed_store() -> (tempfile::TempDir, Snapshot) {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("state");
+    let end = snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
+    (place, end)
+}
+
+fn change(place: &Path, sql: &str) {
+    let connection = rusqlite::Connection::open(place.join("state").join(DATABASE)).unwrap();
+    assert!(connection.execute(sql, []).unwrap() > 0, "{sql}");
+}
+
+fn open(place: &Path) -> (Store, StoredStates) {
+    let at = PlaceSetting::At(place.join("state"));
+    let (store, found) = Store::open(&at, &config().store, &VehicleIdentity::default()).unwrap();
+    (store.unwrap(), found)
+}
+
+#[test]
+fn without_a_good_state_a_start_continues_from_the_capacities_in_the_history() {
+    let (place, end) = replayed_store();
+    for table in state_slots::COPIES {
+        change(place.path(), &format!("UPDATE {table} SET bytes = zeroblob(length)"));
+    }
+    let (_store, found) = open(place.path());
+    assert!(found.states.is_empty() && !found.works);
+    assert_eq!(found.learned.len(), 1);
+    let mut monitor = Monitor::new(config().monitor);
+    assert!(monitor.relearn(&found.learned));
+    let (before, after) = (restored(end).capacity(CellIndex(0)), restored(monitor.snapshot()).capacity(CellIndex(0)));
+    let learned = found.learned[0].capacity;
+    assert!((after.mean - learned.mean).abs() < 1e-9 && (after.std() - learned.std()).abs() < 1e-9, "{after:?}");
+    assert!((after.mean - before.mean).abs() < 0.1 * before.std(), "{before:?}, then {after:?}");
+    let fresh = Monitor::new(config().monitor).capacity(CellIndex(0));
+    assert!(fresh.std() > 1.5 * after.std(), "as a new cell: {fresh:?}, {after:?}");
+}
+
+#[test]
+fn a_damaged_row_of_the_history_is_not_learned_from() {
+    let (place, _) = replayed_store();
+    for table in state_slots::COPIES {
+        change(place.path(), &format!("DELETE FROM {table}"));
+    }
+    let learned = || {
+        let mut folder = Folder::new(place.path().join("state"), 1000);
+        folder.open(&document(1, 1, 1).stamp).unwrap().learned[0]
+    };
+    let good = learned();
+    change(place.path(), "UPDATE capacity SET capacity_ah = 9.9 WHERE seq = (SELECT max(seq) FROM capacity)");
+    let earlier = learned();
+    assert!(earlier.capacity.mean < 9.0 && earlier != good, "{earlier:?}");
+}
+
+#[test]
+fn learned_values_of_other_cells_or_impossible_ones_change_nothing() {
+    let mut monitor = Monitor::new(config().monitor);
+    let before = serde_json::to_string(&monitor.snapshot()).unwrap();
+    let of = |cell: u16, mean: f64, std: f64| {
+        let capacity = crate::filter::ScalarGaussian::from_std(mean, std);
+        LearnedCell { cell: CellIndex(cell), capacity, usable: None, resistance: None }
+    };
+    for learned in [of(1, 2.0, 0.1), of(0, f64::NAN, 0.1), of(0, -2.0, 0.1), of(0, 2.0, 0.0), of(0, 2.0, f64::INFINITY)]
+    {
+        assert!(!monitor.relearn(&[of(0, 2.0, 0.1), learned]), "{learned:?}");
+    }
+    assert_eq!(serde_json::to_string(&monitor.snapshot()).unwrap(), before);
+    assert!(monitor.relearn(&[of(0, 2.0, 0.1)]));
+}
+
+#[test]
+fn the_state_of_the_old_pack_does_not_come_back_with_a_salvage() {
+    let (place, _) = replayed_store();
+    let state = place.path().join("state");
+    assert_eq!(replace_pack(&state).unwrap(), 2);
+    let mut folder = Folder::new(state, 1000);
+    folder.mark_damaged("for the test");
+    let opening = folder.open(&document(1, 1, 1).stamp).unwrap();
+    assert!(opening.state.is_none() && opening.learned.is_empty());
+    assert_eq!(opening.database.counts().packs, 2);
+}
+
+#[test]
+fn a_command_is_committed_although_its_alarm_flickers() {
+    let place = tempfile::tempdir().unwrap();
+    let (store, _) =
+        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
+    let mut store = store.unwrap();
+    let monitor = Monitor::new(config().monitor);
+    let time = Timestamp::from_secs(1.0);
+    let event = |kind| Event { time, kind };
+    let flickers = |store: &mut Store| store.learned(&[event(alarm(Change::Raised))], &monitor, time);
+    while flickers(&mut store).is_some() {}
+    let command = |changed| {
+        let command = Command::Clear(Selector::default());
+        event(EventKind::Command { source: Source::Local, command, changed, refused: 0 })
+    };
+    let cleared = event(alarm(Change::Cleared));
+    assert_eq!(store.learned(&[command(0)], &monitor, time), None, "nothing has changed");
+    let ticket = store.learned(&[cleared, command(1)], &monitor, time).unwrap();
+    assert!(answer(&store, ticket).works);
+    assert!(flickers(&mut store).is_none(), "no more than that");
+    let entries = HistoryReader::open(place.path()).unwrap().entries(&HistoryQuery::default()).unwrap();
+    assert_eq!(entries.last().unwrap().values[3], "cleared");
+}
+
+#[test]
+fn a_history_that_was_written_again_does_not_fit_what_was_noted() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    let write = |ah: f64, rows: usize| {
+        let _ = std::fs::remove_file(&path);
+        let mut database = Database::open(&path, &document(1, 1, 1).stamp, 1000).unwrap();
+        for _ in 0..rows {
+            let rows = vec![HistoryRow::Event(capacity(0, Some(2.0), ah))];
+            database.commit(&[RowBatch { stamp: document(1, 1, 1).stamp, rows }], None).unwrap();
+        }
+        let (rows, hash) = database.head();
+        NotedHead { rows, hash }
+    };
+    let contradiction = |noted: &NotedHead| HistoryReader::open(folder.path()).unwrap().contradiction(noted).unwrap();
+    let noted = write(1.9, 3);
+    assert_eq!(format!("{}:{}", noted.rows, noted.hash).parse(), Ok(noted.clone()));
+    assert_eq!(contradiction(&noted), None);
+    write(1.9, 5);
+    assert_eq!(contradiction(&noted), None, "it has grown");
+    write(1.8, 5);
+    assert!(HistoryReader::open(folder.path()).unwrap().verify().unwrap().broken.is_none());
+    assert!(contradiction(&noted).unwrap().contains("written again"));
+    write(1.9, 2);
+    assert!(contradiction(&noted).unwrap().contains("no row 3"));
+    for text in ["", "3", "3:12", ":", "-1:00", &format!("x:{}", noted.hash)] {
+        assert!(text.parse::<NotedHead>().is_err(), "{text}");
+    }
+}

@@ -1,0 +1,185 @@
+//! A cell known by its label alone: its model is learned from simulated drives and charges, through the whole monitor.
+//!
+//! In: cycles of the paper's scenario by a cell with less capacity and resistance than its label says, a night between two.
+
+use std::path::Path;
+
+use packwatch::can::Frame;
+use packwatch::can::encode::InputEncoder;
+use packwatch::cell::{Branch, CellModel, Chemistry, Table};
+use packwatch::config::{self, ConfigFiles};
+use packwatch::monitor::{Downtime, Event, EventKind, Input, ModelState, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::quantity::{BusIndex, CellIndex, Timestamp};
+use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+
+/// On the label, and in truth.
+const RATED_AH: f64 = 5.0;
+const TRUE_AH: f64 = 4.7;
+const TRUE_RESISTANCE: f64 = 0.7;
+/// Between two cycles, s.
+const NIGHT_S: f64 = 30_000.0;
+
+fn configuration(chemistry: &str) -> MonitorConfig {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
+    let label = format!("chemistry = \"{chemistry}\"\nrated_capacity_ah = {RATED_AH}");
+    let text = text.replace("cell_model = \"cells/example_nmc_2600.toml\"", &label);
+    let path = folder.join("label.toml");
+    let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
+    config::load_with(&ConfigFiles::alone(&path), &read)
+        .unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
+        .monitor
+}
+
+/// The cell in truth: of the label's chemistry, with other resistances.
+fn true_model(config: &MonitorConfig) -> CellModel {
+    let scaled = |table: &Table, factor: f64| Table {
+        values: table.values.iter().map(|row| row.iter().map(|value| factor * value).collect()).collect(),
+    };
+    let mut model = config.model.clone();
+    model.r0_ohm = scaled(&model.r0_ohm, TRUE_RESISTANCE);
+    let branch = |branch: &Branch| Branch {
+        r_ohm: scaled(&branch.r_ohm, TRUE_RESISTANCE),
+        c_farad: scaled(&branch.c_farad, 1.0 / TRUE_RESISTANCE),
+    };
+    model.branches = model.branches.iter().map(branch).collect();
+    model
+}
+
+/// Frames of some cycles, in time order.
+fn vehicle(model: &CellModel, config: &MonitorConfig, cycles: u64) -> Vec<(Timestamp, BusIndex, Frame)> {
+    let encoder = InputEncoder::new(&config.input);
+    let (mut all, mut frames, mut night_s): (Vec<(Timestamp, BusIndex, Frame)>, _, f64) = (Vec::new(), Vec::new(), 0.0);
+    for seed in 1..=cycles {
+        let mut settings = Settings { seed, cycles: Some(1), ..Settings::of(Scenario::Paper, TRUE_AH) };
+        settings.sensors.current.offset = 0.0;
+        settings.pack.ageing = Default::default();
+        (settings.soc_window, settings.pack.initial_soc) = ((0.08, 0.97), 0.97);
+        let mut sim = Simulation::new(model.clone(), settings, Wiring::single());
+        let mut last = Timestamp::ZERO;
+        while let Some(moment) = sim.advance() {
+            frames.clear();
+            encoder.encode(sim.readings(), &mut frames);
+            last = moment.time.plus_secs(night_s);
+            all.extend(frames.iter().map(|(bus, frame)| (last, *bus, *frame)));
+        }
+        night_s = all.first().map_or(0.0, |(first, ..)| last.since(*first)) + NIGHT_S;
+    }
+    all
+}
+
+/// A monitor and all it has said.
+struct Live {
+    monitor: Monitor,
+    out: Outputs,
+    said: Vec<String>,
+    events: Vec<Event>,
+}
+
+impl Live {
+    fn new(config: &MonitorConfig) -> Self {
+        let out = Outputs { want_estimates: true, ..Outputs::default() };
+        Self { monitor: Monitor::new(config.clone()), out, said: Vec::new(), events: Vec::new() }
+    }
+
+    fn restored(config: &MonitorConfig, snapshot: Snapshot) -> Self {
+        let mut live = Self::new(config);
+        live.monitor.restore(snapshot, Downtime::AsStamped).expect("its own state");
+        live
+    }
+
+    fn take(&mut self, (time, bus, frame): &(Timestamp, BusIndex, Frame)) {
+        while let Some(due) = self.monitor.next_due().filter(|due| due <= time && time.since(*due) < 60.0) {
+            self.give(Input::Tick { time: due });
+        }
+        self.give(Input::Frame { time: *time, bus: *bus, frame });
+    }
+
+    fn give(&mut self, input: Input<'_>) {
+        self.monitor.handle(input, &mut self.out);
+        self.said.extend(self.out.frames.iter().map(|frame| format!("{frame:?}")));
+        self.said.extend(self.out.estimates.iter().map(|estimate| format!("{estimate:?}")));
+        self.said.extend(self.out.events.iter().map(|event| format!("{event:?}")));
+        self.events.append(&mut self.out.events);
+        self.out.clear();
+    }
+}
+
+#[test]
+fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
+    let config = configuration("nmc811-graphite");
+    let mut live = Live::new(&config);
+    vehicle(&true_model(&config), &config, 4).iter().for_each(|frame| live.take(frame));
+    let view = live.monitor.model();
+    assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
+    let own = view.own.expect("a learned model");
+    let off = (own.capacity.mean - TRUE_AH) / own.capacity.std();
+    assert!(off.abs() < 1.96 && own.capacity.std() < 0.05 * TRUE_AH, "{:?}", own.capacity);
+    assert!(view.fits >= 2 && view.taken_back == 0, "{} fits, {} taken back", view.fits, view.taken_back);
+    let published = live.monitor.capacity(CellIndex(0));
+    assert!((published.mean - TRUE_AH).abs() < 1.96 * published.std(), "{published:?}");
+    let learned_at = |event: &Event| matches!(event.kind, EventKind::Model { .. }).then_some(event.time);
+    let is_gap = |event: &Event| matches!(event.kind, EventKind::Gap { .. }).then_some(event.time);
+    let gaps: Vec<Timestamp> = live.events.iter().filter_map(is_gap).collect();
+    for time in live.events.iter().filter_map(learned_at) {
+        let nearest_s = gaps.iter().map(|gap| gap.since(time).abs()).fold(f64::MAX, f64::min);
+        assert!(nearest_s < NIGHT_S + 60.0, "a model changed while driving, {nearest_s} s from a night");
+    }
+}
+
+#[test]
+fn a_state_of_any_moment_continues_as_if_there_had_been_no_restart() {
+    let config = configuration("nmc811-graphite");
+    let frames = vehicle(&true_model(&config), &config, 3);
+    let mut whole = Live::new(&config);
+    let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
+    for (at, frame) in frames.iter().enumerate() {
+        // Each stored state is followed over a night, then the next one.
+        if at % (frames.len() / 7) == frames.len() / 14 {
+            twin = Some(Live::restored(&config, whole.monitor.snapshot()));
+            from = whole.said.len();
+        }
+        whole.take(frame);
+        if let Some(twin) = &mut twin {
+            twin.take(frame);
+            let differ = whole.said[from..].iter().zip(&twin.said).find(|(a, b)| a != b);
+            assert_eq!(differ, None, "frame {at}");
+            assert_eq!(whole.said.len() - from, twin.said.len(), "frame {at}");
+            from = whole.said.len();
+            twin.said.clear();
+        }
+    }
+    assert!(whole.monitor.model().own.is_some(), "{:?}", whole.monitor.model().state);
+}
+
+#[test]
+fn a_wrong_chemistry_on_the_label_is_found_within_one_cycle() {
+    let truth = configuration("nmc811-graphite");
+    let model = true_model(&truth);
+    for (wrong, right) in [("lfp-graphite", "nmc"), ("lco-graphite", "n")] {
+        let config = configuration(wrong);
+        let mut live = Live::new(&config);
+        vehicle(&model, &truth, 1).iter().for_each(|frame| live.take(frame));
+        live.give(Input::UnknownGap { time: Timestamp::from_secs(4e9) });
+        let view = live.monitor.model();
+        assert_eq!(view.state, ModelState::Unfit, "{wrong}");
+        let better = view.chemistry.map(Chemistry::name).unwrap_or_default();
+        assert!(better.starts_with(right), "{wrong}: {better}");
+        assert!(view.own.is_none(), "the label's model stays");
+    }
+}
+
+#[test]
+fn a_corrected_label_keeps_the_rows_and_forgets_the_model() {
+    let wrong = configuration("lfp-graphite");
+    let right = configuration("nmc811-graphite");
+    let mut live = Live::new(&wrong);
+    vehicle(&true_model(&right), &right, 2).iter().for_each(|frame| live.take(frame));
+    let rows = live.monitor.model().notebook.map_or(0, |notebook| notebook.rows().len());
+    assert!(rows > 20, "{rows} rows");
+    let mut corrected = Live::restored(&right, live.monitor.snapshot());
+    corrected.give(Input::UnknownGap { time: Timestamp::from_secs(4e9) });
+    let view = corrected.monitor.model();
+    assert!(view.notebook.map_or(0, |notebook| notebook.rows().len()) >= rows);
+    assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
+}
