@@ -64,10 +64,13 @@ fn show(description: &Description, page: &mut String) {
     page.push_str("\ninterfaces\n");
     for interface in &description.interfaces {
         let kind = if interface.fd { "classic and FD" } else { "classic" };
-        let ids = match interface.filter_ids.len() {
+        let mut ids = match interface.filter_ids.len() {
             0 => "nothing is read".to_owned(),
             _ => format!("kernel filter {}", interface.filter_ids.join(" ")),
         };
+        if !interface.own_ids.is_empty() {
+            ids.push_str(&format!("; watched for another sender: {}", interface.own_ids.join(" ")));
+        }
         page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }
     list("signals", &table(description.signals.iter().map(signal)), "", page);

@@ -287,8 +287,12 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let (mut whole, mut cut) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
     let wanting = || Outputs { want_estimates: true, ..Outputs::default() };
     let (mut out_whole, mut out_cut, mut cuts) = (wanting(), wanting(), 0);
+    let mut before = Timestamp::from_nanos(0);
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
-        if nth > 0 && dice.one_in(one_in) {
+        // After a longer time without an input the restored one takes it that the program was off.
+        let is_break = record.input().time().since(before).abs() > 30.0;
+        before = record.input().time();
+        if nth > 0 && !is_break && dice.one_in(one_in) {
             cut = restored(&cut, config);
             cuts += 1;
         }

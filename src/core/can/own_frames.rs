@@ -42,13 +42,19 @@ pub struct OwnIdUse {
     frames: u64,
 }
 
-/// A frame that we sent.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// A frame that we sent, with a check sum in the place of its payload: to keep it needs no memory of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct SentFrame {
     time: Timestamp,
     bus: BusIndex,
     id: CanId,
-    data: Vec<u8>,
+    sum: u64,
+}
+
+/// FNV-1a of a payload and its length: a copy is to be recognised, not to be proven.
+fn sum(data: &[u8]) -> u64 {
+    let bytes = data.iter().copied().chain([data.len() as u8]);
+    bytes.fold(0xCBF2_9CE4_8422_2325, |sum, byte| (sum ^ u64::from(byte)).wrapping_mul(0x100_0000_01B3))
 }
 
 /// State for a snapshot.
@@ -75,7 +81,9 @@ impl OwnFrames {
         let mut own: Vec<_> = own.into_iter().collect();
         own.sort_unstable();
         own.dedup();
-        Self { own, ..Self::default() }
+        let mut own_frames = Self { own, ..Self::default() };
+        own_frames.state.sent.reserve_exact(MAX_SENT);
+        own_frames
     }
 
     /// Whether an identifier is ours.
@@ -90,7 +98,7 @@ impl OwnFrames {
             if self.state.sent.len() >= MAX_SENT {
                 self.state.sent.pop_front();
             }
-            self.state.sent.push_back(SentFrame { time, bus, id: frame.id(), data: frame.data().to_vec() });
+            self.state.sent.push_back(SentFrame { time, bus, id: frame.id(), sum: sum(frame.data()) });
         }
     }
 
@@ -104,7 +112,8 @@ impl OwnFrames {
 
     fn handle_own(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_echo = |sent: &SentFrame| {
-            (sent.bus, sent.id, &sent.data[..]) == (bus, frame.id(), frame.data())
+            (sent.bus, sent.id) == (bus, frame.id())
+                && sent.sum == sum(frame.data())
                 && now.since(sent.time).abs() <= ECHO_S
         };
         if let Some(echo) = self.state.sent.iter().position(is_echo) {
@@ -146,7 +155,8 @@ impl OwnFrames {
     /// After time without listening, or a step of the clock: every other sender is gone, and no echo comes.
     pub fn restart(&mut self) {
         self.poll(Timestamp::from_nanos(i64::MAX));
-        self.state = OwnFramesState::default();
+        self.state.uses.clear();
+        self.state.sent.clear();
     }
 
     /// Returns the state.

@@ -103,7 +103,7 @@ impl MonitorConfig {
     }
 
     /// Identifiers that are decoded on an interface, ascending.
-    fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
+    pub fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
         ids.extend(diagnostic::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));

@@ -24,13 +24,16 @@ use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp, bounds};
-use crate::sample::{CellSample, SamplerState};
+use crate::sample::{CellSample, SampleConfig, SamplerState};
 
 /// Charge of a stored state that no current moved.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
 /// Room for limits of the current that were wider when the charge was counted, and for a clock that was set.
 const CHARGE_TOLERANCE: f64 = 2.0;
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
+
+/// A longer time without an input, s, is a break of the program, whatever its stamps: a running one ticks.
+const BREAK_S: f64 = 30.0;
 
 /// Layout version of [`Snapshot`].
 const SNAPSHOT_VERSION: u32 = 2;
@@ -174,7 +177,8 @@ impl Monitor {
     /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
     /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
     /// other. [`Downtime::AsStamped`] says that the same clock continues: then frames, events and estimates are, byte for byte,
-    /// those of a monitor that had not stopped, unless the state was stored [for a restart](Snapshot::for_restart).
+    /// those of a monitor that had not stopped, unless half a minute is without an input or the state was stored
+    /// [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
     /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
@@ -202,8 +206,7 @@ impl Monitor {
         }
         snapshot.check()?;
         let config = sampling.sampler.config();
-        let most_a = config.current.min.abs().max(config.current.max.abs()) / f64::from(config.strings.max(1));
-        snapshot.check_charges(f64::from(config.strings.max(1)), most_a)?;
+        snapshot.check_charges(config)?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
         Ok(())
     }
@@ -212,7 +215,8 @@ impl Monitor {
     /// to the caller.
     pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
         let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
-        if let (Downtime::AsStamped, Some(continuation)) = (downtime, snapshot.continuation.take()) {
+        let continuation = snapshot.continuation.take().filter(|_| now.since(snapshot.time).abs() <= BREAK_S);
+        if let (Downtime::AsStamped, Some(continuation)) = (downtime, continuation) {
             (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
             self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses));
             self.stages.restore(*snapshot, now, true, out);
@@ -398,10 +402,13 @@ impl Snapshot {
         Ok(self.learning.check()?)
     }
 
-    /// Checks that the charge between a moment of the past and the state is one that a current of at most `most_a` moves.
+    /// Checks that the charge between a moment of the past and the state is one that the largest plausible current moves.
     /// Only its differences mean anything, so that each of both numbers alone may be what it likes.
-    fn check_charges(&self, strings: f64, most_a: f64) -> Result<(), RestoreError> {
-        let charge_as = self.sampler.charge_as() / strings;
+    fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
+        let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
+        let most_a = limits.min.abs().max(limits.max.abs()) / strings;
+        // A cell's latest voltage has taken in the current that was held until then.
+        let charge_as = self.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
             let passed_s = self.time.since(time).abs() + CHARGE_TOLERANCE_S;
             let moved_as = charge_as - before_as;

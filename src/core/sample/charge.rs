@@ -138,11 +138,6 @@ impl ChargeCounter {
         bounds::TIME_S.check_all("the time that charge is counted", [offset_s, unmeasured_s, flowing_s, discharging_s])
     }
 
-    /// Charge counted so far, As.
-    pub(super) fn charge_as(&self) -> f64 {
-        self.totals.charge_as
-    }
-
     fn passed_s(&self, time: Timestamp) -> f64 {
         self.counted_to.map_or(0.0, |from| time.since(from).max(0.0))
     }

@@ -58,9 +58,9 @@ impl SamplerState {
         self.signals.iter().try_for_each(Signal::check)
     }
 
-    /// Charge counted up to the latest reading, As, for the pack.
-    pub fn charge_as(&self) -> f64 {
-        self.charge.charge_as()
+    /// Charge up to `time`, As, for the pack: the latest reading holds for at most `max_age_s`.
+    pub fn charge_as(&self, time: Timestamp, max_age_s: f64) -> f64 {
+        self.charge.totals_at(time, max_age_s).charge_as
     }
 
     /// Moves every stamp by `by_nanos`, onto another clock.

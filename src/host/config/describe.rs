@@ -53,8 +53,10 @@ pub struct InterfaceUse {
     pub name: String,
     /// Whether FD frames are accepted.
     pub fd: bool,
-    /// Identifiers let through, as candump writes them.
+    /// Identifiers of inputs that are let through, as candump writes them.
     pub filter_ids: Vec<String>,
+    /// Those let through because they are this program's: no other node may send them.
+    pub own_ids: Vec<String>,
 }
 
 /// A configured signal as found in its DBC.
@@ -196,8 +198,10 @@ fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
 }
 
 fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> InterfaceUse {
-    let filter_ids = config.monitor.wanted_ids(bus).iter().map(ToString::to_string).collect();
-    InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids }
+    let filter_ids: Vec<_> = config.monitor.listened_ids(bus).iter().map(ToString::to_string).collect();
+    let all = config.monitor.wanted_ids(bus).into_iter().map(|id| id.to_string());
+    let own_ids = all.filter(|id| !filter_ids.contains(id)).collect();
+    InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids, own_ids }
 }
 
 fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> SignalUse {

@@ -21,8 +21,12 @@ fn faults_of_a_cell_model() {
         ("[3.0, 3.6, 4.1]", "[3.0, 3.6]", "cell.toml:12: tables.ocv_v: row 1 has 2 values, must be 3, one per soc"),
         ("[[3.0, 3.6, 4.1], ", "[", "cell.toml:12: tables.ocv_v: 1 rows, must be 2, one per temperature_c"),
         ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0 and at most 100"),
-        ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be above 0"),
-        ("[[100, 100, 100]", "[[100, 0, 100]", "cell.toml:16: tables.branches[1].c_farad = 0, must be above 0"),
+        ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be 0.000000001 to 1000"),
+        (
+            "[[100, 100, 100]",
+            "[[100, 0, 100]",
+            "cell.toml:16: tables.branches[1].c_farad = 0, must be 0.000001 to 1000000000000",
+        ),
         (
             "c_farad = [[100, 100, 100], ",
             "c_farad = [",
