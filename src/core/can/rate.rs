@@ -6,11 +6,14 @@
 //! Per window of [`WINDOW_NS`] the frames are counted. More than [`EXCESS`] times the expected number in [`WINDOWS`] windows in
 //! a row is a second sender where there is a second sign of it: each frame of the first one falls between two of the other, so
 //! that one interval in each of its periods is much shorter than the mean; or the currents alternate. A sender that becomes
-//! faster, as many do when the vehicle wakes, gives neither. The expected number is that of the DBC's cycle time, else the
-//! highest steady rate so far; it is stored, so that a second sender is found after a restart, too.
+//! faster, as many do when the vehicle wakes, gives neither. Short intervals that a message has anyway, as the pages of a
+//! multiplexed one that come in a burst, are learned with its rate and count for nothing. The expected number is the highest
+//! steady rate so far, or that of the DBC's cycle time if it is higher; the rate is stored, so that a second sender is found after
+//! a restart, too.
 //!
-//! Limits: a second sender as slow as the first of fewer than [`LEAST_PER_S`] frames a second, or one that is there before the
-//! rate is known, is not found. A message with end-to-end protection needs none of this: its counters do not fit.
+//! Limits: a second sender as slow as the first of fewer than [`LEAST_PER_S`] frames a second, one of a message that always comes
+//! in bursts or more than twenty times as often, if it carries no current, and one that is there before the rate is known, if its
+//! currents do not differ, are not found. A message with end-to-end protection needs none of this: its counters do not fit.
 
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +41,8 @@ const LEAST_PER_S: f64 = 3.0;
 const SHORT: f64 = 0.5;
 /// Short intervals, or contradictions, per expected frame that are a sign of a second sender.
 const SIGNS: f64 = 0.4;
+/// Part of the frames that comes after a short interval by chance: other messages delay them.
+const CHANCE_SHORT: f64 = 0.02;
 
 /// A second sender was found, or is gone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -62,6 +67,9 @@ pub struct MessageRate {
     id: CanId,
     /// Highest steady rate, 1/s.
     learned_per_s: Option<f64>,
+    /// Part of its frames that come after a short interval.
+    #[serde(default)]
+    usual_short: f64,
     /// Rate of the latest windows, and for how many it has been steady.
     candidate: f64,
     steady: u32,
@@ -95,7 +103,7 @@ pub struct SecondSenders {
 }
 
 impl SecondSenders {
-    /// For these messages, each with its cycle time (s) where it is known.
+    /// For these messages, each with the cycle time (s) of its frames where it is known.
     pub fn new(messages: impl IntoIterator<Item = (BusIndex, CanId, Option<f64>)>) -> Self {
         let mut messages: Vec<_> = messages.into_iter().collect();
         messages.sort_by_key(|(bus, id, _)| (*bus, *id));
@@ -125,8 +133,7 @@ impl SecondSenders {
     pub fn handle(&mut self, now: Timestamp, bus: BusIndex, id: CanId) {
         let number = self.numbers.number(bus, id);
         let Some(rate) = self.rates.get_mut(number) else { return };
-        let expected = self.configured_per_s[number].or(rate.learned_per_s);
-        rate.end_windows(now, expected, &mut self.changes);
+        rate.end_windows(now, self.configured_per_s[number], &mut self.changes);
         rate.count(now);
         if self.next_end.is_none() {
             self.next_end = rate.window_from;
@@ -152,7 +159,7 @@ impl SecondSenders {
             return;
         }
         for (rate, configured) in self.rates.iter_mut().zip(&self.configured_per_s) {
-            rate.end_windows(now, configured.or(rate.learned_per_s), &mut self.changes);
+            rate.end_windows(now, *configured, &mut self.changes);
         }
         self.next_end = self.rates.iter().filter_map(|rate| rate.window_from).min();
     }
@@ -163,6 +170,7 @@ impl SecondSenders {
         for rate in &mut self.rates {
             *rate = MessageRate {
                 learned_per_s: rate.learned_per_s,
+                usual_short: rate.usual_short,
                 is_doubtful: rate.is_doubtful,
                 ..MessageRate::new(rate.bus, rate.id)
             };
@@ -192,6 +200,7 @@ impl MessageRate {
             bus,
             id,
             learned_per_s: None,
+            usual_short: 0.0,
             candidate: 0.0,
             steady: 0,
             excess: 0,
@@ -208,7 +217,7 @@ impl MessageRate {
 
     fn is_possible(&self) -> bool {
         let is_rate = |rate: f64| (0.0..=1e9).contains(&rate);
-        is_rate(self.candidate) && self.learned_per_s.is_none_or(is_rate)
+        is_rate(self.candidate) && self.learned_per_s.is_none_or(is_rate) && (0.0..=1.0).contains(&self.usual_short)
     }
 
     #[inline]
@@ -226,11 +235,12 @@ impl MessageRate {
 
     /// Ends the window, if it is over.
     #[inline]
-    fn end_windows(&mut self, now: Timestamp, expected: Option<f64>, changes: &mut Vec<SenderChange>) {
+    fn end_windows(&mut self, now: Timestamp, configured: Option<f64>, changes: &mut Vec<SenderChange>) {
         let Some(from) = self.window_from else { return };
         let passed_ns = now.nanos().saturating_sub(from.nanos());
         if passed_ns >= WINDOW_NS {
-            self.end_window(expected, changes);
+            let rates = configured.into_iter().chain(self.learned_per_s);
+            self.end_window(rates.reduce(f64::max), changes);
             let next = from.plus_nanos(WINDOW_NS);
             // A message that has paused begins a new window with its next frame.
             self.window_from = (passed_ns < 2 * WINDOW_NS).then_some(next);
@@ -239,9 +249,9 @@ impl MessageRate {
 
     fn end_window(&mut self, expected: Option<f64>, changes: &mut Vec<SenderChange>) {
         let frames = f64::from(self.frames);
-        let signs = f64::from(self.short.max(self.contradictions));
-        let is_excess = expected
-            .is_some_and(|expected| frames > EXCESS * expected + DELAYED && signs >= (SIGNS * expected).max(1.0));
+        let is_excess = expected.is_some_and(|expected| {
+            frames > EXCESS * expected + DELAYED && self.signs(frames) >= (SIGNS * expected).max(1.0)
+        });
         (self.excess, self.calm) = match is_excess {
             true => (self.excess.saturating_add(1), 0),
             false => (0, self.calm.saturating_add(1)),
@@ -258,11 +268,22 @@ impl MessageRate {
         (self.frames, self.short, self.contradictions) = (0, 0, 0);
     }
 
+    /// Signs of a second sender in the window. What intervals are usual has to be known before a short one is a sign.
+    fn signs(&self, frames: f64) -> f64 {
+        let usual = frames * self.usual_short.max(CHANCE_SHORT);
+        let short = self.learned_per_s.map_or(0.0, |_| f64::from(self.short) - usual);
+        short.max(f64::from(self.contradictions))
+    }
+
     /// Learns a steady rate; a higher one replaces a lower one where no second sender causes it.
     fn learn(&mut self, frames: f64, is_excess: bool) {
         let (part, count) = STEADY;
         let is_steady = (frames - self.candidate).abs() <= part * self.candidate + count;
         self.steady = if is_steady && !is_excess && !self.is_doubtful { self.steady.saturating_add(1) } else { 0 };
+        if self.steady > 0 && frames > 0.0 {
+            let short = f64::from(self.short) / frames;
+            self.usual_short += 0.2 * (short - self.usual_short);
+        }
         self.candidate = if is_steady { self.candidate + 0.2 * (frames - self.candidate) } else { frames };
         if self.steady >= STEADY_WINDOWS && self.candidate >= LEAST_PER_S {
             self.learned_per_s = Some(self.learned_per_s.map_or(self.candidate, |rate| rate.max(self.candidate)));

@@ -5,7 +5,7 @@
 use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
 use crate::alarm::RuleConfig;
 use crate::can::CanId;
-use crate::can::decode::InputMap;
+use crate::can::decode::{Binding, InputMap};
 use crate::can::diagnostic::{self, Answer};
 use crate::can::encode::LayoutMessage;
 use crate::can::flood::FloodConfig;
@@ -94,12 +94,17 @@ impl MonitorConfig {
         self.output.iter().flat_map(of)
     }
 
-    /// Unprotected input messages with their cycle time, s, where it is known.
+    /// Unprotected input messages with the cycle time of their frames, s, where it is known: that of a multiplexed message may be
+    /// that of each page.
     pub(super) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
+        let has_pages = |bus, id| {
+            let of_message = |binding: &&Binding| (binding.bus, binding.id) == (bus, id);
+            self.input.bindings().iter().filter(of_message).any(|binding| !binding.mux.is_empty())
+        };
         let messages = self.input.messages().filter(move |(bus, id, _)| !is_protected(*bus, *id));
-        messages.map(move |(bus, id, _)| (bus, id, cycle_s(bus, id)))
+        messages.map(move |(bus, id, _)| (bus, id, cycle_s(bus, id).filter(|_| !has_pages(bus, id))))
     }
 
     /// Identifiers that are decoded on an interface, ascending.

@@ -410,7 +410,8 @@ impl Snapshot {
         // A cell's latest voltage has taken in the current that was held until then.
         let charge_as = self.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
-            let passed_s = self.time.since(time).abs() + CHARGE_TOLERANCE_S;
+            // The next reading replaces a current that was held for so long.
+            let passed_s = self.time.since(time).abs() + limits.max_age_s + CHARGE_TOLERANCE_S;
             let moved_as = charge_as - before_as;
             let is_possible = moved_as.abs() <= CHARGE_TOLERANCE * most_a * passed_s;
             InvalidState::unless(is_possible, CHARGE, moved_as / 3600.0, "Ah that the largest plausible current moves")
