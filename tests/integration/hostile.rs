@@ -250,16 +250,16 @@ fn frozen_at(events: &[(f64, EventKind)]) -> Option<f64> {
 }
 
 #[test]
-fn a_frozen_current_is_found_once_the_load_turns_twice_and_an_hour_s_drive_has_none() {
+fn a_frozen_current_is_found_within_a_minute_and_an_hour_s_drive_has_none() {
     let Drive { events, .. } = drive(None, 3600.0);
     assert_eq!(frozen_at(&events), None);
     assert!(!events.iter().any(|(_, kind)| matches!(kind, EventKind::SecondSender(_) | EventKind::OwnIdentifier(_))));
-    // The second one is followed by a cruise of 100 s, in which the voltages say nothing.
-    for (frozen_s, within_s) in [(120.0, 60.0), (333.3, 150.0)] {
+    // The second one is followed by a cruise of 100 s, in which the voltages say nothing more.
+    for frozen_s in [120.0, 333.3] {
         let Drive { events, validity, differs_s } = drive(Some(frozen_s), frozen_s + 240.0);
         let after_s = frozen_at(&events).zip(differs_s).map(|(at_s, differs_s)| at_s - differs_s);
         eprintln!("frozen at {frozen_s} s, wrong from {differs_s:?} s: found {after_s:?} s later");
-        assert!(after_s.is_some_and(|after_s| after_s <= within_s), "{frozen_s}: {after_s:?}");
+        assert!(after_s.is_some_and(|after_s| after_s <= 60.0), "{frozen_s}: {after_s:?}");
         assert_eq!(validity, Validity::Untrusted, "{frozen_s}");
     }
 }

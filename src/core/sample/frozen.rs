@@ -5,10 +5,11 @@
 //!
 //! A constant reading alone proves nothing: a parked pack, a charger and a laboratory hold a current for hours, and a coarse
 //! sensor shows one value all the while. But then the voltages rest, or drift one way. A changing load moves them to and fro:
-//! the median of the cells turns back by more than a [`Reversals::step_v`] again and again. [`MIN_REVERSALS`] of these while at least
-//! [`MIN_READINGS`] readings were the same, over at least [`MIN_FROZEN_S`], are not the current's.
+//! the median of the cells moves one way and turns back, by more than its noise each time, within [`MAX_TURN_S`]. Where the
+//! reading is still the same [`MIN_FROZEN_S`] later, after at least [`MIN_READINGS`] equal ones, it is not the current's: a reading
+//! that comes later than the voltages has changed by then.
 //!
-//! Limits: a load that never turns back, or moves the voltages by less than the step, is not seen; nor a sensor whose last
+//! Limits: a load that does not turn back, or moves the voltages by less than the step, is not seen; nor a sensor whose last
 //! digits still change (its voltages then contradict the estimate).
 
 use serde::{Deserialize, Serialize};
@@ -17,15 +18,20 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 
 /// Readings of the current that were the same.
 const MIN_READINGS: u32 = 20;
-/// Time over which they were, s: a constant load of a few seconds is usual.
+/// Time for which they still are after the voltages turned back, s: no current comes that much later.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Times the voltages turned back: one stop of a vehicle is two, braking, accelerating and cruising. A vehicle that cruises is not
-/// judged, nor is its current wrong then.
-const MIN_REVERSALS: u32 = 2;
-/// Step that is no noise of a voltage, in its standard deviations.
+/// Longest time between an extreme voltage and the return from it, s: cells that rest, cool or balance turn more slowly.
+const MAX_TURN_S: f64 = 60.0;
+/// Step that is no noise of a voltage, in its configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
-/// Least step, V: less may be a charger's ripple.
-const MIN_STEP_V: f64 = 0.01;
+/// The same, in the median size of the latest moves from one round to the next, where these are larger than the configured noise:
+/// 8 standard deviations, so that not even two readings in a row reach it by chance within a day.
+const STEP_MOVES: f64 = 8.4;
+/// Moves of which the median is taken, and the fewest.
+const MAX_MOVES: usize = 32;
+const MIN_MOVES: usize = 8;
+/// Least step, V: less may be a charger's ripple, or a load within one step of a coarse current sensor.
+const MIN_STEP_V: f64 = 0.02;
 /// Cells of which the median is taken: the first ones, as many as separate a glitch from a load.
 const MAX_MEDIAN: usize = 15;
 /// Without a change of the current for longer than this between two readings the time in between is not judged, s.
@@ -39,16 +45,19 @@ struct Reversals {
     range_v: Option<(f64, f64)>,
     /// The voltage rises since the last turning point, or falls.
     is_rising: Option<bool>,
+    /// When it was furthest that way.
+    extreme_at: Timestamp,
     /// It has turned in one reading, which the next one has to confirm.
     is_unconfirmed: bool,
-    count: u32,
+    /// It has turned back in time.
+    has_turned: bool,
 }
 
 impl Reversals {
     /// Takes a voltage.
-    fn handle(&mut self, voltage_v: f64, step_v: f64) {
+    fn handle(&mut self, now: Timestamp, voltage_v: f64, step_v: f64) {
         let Some((low, high)) = self.range_v else {
-            self.range_v = Some((voltage_v, voltage_v));
+            (self.range_v, self.extreme_at) = (Some((voltage_v, voltage_v)), now);
             return;
         };
         let (fell, rose) = (voltage_v <= high - step_v, voltage_v >= low + step_v);
@@ -63,10 +72,14 @@ impl Reversals {
         }
         self.is_unconfirmed = false;
         if turns {
-            self.count += u32::from(self.is_rising.is_some());
+            self.has_turned |= self.is_rising.is_some() && now.since(self.extreme_at) <= MAX_TURN_S;
             self.is_rising = Some(rose && !(fell && self.is_rising == Some(true)));
-            self.range_v = Some((voltage_v, voltage_v));
+            (self.range_v, self.extreme_at) = (Some((voltage_v, voltage_v)), now);
         } else {
+            if (voltage_v > high && self.is_rising != Some(false)) || (voltage_v < low && self.is_rising != Some(true))
+            {
+                self.extreme_at = now;
+            }
             self.range_v = Some((low.min(voltage_v), high.max(voltage_v)));
         }
     }
@@ -76,16 +89,21 @@ impl Reversals {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct FrozenCheck {
-    /// The unchanged reading, since when, the latest, and how many.
+    /// The unchanged reading, when it came last, and how often.
     current_a: Option<f64>,
-    since: Timestamp,
     latest: Timestamp,
     readings: u32,
     reversals: Reversals,
+    /// The first reading after the voltages turned back.
+    turned_at: Option<Timestamp>,
     /// Voltages of the round at hand, V, at most [`MAX_MEDIAN`]; the first cell begins a round.
     round_v: Vec<f64>,
+    /// The round at hand began before the reading changed.
+    is_mixed: bool,
     /// Median of the round before, V.
     median_v: f64,
+    /// Sizes of the latest moves of the median, V, at most [`MAX_MOVES`]: they stay when the current's reading changes.
+    moves_v: Vec<f64>,
     is_frozen: bool,
 }
 
@@ -107,42 +125,60 @@ impl FrozenCheck {
         if self.current_a != Some(current_a) || (is_paused && !self.is_frozen) {
             *self = Self {
                 current_a: Some(current_a),
-                since: now,
+                is_mixed: true,
                 round_v: std::mem::take(&mut self.round_v),
+                median_v: self.median_v,
+                moves_v: std::mem::take(&mut self.moves_v),
                 ..Self::default()
             };
-            self.round_v.clear();
         }
         (self.latest, self.readings) = (now, self.readings.saturating_add(1));
-        let is_long = self.readings >= MIN_READINGS && now.since(self.since) >= MIN_FROZEN_S;
-        self.is_frozen = self.is_frozen || (is_long && self.reversals.count >= MIN_REVERSALS);
+        if self.reversals.has_turned && self.turned_at.is_none() {
+            self.turned_at = Some(now);
+        }
+        let is_late = self.turned_at.is_some_and(|turned_at| now.since(turned_at) >= MIN_FROZEN_S);
+        self.is_frozen = self.is_frozen || (is_late && self.readings >= MIN_READINGS);
         self.is_frozen
     }
 
-    /// Takes a cell's voltage; `is_first`: of the first cell, which begins a round.
+    /// Takes the voltage of a cell; the first one begins a round.
     #[inline]
-    pub(super) fn handle_voltage(&mut self, is_first: bool, voltage_v: f64, step_v: f64) {
-        if self.readings < 2 || self.is_frozen {
+    pub(super) fn handle_voltage(&mut self, now: Timestamp, cell: usize, voltage_v: f64, step_v: f64) {
+        if cell >= MAX_MEDIAN {
             return;
         }
-        if is_first && !self.round_v.is_empty() {
-            self.end_round(step_v);
+        if cell == 0 && !self.round_v.is_empty() {
+            self.end_round(now, step_v);
         }
         if self.round_v.len() < MAX_MEDIAN {
             self.round_v.push(voltage_v);
         }
     }
 
-    fn end_round(&mut self, step_v: f64) {
+    fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
         // Of two middle cells the one that has moved less: a load moves both.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };
+        if self.moves_v.len() == MAX_MOVES {
+            self.moves_v.remove(0);
+        }
+        self.moves_v.push((median - self.median_v).abs());
         self.median_v = median;
         self.round_v.clear();
-        self.reversals.handle(median, step_v);
+        let is_mixed = std::mem::take(&mut self.is_mixed);
+        if !is_mixed && self.readings >= 2 && !self.reversals.has_turned && self.moves_v.len() >= MIN_MOVES {
+            self.reversals.handle(now, median, step_v.max(STEP_MOVES * self.median_move_v()));
+        }
+    }
+
+    fn median_move_v(&self) -> f64 {
+        let mut moves_v = [0.0; MAX_MOVES];
+        let moves_v = &mut moves_v[..self.moves_v.len()];
+        moves_v.copy_from_slice(&self.moves_v);
+        *moves_v.select_nth_unstable_by(self.moves_v.len() / 2, f64::total_cmp).1
     }
 
     /// After a gap of unknown length nothing is known.
@@ -151,12 +187,18 @@ impl FrozenCheck {
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {
-        (self.since, self.latest) = (self.since.plus_nanos(by_nanos), self.latest.plus_nanos(by_nanos));
+        for stamp in [&mut self.latest, &mut self.reversals.extreme_at].into_iter().chain(&mut self.turned_at) {
+            *stamp = stamp.plus_nanos(by_nanos);
+        }
     }
 
     /// Checks a stored state; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.reversals.range_v.unwrap_or_default();
+        bounds::VOLTAGE_V.check("the voltage beside a constant current", self.median_v)?;
+        bounds::NUMBER.check_all("moves of a voltage beside a constant current", self.moves_v.iter().copied())?;
+        let moves = self.moves_v.len();
+        InvalidState::unless(moves <= MAX_MOVES, "the moves of a voltage", moves as f64, "at most 32")?;
         bounds::VOLTAGE_V
             .check_all("a voltage beside a constant current", self.round_v.iter().copied().chain([low, high]))?;
         bounds::CURRENT_A.check_all("a constant current", self.current_a)?;
@@ -179,7 +221,8 @@ mod tests {
         let mut check = FrozenCheck::default();
         (0..10 * seconds).map(|k| f64::from(k) / 10.0).find(|&time_s| {
             for cell in 0..3 {
-                check.handle_voltage(cell == 0, voltage(time_s) + 0.01 * f64::from(cell), step_v(0.005));
+                let (now, voltage_v) = (Timestamp::from_secs(time_s), voltage(time_s) + 0.01 * cell as f64);
+                check.handle_voltage(now, cell, voltage_v, step_v(0.005));
             }
             check.handle_current(Timestamp::from_secs(time_s), current(time_s))
         })
@@ -212,9 +255,22 @@ mod tests {
     }
 
     #[test]
+    fn a_current_that_comes_later_than_the_voltages_and_cells_that_turn_slowly_are_none() {
+        // The end of a charge: the voltages fall three seconds before the reading does.
+        let charge = |time_s: f64| if time_s < 100.0 { 3.6 + 2e-3 * time_s } else { 3.7 };
+        assert_eq!(found_s(200, |time_s| if time_s < 103.0 { -50.0 } else { 0.0 }, charge), None);
+        let found = found_s(200, |_| -50.0, charge);
+        assert!(found.is_some_and(|found_s| found_s > 105.0 && found_s < 106.0), "{found:?}");
+        assert_eq!(found_s(4000, |_| 0.0, |time_s| 3.7 + 0.04 * libm::sin(time_s / 200.0)), None);
+    }
+
+    #[test]
     fn a_load_that_the_current_shows_is_none_and_glitches_are_none() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
+        // Five times the configured noise, which a coarse sensor may have.
+        let waves = |time_s: f64| libm::sin(371.0 * time_s) + libm::sin(911.3 * time_s) + libm::sin(57.1 * time_s);
+        assert_eq!(found_s(3600, |_| 5.0, |time_s| 3.7 + 0.025 * waves(time_s)), None);
         let glitch = |time_s: f64| if (time_s * 10.0).round() % 70.0 == 0.0 { 3.2 } else { 3.7 };
         assert_eq!(found_s(600, |_| 5.0, glitch), None);
     }

@@ -201,11 +201,11 @@ impl Sampler {
             }
             Channel::ReportedSoc | Channel::ReportedSoh | Channel::SupplyVoltage | Channel::PackIdentity => None,
             Channel::PackVoltage => {
-                self.state.frozen.handle_voltage(true, value, self.step_v);
+                self.state.frozen.handle_voltage(time, 0, value, self.step_v);
                 Some(self.sample(CellIndex(0), value))
             }
             Channel::CellVoltage(cell) => {
-                self.state.frozen.handle_voltage(cell.0 == 0, value, self.step_v);
+                self.state.frozen.handle_voltage(time, cell.index(), value, self.step_v);
                 Some(self.sample(cell, value))
             }
         }
@@ -249,7 +249,7 @@ impl Sampler {
             return None;
         }
         state.counts.accepted = state.counts.accepted.saturating_add(1);
-        state.frozen.handle_voltage(cell.0 == 0, voltage_v, self.step_v);
+        state.frozen.handle_voltage(time, cell.index(), voltage_v, self.step_v);
         Some(self.sample(cell, voltage_v))
     }
 

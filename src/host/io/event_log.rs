@@ -111,6 +111,7 @@ impl EventLog {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
             }
             EventKind::SecondSender(SenderChange { bus, id, active: true, frames_per_s, expected_per_s }) => {
+                let expected_per_s = rounded(expected_per_s);
                 tracing::warn!(interface = self.name(bus), %id, frames_per_s, expected_per_s, "second sender");
             }
             EventKind::SecondSender(SenderChange { bus, id, .. }) => {
@@ -132,10 +133,10 @@ impl EventLog {
             EventKind::Model { .. } => log_model(&event.kind),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
-                tracing::warn!(cell = number(cell), mean_nis, "estimate not to be trusted");
+                tracing::warn!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate not to be trusted");
             }
             EventKind::Trust { cell, trusted: true, mean_nis } => {
-                tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
+                tracing::info!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate trusted again");
             }
             EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
             EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
@@ -154,6 +155,7 @@ impl EventLog {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
             }
             EventKind::PackReplaced { capacity_ah, capacity_std_ah } => {
+                let (capacity_ah, capacity_std_ah) = (capacity_ah.map(rounded), capacity_std_ah.map(rounded));
                 tracing::warn!(
                     capacity_ah,
                     capacity_std_ah,
@@ -184,7 +186,7 @@ impl EventLog {
             }
             EventKind::Store { works: true } => tracing::info!("files can be written"),
             EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
-            EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
+            EventKind::Gap { seconds } => tracing::info!(seconds = seconds.map(rounded), "gap"),
         }
     }
 
