@@ -333,6 +333,15 @@ fn camel_case(name: &str) -> String {
 }
 
 #[test]
+fn a_threshold_of_whole_seconds_is_sent_as_it_is() {
+    let layout = Case::all()[0].layout();
+    for name in ["PACKWATCH_Alarm.Threshold_StoreFailed", "PACKWATCH_Alarm.Threshold_BusFault"] {
+        let (_, signal) = layout.signal(name).unwrap();
+        assert_eq!((signal.layout.factor, signal.layout.offset), (1.0, 0.0), "{name}: 1 s was sent as 2 s");
+    }
+}
+
+#[test]
 fn every_rule_is_named_in_the_value_tables_by_its_number() {
     let text = include_str!("../../config/packwatch.dbc");
     let dbc = Database::parse(text).unwrap();

@@ -53,6 +53,22 @@ fn a_seed_gives_the_same_bytes_and_another_seed_others() {
 }
 
 #[test]
+fn two_cycles_of_the_day_are_two() {
+    let truth = |cycles: &str| {
+        let example = config("example.toml");
+        let cells = ["--cells", "1", "--period", "1000", "--cell-period", "1000"];
+        let output =
+            packwatch(&[&["simulate", "ev-day", "-c", &example, "-o", "-", "--cycles", cycles], &cells[..]].concat());
+        let words = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{words}");
+        assert!(words.contains(&format!("{cycles} cycles completed")), "{words}");
+        output.stdout.len()
+    };
+    let (one, two) = (truth("1"), truth("2"));
+    assert!(two as f64 > 1.8 * one as f64, "{one} {two}");
+}
+
+#[test]
 fn log_is_candump_in_order_of_time_with_current_every_10_ms() {
     let folder = tempfile::tempdir().expect("a folder for the test");
     let (log, _) = simulate_day(folder.path(), "day", "1");

@@ -19,7 +19,7 @@ pub(super) struct Changes {
     /// Seed of all randomness
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// End after this many cycles (reference: 10; random-walk: blocks, 1; ev-day: its cycles, in place of the duration)
+    /// End after this many cycles (reference: 10; random-walk: blocks, 1; ev-day: days)
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     cycles: Option<u32>,
     /// End after this time, s (ev-day: 86400)
@@ -112,8 +112,9 @@ impl Changes {
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);
-        // The scenario's own duration would end the cycles that were asked for.
-        settings.duration_s = self.duration.or(settings.duration_s.filter(|_| self.cycles.is_none()));
+        // Only the day has a duration of its own, and its cycles are days.
+        let days = f64::from(self.cycles.unwrap_or(1));
+        settings.duration_s = self.duration.or(settings.duration_s.map(|day_s| days * day_s));
         settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);
         self.pack.apply(&mut settings.pack);
         self.sensors.apply(&mut settings.sensors);
