@@ -268,9 +268,13 @@ mod tests {
     fn a_load_that_the_current_shows_is_none_and_glitches_are_none() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
-        // Five times the configured noise, which a coarse sensor may have.
-        let waves = |time_s: f64| libm::sin(371.0 * time_s) + libm::sin(911.3 * time_s) + libm::sin(57.1 * time_s);
-        assert_eq!(found_s(3600, |_| 5.0, |time_s| 3.7 + 0.025 * waves(time_s)), None);
+        // Five times the configured noise, which a coarse sensor may have: uniform, drawn from the time.
+        let noise = |time_s: f64| {
+            let bits = ((10.0 * time_s) as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+            let bits = (bits ^ (bits >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            0.087 * ((bits >> 40) as f64 / f64::from(1 << 24) - 0.5)
+        };
+        assert_eq!(found_s(3600, |_| 5.0, |time_s| 3.7 + noise(time_s)), None);
         let glitch = |time_s: f64| if (time_s * 10.0).round() % 70.0 == 0.0 { 3.2 } else { 3.7 };
         assert_eq!(found_s(600, |_| 5.0, glitch), None);
     }
