@@ -22,8 +22,9 @@ use crate::cell::{
 use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Fewest new rows for which a fit is made: they cover 12 % of the charge, or half an hour.
+/// Fewest new rows for which a fit is made, and least charge that moved in them, part of the rated capacity.
 const LEAST_NEW_ROWS: usize = 6;
+const LEAST_NEW_CHARGE: f64 = 0.12;
 
 /// Shortest rest in which a model changes, s: longer than a red light.
 const REST_S: f64 = 120.0;
@@ -33,9 +34,16 @@ const REST_S: f64 = 120.0;
 /// cells, LFP from all others by hundreds.
 const CHEMISTRY_MARGIN: f64 = 4.0;
 
-/// Misfit above which a fit is not used: drives that a circuit describes have 0.25 to 0.4; heavy load in the cold, a faulty sensor
-/// or another pack half-way have more.
-const MOST_MISFIT: f64 = 0.45;
+/// The same from which on the model before is the better one.
+const BEFORE_MARGIN: f64 = 4.0;
+
+/// Misfit of drives that a circuit describes, at most.
+const USUAL_MISFIT: f64 = 0.45;
+/// Misfit above which a fit is not used: with usual sensors it is up to 0.65; heavy load in the cold, a faulty sensor or another pack
+/// half-way have more.
+const MOST_MISFIT: f64 = 0.7;
+/// The same above which the model in force is given up: rows deviate more than they should.
+const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Deviation of the capacity above which a fit is not used, fraction: the label's is 0.1, and where the rows say little of the
 /// capacity they say little of the curve.
@@ -277,6 +285,7 @@ impl Modelling {
         let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && chemistry.is_none();
         self.label.is_some()
             && notebook.unread() >= LEAST_NEW_ROWS
+            && notebook.new_charge_ah() >= LEAST_NEW_CHARGE * self.notebook.rated_ah
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
     }
 
@@ -288,15 +297,18 @@ impl Modelling {
         let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
         let fitted = fit::fit(&label, self.state.notebook.rows(), self.state.notebook.present());
         self.state.notebook.mark_read();
-        let fitted = fitted?;
-        self.state.fits = self.state.fits.saturating_add(1);
-        self.state.chemistry = better_chemistry(&label, &fitted, self.state.notebook.rows());
-        if self.state.chemistry.is_some() || fitted.misfit > MOST_MISFIT {
+        if fit::says_enough(&label, self.state.notebook.rows()) {
+            self.state.fits = self.state.fits.saturating_add(1);
+            self.state.chemistry = better_chemistry(&label, fitted.as_ref(), self.state.notebook.rows());
+        }
+        if self.state.chemistry.is_some() || fitted.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
             return self.return_to_label();
         }
+        let fitted = fitted?;
         // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
-        if is_flat || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
+        let is_rough = fitted.misfit > MOST_MISFIT;
+        if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
             return None;
         }
         let Fit { own, soc, soc_by_capacity, .. } = fitted;
@@ -328,7 +340,7 @@ impl Modelling {
         let new_rows = self.state.notebook.new_rows();
         let cost = |own: Option<&OwnModel>| rows_cost(label, own, new_rows);
         let (Some(present), Some(before)) = (cost(Some(own)), cost(self.state.before.as_ref())) else { return };
-        if before < present {
+        if before < present - BEFORE_MARGIN {
             self.state.own = self.state.before.take();
             self.state.taken_back = self.state.taken_back.saturating_add(1);
             self.outcome = FitOutcome::Returned;
@@ -373,10 +385,15 @@ impl Modelling {
     }
 }
 
-/// The chemistry that explains the rows clearly better than that of the label, if there is one.
-fn better_chemistry(label: &Label, fitted: &Fit, rows: &[Row]) -> Option<Chemistry> {
-    let margin = CHEMISTRY_MARGIN * (fitted.misfit / MOST_MISFIT).max(1.0);
-    let cost = |label: &Label| fit::label_cost(label, rows, fitted.own.capacity.mean);
+/// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the fit, if
+/// there is one, or the rated one, as suits it better.
+fn better_chemistry(label: &Label, fitted: Option<&Fit>, rows: &[Row]) -> Option<Chemistry> {
+    let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
+    let capacities = [Some(label.rated_ah), fitted.map(|it| it.own.capacity.mean)];
+    let cost = |label: &Label| {
+        let costs = capacities.iter().flatten().filter_map(|&capacity_ah| fit::label_cost(label, rows, capacity_ah));
+        costs.min_by(f64::total_cmp)
+    };
     let own = cost(label)?;
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
     let costs = others.filter_map(|chemistry| Some((chemistry, cost(&label.with_chemistry(chemistry))?)));
