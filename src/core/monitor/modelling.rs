@@ -11,7 +11,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{EventKind, MonitorConfig};
+use super::{Event, EventKind, MonitorConfig};
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit::{self, Fit};
 use crate::cell::own_model::rows_cost;
@@ -78,6 +78,27 @@ impl ModelState {
     }
 }
 
+/// Most changes of the model that are kept.
+const MAX_CHANGES: usize = 16;
+
+/// A change of the model: when, and what was known after it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelChange {
+    /// When.
+    pub time: Timestamp,
+    /// How well the model is known since.
+    pub state: ModelState,
+    /// Its capacity, Ah; `None` = the label's model.
+    pub capacity: Option<ScalarGaussian>,
+    /// Root mean square of the rows' residuals, V.
+    pub residual_v: Option<f64>,
+    /// The chemistry that explains the voltages better than that on the label.
+    pub chemistry: Option<Chemistry>,
+    /// The model before holds again.
+    pub is_taken_back: bool,
+}
+
 /// What is known of the cells' model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
@@ -95,6 +116,8 @@ pub struct ModelView<'a> {
     pub fits: u32,
     /// Models taken back.
     pub taken_back: u32,
+    /// The latest changes, oldest first.
+    pub changes: &'a [ModelChange],
 }
 
 /// The modelling stage.
@@ -145,6 +168,8 @@ pub(super) struct ModellingState {
     fits: u32,
     #[serde(default)]
     taken_back: u32,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    changes: Vec<ModelChange>,
 }
 
 /// Another model for the estimators.
@@ -162,12 +187,14 @@ impl ModellingState {
     /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.notebook.check()?;
-        self.own.iter().chain(&self.before).try_for_each(OwnModel::check)
+        self.own.iter().chain(&self.before).try_for_each(OwnModel::check)?;
+        let (count, most) = (self.changes.len(), MAX_CHANGES);
+        InvalidState::unless(count <= most, "the changes of the model", count as f64, "at most 16")
     }
 
     /// What is known of cells with this label; `None` = of a model file.
     fn view(&self, label: Option<Label>) -> ModelView<'_> {
-        let Self { notebook, own, chemistry, fits, taken_back, .. } = self;
+        let Self { notebook, own, chemistry, fits, taken_back, changes, .. } = self;
         let state = match (label, own) {
             (None, _) => ModelState::Given,
             _ if chemistry.is_some() => ModelState::Unfit,
@@ -183,6 +210,7 @@ impl ModellingState {
             chemistry: *chemistry,
             fits: *fits,
             taken_back: *taken_back,
+            changes,
         }
     }
 
@@ -357,18 +385,22 @@ impl Modelling {
         self.label.map(|_| self.state.clone())
     }
 
-    /// The event of the latest fit; `None` when nothing has changed. `before` is the state before it.
-    pub(super) fn event(&self, before: ModelState) -> Option<EventKind> {
+    /// Notes what the latest fit has changed, as the event it is; `None` when nothing has. `before` is the state before it.
+    pub(super) fn note_change(&mut self, time: Timestamp, before: ModelState) -> Option<Event> {
         let ModelView { state, own, chemistry, .. } = self.view();
-        let is_new = state != before || self.outcome != FitOutcome::Nothing;
-        is_new.then(|| EventKind::Model {
-            state,
-            capacity_ah: own.map(|own| own.capacity.mean),
-            capacity_std_ah: own.map(|own| own.capacity.std()),
-            residual_v: own.map(|own| own.residual_v),
-            chemistry,
-            is_taken_back: self.has_returned(),
-        })
+        if state == before && self.outcome == FitOutcome::Nothing {
+            return None;
+        }
+        let (capacity, residual_v) = own.map(|own| (own.capacity, own.residual_v)).unzip();
+        let is_taken_back = self.has_returned();
+        let changes = &mut self.state.changes;
+        if changes.len() == MAX_CHANGES {
+            changes.remove(0);
+        }
+        changes.push(ModelChange { time, state, capacity, residual_v, chemistry, is_taken_back });
+        let (capacity_ah, capacity_std_ah) = capacity.map(|it| (it.mean, it.std())).unzip();
+        let kind = EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back };
+        Some(Event { time, kind })
     }
 
     /// What is known.

@@ -37,10 +37,10 @@ const LEAST_GAIN: f64 = 0.02;
 const FIRST_DAMPING: f64 = 1e-3;
 const MOST_DAMPING: f64 = 1e6;
 /// Capacities of the grid relative to the rated one; the search begins at the rated one.
-const LEAST_CAPACITY: f64 = 0.68;
+const LEAST_CAPACITY: f64 = 0.52;
 const CAPACITY_STEP: f64 = 0.04;
-const CAPACITIES: usize = 16;
-const FIRST_CAPACITY: usize = 8;
+const CAPACITIES: usize = 20;
+const FIRST_CAPACITY: usize = 12;
 /// Cost above the least that a capacity at either end of the grid must have: what is most likely beyond it is not of this label.
 const LEAST_END_COST: f64 = 3.0;
 /// Cost above the least beyond which no further capacity is tried.
