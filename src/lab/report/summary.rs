@@ -453,4 +453,31 @@ mod tests {
         assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.what.contains("Check sensors"), "{}", summary.what);
     }
+
+    #[test]
+    fn the_headline_has_the_value_of_now_and_cards_their_doubt_and_assumption() {
+        let mut data = Data::new(Origin::Replay);
+        data.alarms = vec![alarm(1.7e9, "usable_capacity_low", "severe", true)];
+        data.learned = vec![CapacityRecord { usable_ah: Some((0.9, 0.01)), ..learned(1.71e9, 2, Some(1.0)) }];
+        let of = |data: &Data| of(data, &PageContext::default(), &Err("too little".into()));
+        let said = of(&data);
+        assert_eq!(said.how, "Past its limit: act now. Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 3).");
+        let capacity = |summary: &Summary| summary.tiles.iter().find(|tile| tile.name == "Capacity").cloned().unwrap();
+        assert_eq!((capacity(&said).note.as_str(), capacity(&said).doubt), ("\u{b1} 0.010, cell 3", None));
+        data.learned = vec![learned(1.71e9, 2, None)];
+        data.untrusted.insert(2);
+        let doubted = capacity(&of(&data));
+        assert_eq!(doubted.note, "\u{b1} 0.010, cell 3; assumed, not measured yet");
+        assert_eq!(doubted.doubt.as_deref(), Some("not trusted: cell 3"));
+        let unmarked = of(&data).tiles.into_iter().filter(|tile| tile.doubt.is_none() && tile.value != "unknown");
+        assert_eq!(unmarked.map(|tile| tile.name).collect::<Vec<_>>(), ["Use so far", "Alarms raised now"]);
+    }
+
+    #[test]
+    fn short_times_have_seconds_and_no_number_is_minus_zero() {
+        assert_eq!([42.0, 600.0, 36_000.0, 1e6].map(length), ["42 s", "10.0 min", "10.0 h", "12 days"]);
+        assert_eq!(amount(-0.0001, "capacity_low"), "0 Ah");
+        assert_eq!(without_minus_zero("-0.000".to_owned()), "0.000");
+        assert_eq!(without_minus_zero("-0.010".to_owned()), "-0.010");
+    }
 }
