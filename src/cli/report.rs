@@ -16,7 +16,7 @@ use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::{Monitor, Snapshot};
-use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
+use crate::replay::{self, OutputWatch, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
 
 /// Arguments of `report`.
@@ -145,7 +145,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
     let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
     let watched = Rc::clone(&data);
-    let watch: Box<dyn FnMut(&crate::monitor::Outputs)> = Box::new(move |out| {
+    let watch: OutputWatch = Box::new(move |_, out| {
         let mut data = watched.borrow_mut();
         out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
         out.events.iter().for_each(|event| data.take_event(event));

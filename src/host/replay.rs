@@ -86,8 +86,8 @@ impl ReplaySettings {
     }
 }
 
-/// Called with the outputs of each input.
-pub type OutputWatch = Box<dyn FnMut(&Outputs)>;
+/// Called with each input and its outputs.
+pub type OutputWatch = Box<dyn FnMut(&Input<'_>, &Outputs)>;
 
 /// Files of the results.
 #[derive(Default)]
@@ -98,7 +98,7 @@ pub struct Sinks {
     pub events: Option<ResultFile>,
     /// candump lines of the frames that would be sent.
     pub frames: Option<ResultFile>,
-    /// Called with the outputs of each input.
+    /// Called with each input and its outputs.
     pub watch: Option<OutputWatch>,
 }
 
@@ -357,6 +357,9 @@ impl Replay {
         if let Some(store) = &mut self.settings.store {
             store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
         }
+        if let Some(watch) = &mut self.sinks.watch {
+            watch(&input, &self.out);
+        }
         self.write_out()?;
         Ok(())
     }
@@ -365,9 +368,6 @@ impl Replay {
         let out = &mut self.out;
         if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
             return Ok(());
-        }
-        if let Some(watch) = &mut self.sinks.watch {
-            watch(out);
         }
         if let Some(file) = &mut self.sinks.estimates {
             self.summary.estimates += out.estimates.len() as u64;

@@ -14,8 +14,8 @@ use super::CellStep;
 use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
-/// Most rows: with 56 bytes each below 7 kB.
-pub const MAX_ROWS: usize = 160;
+/// Most rows: with 60 bytes each below 8 kB.
+pub const MAX_ROWS: usize = 128;
 /// Most stretches: each has an SOC of its own to be found.
 const MAX_STRETCHES: usize = 16;
 /// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K.
@@ -355,7 +355,7 @@ impl Notebook {
             self.rows.len() <= MAX_ROWS,
             "the rows of the notebook",
             self.rows.len() as f64,
-            "at most 120",
+            "at most 128",
         )?;
         for row in &self.rows {
             let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;

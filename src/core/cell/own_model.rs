@@ -7,7 +7,7 @@ pub mod fit;
 
 use serde::{Deserialize, Serialize};
 
-use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, ResistanceFactors, TEMPERATURE_NODES};
+use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, ResistanceFactors, TEMPERATURE_NODES, usual_cold_sag_v};
 use super::config::EstimatorConfig;
 use super::model::{CellModel, ModelSpread};
 use super::notebook::Row;
@@ -37,6 +37,9 @@ pub struct OwnModel {
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
     pub drop_std: [f64; TEMPERATURE_NODES],
+    /// How far the curve is lower at 0 degrees C than at 25, V.
+    #[serde(default = "usual_cold_sag_v")]
+    pub cold_sag_v: ScalarGaussian,
     /// Capacity, Ah.
     pub capacity: ScalarGaussian,
     /// Root mean square of the rows' residuals, V.
@@ -50,6 +53,7 @@ impl OwnModel {
             mean_v: self.curve_v.to_vec(),
             modes_v: self.modes_v.each_ref().map(|mode_v| mode_v.to_vec()),
             rest_v: self.rest_v.to_vec(),
+            cold_sag_v: self.cold_sag_v,
             electrodes: label.curve()?.electrodes,
         };
         let mut sorted = self.rest_v;
@@ -111,6 +115,8 @@ impl OwnModel {
         InvalidState::unless_numbers("the curve of a learned model", numbers.copied())?;
         let naturals = self.rest_v.iter().chain(&self.drop_std).chain([&self.residual_v]);
         InvalidState::unless_naturals("an error of a learned model", naturals.copied())?;
+        InvalidState::unless_numbers("the curve's sag in the cold of a learned model", [self.cold_sag_v.mean])?;
+        InvalidState::unless_positive("the variance of that sag", self.cold_sag_v.variance)?;
         InvalidState::unless_capacity("the capacity of a learned model", self.capacity.mean)?;
         InvalidState::unless_positive("the variance of the capacity of a learned model", self.capacity.variance)
     }

@@ -29,8 +29,8 @@ use crate::ident::record::{self, Limits, Record};
 use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
 use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
 use crate::io::log::{LogOptions, LogSource};
-use crate::monitor::{Estimate, Monitor, MonitorConfig, Outputs};
-use crate::replay::{self, ReplaySettings, Sinks};
+use crate::monitor::{Estimate, Input, Monitor, MonitorConfig};
+use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
 /// A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
 const HOLE_S: f64 = 120.0;
@@ -103,6 +103,8 @@ struct MeanCell {
     voltage_v: Vec<f64>,
     count: f64,
     sums: [f64; 6],
+    /// The next reading begins another stretch.
+    begins: bool,
 }
 
 impl MeanCell {
@@ -131,6 +133,14 @@ impl MeanCell {
         self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
     }
 
+    /// What follows does not hang together with what was: time passed that nobody knows.
+    fn end_stretch(&mut self) {
+        if self.count > 0.0 {
+            self.close();
+        }
+        self.begins = true;
+    }
+
     fn close(&mut self) {
         let [time_s, current_a, voltage_v, temperature_c, soc, soc_std] = self.sums.map(|sum| sum / self.count);
         (self.count, self.sums) = (0.0, [0.0; 6]);
@@ -139,7 +149,8 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        if last_s.is_none_or(|last_s| time_s - last_s > HOLE_S || time_s < last_s) {
+        let has_hole = last_s.is_none_or(|last_s| time_s - last_s > HOLE_S || time_s < last_s);
+        if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
             self.stretches.push(Stretch { beginning, ..Stretch::default() });
         }
@@ -282,8 +293,14 @@ fn colder(temperature_c: f64) -> f64 {
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
-    let watch = move |out: &Outputs| out.estimates.iter().for_each(|estimate| watched.borrow_mut().take(estimate));
-    let sinks = Sinks { watch: Some(Box::new(watch)), ..Sinks::default() };
+    let watch: OutputWatch = Box::new(move |input, out| {
+        let mut mean = watched.borrow_mut();
+        if matches!(input, Input::UnknownGap { .. }) {
+            mean.end_stretch();
+        }
+        out.estimates.iter().for_each(|estimate| mean.take(estimate));
+    });
+    let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
     // The model that is fitted does not change on the way.

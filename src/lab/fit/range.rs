@@ -58,7 +58,7 @@ impl MeasuredRange {
         Self {
             temperature_c: inner.map(|(temperature_c, _)| *temperature_c).fold(none, ends),
             current_a: rows().map(|row| row.current_a).fold(none, ends),
-            soc: rows().map(|row| row.soc).fold(none, ends),
+            soc: rows().map(|row| row.soc.clamp(0.0, 1.0)).fold(none, ends),
             rms_a: (square / seconds).sqrt(),
         }
     }

@@ -20,10 +20,10 @@ use nalgebra::{DMatrix, DVector};
 
 use super::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::cell::chemistry::curve::CurvePrior;
-use crate::cell::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C};
+use crate::cell::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C, usual_cold_sag_v};
 use crate::cell::notebook::Row;
 use crate::filter::ScalarGaussian;
-use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, FACTORS, LOG_CAPACITY};
+use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY};
 use noise::{NormalEquations, RepeatedErrors};
 
 /// Fewest rows, and least part of the capacity that a stretch of them must span.
@@ -260,6 +260,10 @@ impl<'a> Search<'a> {
                 by_temperature: std::array::from_fn(|j| theta[BY_TEMPERATURE + j]),
             },
             drop_std: TEMPERATURE_C.map(|temperature_c| self.basis.drop_std(theta, covariance, temperature_c)),
+            cold_sag_v: ScalarGaussian {
+                mean: usual_cold_sag_v().mean + theta[COLD_SAG],
+                variance: covariance[(COLD_SAG, COLD_SAG)],
+            },
             capacity,
             residual_v: (squares_v2 / rows.len() as f64).sqrt(),
         }

@@ -5,19 +5,21 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::cell::chemistry::curve::CurvePrior;
-use crate::cell::chemistry::{FACTOR_SOC, Label, RESISTANCES, SOC};
+use crate::cell::chemistry::{FACTOR_SOC, Label, RESISTANCES, SOC, cold_share, usual_cold_sag_v};
 use crate::cell::model::{CellModel, arrhenius};
 use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 
 /// First indices of the parameters: the curve's deviations from the label's, V, at the SOC breakpoints; ln of the resistances'
-/// factors over SOC; their deviation from the law of temperature; ln of the capacity, Ah; the SOC at which each stretch began.
+/// factors over SOC; their deviation from the law of temperature; the curve's sag in the cold less the label's, V; ln of the capacity,
+/// Ah; the SOC at which each stretch began.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
-pub(super) const LOG_CAPACITY: usize = BY_TEMPERATURE + RESISTANCES;
+pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
+pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
 pub(super) const BEGINNINGS: usize = LOG_CAPACITY + 1;
-/// Parameters of SOC and capacity among those of a row.
-pub(super) const SOC_AND_CAPACITY: usize = 4;
+/// Parameters of curve, SOC and capacity among those of a row.
+pub(super) const CURVE_AND_SOC: usize = 5;
 
 /// Limits of the parameters: SOC at a beginning, ln of a factor, deviation from the law of temperature.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
@@ -48,7 +50,7 @@ pub(super) struct Prediction {
     pub(super) ohm: [f64; RESISTANCES],
     /// Change of ln of a resistance with each of its three parameters.
     pub(super) by_factor: [f64; 3],
-    /// Parameters on which the voltage depends: four of SOC and capacity, then three of each resistance.
+    /// Parameters on which the voltage depends: five of curve, SOC and capacity, then three of each resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
 }
@@ -77,6 +79,7 @@ impl<'a> Basis<'a> {
         theta[LOG_CAPACITY] = libm::log(own.map_or(label.rated_ah, |own| own.capacity.mean));
         if let Some(own) = own {
             (0..SOC_NODES).for_each(|s| theta[s] = own.curve_v[s] - self.curve.mean_v[s]);
+            theta[COLD_SAG] = own.cold_sag_v.mean - usual_cold_sag_v().mean;
             for j in 0..RESISTANCES {
                 (0..FACTOR_NODES).for_each(|n| theta[FACTORS + j * FACTOR_NODES + n] = own.factors.ln[j][n]);
                 theta[BY_TEMPERATURE + j] = own.factors.by_temperature[j];
@@ -93,8 +96,8 @@ impl<'a> Basis<'a> {
         for (i, value) in theta.iter_mut().enumerate().skip(FACTORS) {
             let (low, high) = match i {
                 ..BY_TEMPERATURE => (-MOST_LOG_FACTOR, MOST_LOG_FACTOR),
-                BY_TEMPERATURE..LOG_CAPACITY => (-MOST_BY_TEMPERATURE, MOST_BY_TEMPERATURE),
-                LOG_CAPACITY => continue,
+                BY_TEMPERATURE..COLD_SAG => (-MOST_BY_TEMPERATURE, MOST_BY_TEMPERATURE),
+                COLD_SAG | LOG_CAPACITY => continue,
                 BEGINNINGS.. => BEGINNING,
             };
             *value = value.clamp(low, high);
@@ -115,8 +118,9 @@ impl<'a> Basis<'a> {
         let own_slope_v =
             if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
         let slope_v = self.model.ocv_slope_v(&position, self.model.capacity_ah) + own_slope_v;
-        let mut index = vec![node, node + 1, LOG_CAPACITY, beginning];
-        let mut slope = vec![1.0 - along, along, slope_v * moved, slope_v];
+        let cold = cold_share(temperature_c);
+        let mut index = vec![node, node + 1, COLD_SAG, LOG_CAPACITY, beginning];
+        let mut slope = vec![1.0 - along, along, -cold, slope_v * moved, slope_v];
         let (low, part) = interval(&FACTOR_SOC, soc);
         let by_temperature = libm::log(arrhenius(temperature_c));
         let by_factor = [1.0 - part, part, by_temperature];
@@ -137,7 +141,7 @@ impl<'a> Basis<'a> {
             slope.extend(by_factor.map(|factor| -factor * part_v));
             ohm
         });
-        let voltage_v = self.model.ocv_v(&position) + own_v - drop_v;
+        let voltage_v = self.model.ocv_v(&position) + own_v - cold * theta[COLD_SAG] - drop_v;
         Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
     }
 

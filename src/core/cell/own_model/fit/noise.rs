@@ -4,7 +4,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::basis::{Basis, Prediction, SOC_AND_CAPACITY};
+use super::basis::{Basis, CURVE_AND_SOC, Prediction};
 use crate::cell::notebook::{CurrentSteps, Row};
 
 /// Standard deviations of a row's error: of the voltage, V; of the drop, fraction; of the SOC.
@@ -118,7 +118,7 @@ impl NormalEquations {
             [of(per_series * series_ohm), of(per_fast * fast_ohm)].concat()
         };
         // The parameters of the series resistance and of the fastest branch.
-        let index = &index[SOC_AND_CAPACITY..SOC_AND_CAPACITY + 2 * by_factor.len()];
+        let index = &index[CURVE_AND_SOC..CURVE_AND_SOC + 2 * by_factor.len()];
         self.add(index, &slope(of_i[0], of_i[1]), residuals_v[0], weight);
         self.add(index, &slope(0.0, of_x), residuals_v[1], weight);
         self.cost += 0.5 * weight * (residuals_v[0] * residuals_v[0] + residuals_v[1] * residuals_v[1]);

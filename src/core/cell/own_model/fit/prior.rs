@@ -2,9 +2,9 @@
 
 use nalgebra::DMatrix;
 
-use super::basis::{BEGINNINGS, BY_TEMPERATURE, FACTORS, LOG_CAPACITY};
+use super::basis::{BEGINNINGS, BY_TEMPERATURE, COLD_SAG, FACTORS, LOG_CAPACITY};
 use crate::cell::chemistry::curve::CurvePrior;
-use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES};
+use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 
 /// Deviations of ln(resistance) between cells: common to all parts of one cell, of each part, over SOC; and of the part of its
@@ -36,7 +36,8 @@ pub(super) fn information(curve: &CurvePrior, size: usize) -> Option<DMatrix<f64
     let covariance = DMatrix::from_fn(count, count, factor_covariance);
     prior.view_mut((FACTORS, FACTORS), (count, count)).copy_from(&covariance.cholesky()?.inverse());
     let mut near = |i: usize, std: f64| prior[(i, i)] = 1.0 / (std * std);
-    (BY_TEMPERATURE..LOG_CAPACITY).for_each(|i| near(i, BY_TEMPERATURE_STD));
+    (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, BY_TEMPERATURE_STD));
+    near(COLD_SAG, usual_cold_sag_v().std());
     near(LOG_CAPACITY, CAPACITY_STD);
     (BEGINNINGS..size).for_each(|i| near(i, BEGINNING_STD));
     Some(prior)
