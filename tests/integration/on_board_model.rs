@@ -46,15 +46,26 @@ fn true_model(config: &MonitorConfig) -> CellModel {
     model
 }
 
-/// Frames of some cycles, in time order.
-fn vehicle(model: &CellModel, config: &MonitorConfig, cycles: u64) -> Vec<(Timestamp, BusIndex, Frame)> {
+/// Swings of the SOC of deep cycles.
+const DEEP: [(f64, f64); 1] = [(0.08, 0.97)];
+/// Of partial ones: 60 % of the charge, now and then charged until it is full.
+const PARTIAL: [(f64, f64); 3] = [(0.4, 1.0), (0.1, 0.7), (0.25, 0.85)];
+
+/// Frames of some cycles of a cell with a capacity, Ah, in time order; the swings are taken in turn.
+fn vehicle(
+    model: &CellModel,
+    config: &MonitorConfig,
+    capacity_ah: f64,
+    swings: &[(f64, f64)],
+    cycles: u64,
+) -> Vec<(Timestamp, BusIndex, Frame)> {
     let encoder = InputEncoder::new(&config.input);
     let (mut all, mut frames, mut night_s): (Vec<(Timestamp, BusIndex, Frame)>, _, f64) = (Vec::new(), Vec::new(), 0.0);
-    for seed in 1..=cycles {
-        let mut settings = Settings { seed, cycles: Some(1), ..Settings::of(Scenario::Paper, TRUE_AH) };
+    for (seed, swing) in (1..=cycles).zip(swings.iter().cycle()) {
+        let mut settings = Settings { seed, cycles: Some(1), ..Settings::of(Scenario::Paper, capacity_ah) };
         settings.sensors.current.offset = 0.0;
         settings.pack.ageing = Default::default();
-        (settings.soc_window, settings.pack.initial_soc) = ((0.08, 0.97), 0.97);
+        (settings.soc_window, settings.pack.initial_soc) = (*swing, swing.1);
         let mut sim = Simulation::new(model.clone(), settings, Wiring::single());
         let mut last = Timestamp::ZERO;
         while let Some(moment) = sim.advance() {
@@ -109,7 +120,7 @@ impl Live {
 fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
     let config = configuration("nmc811-graphite");
     let mut live = Live::new(&config);
-    vehicle(&true_model(&config), &config, 4).iter().for_each(|frame| live.take(frame));
+    vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 4).iter().for_each(|frame| live.take(frame));
     let view = live.monitor.model();
     assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
     let own = view.own.expect("a learned model");
@@ -128,9 +139,27 @@ fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
 }
 
 #[test]
+fn five_partial_cycles_show_that_the_label_is_wrong() {
+    let config = configuration("nmc811-graphite");
+    for capacity_ah in [0.9 * RATED_AH, 1.1 * RATED_AH] {
+        let mut live = Live::new(&config);
+        vehicle(&true_model(&config), &config, capacity_ah, &PARTIAL, 5).iter().for_each(|frame| live.take(frame));
+        let capacity = live.monitor.capacity(CellIndex(0));
+        let off = capacity.mean - capacity_ah;
+        assert!(
+            off.abs() < 1.96 * capacity.std() && off.abs() < 0.03 * capacity_ah,
+            "{capacity_ah}: {capacity:?}, {} fits",
+            live.monitor.model().fits
+        );
+        let is_unfit = |event: &Event| matches!(event.kind, EventKind::Model { state: ModelState::Unfit, .. });
+        assert!(!live.events.iter().any(is_unfit), "{capacity_ah}: another chemistry was told");
+    }
+}
+
+#[test]
 fn a_state_of_any_moment_continues_as_if_there_had_been_no_restart() {
     let config = configuration("nmc811-graphite");
-    let frames = vehicle(&true_model(&config), &config, 3);
+    let frames = vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 3);
     let mut whole = Live::new(&config);
     let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
     for (at, frame) in frames.iter().enumerate() {
@@ -159,7 +188,7 @@ fn a_wrong_chemistry_on_the_label_is_found_within_one_cycle() {
     for (wrong, right) in [("lfp-graphite", "nmc"), ("lco-graphite", "n")] {
         let config = configuration(wrong);
         let mut live = Live::new(&config);
-        vehicle(&model, &truth, 1).iter().for_each(|frame| live.take(frame));
+        vehicle(&model, &truth, TRUE_AH, &DEEP, 1).iter().for_each(|frame| live.take(frame));
         live.give(Input::UnknownGap { time: Timestamp::from_secs(4e9) });
         let view = live.monitor.model();
         assert_eq!(view.state, ModelState::Unfit, "{wrong}");
@@ -174,7 +203,7 @@ fn a_corrected_label_keeps_the_rows_and_forgets_the_model() {
     let wrong = configuration("lfp-graphite");
     let right = configuration("nmc811-graphite");
     let mut live = Live::new(&wrong);
-    vehicle(&true_model(&right), &right, 2).iter().for_each(|frame| live.take(frame));
+    vehicle(&true_model(&right), &right, TRUE_AH, &DEEP, 2).iter().for_each(|frame| live.take(frame));
     let rows = live.monitor.model().notebook.map_or(0, |notebook| notebook.rows().len());
     assert!(rows > 20, "{rows} rows");
     let mut corrected = Live::restored(&right, live.monitor.snapshot());

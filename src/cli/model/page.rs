@@ -5,7 +5,8 @@ use serde::Serialize;
 use crate::cell::{CellModel, Chemistry, ModelBands, advise};
 use crate::cli::output;
 use crate::config::cell_model::{KnownBy, LearnedFrom, MeasuredRange, SourcedModel, state_words};
-use crate::monitor::ModelState;
+use crate::io::stamp::format_utc;
+use crate::monitor::{ModelChange, ModelState};
 
 /// Rows of the curve: every 5 % of SOC.
 const CURVE_STEPS: u32 = 20;
@@ -41,12 +42,24 @@ pub(super) struct ModelPage {
 #[derive(Debug, Serialize)]
 struct LearnedRow {
     fits: u32,
+    changes: Vec<ChangeRow>,
     residual_v: Option<f64>,
     /// The chemistry that explains the voltages better.
     chemistry: Option<Chemistry>,
     soc_share: f64,
     soc_ranges: Vec<[f64; 2]>,
     temperature_ranges_c: Vec<[f64; 2]>,
+}
+
+/// A change of a learned model.
+#[derive(Debug, Serialize)]
+struct ChangeRow {
+    time: String,
+    state: ModelState,
+    capacity_ah: Option<f64>,
+    capacity_std_ah: Option<f64>,
+    residual_v: Option<f64>,
+    taken_back: bool,
 }
 
 /// The open-circuit curve at one SOC.
@@ -152,6 +165,12 @@ impl ModelPage {
         let parts = (1..=branches).flat_map(|k| [format!("branch {k}"), "tau, s".to_owned()]);
         let heads: Vec<String> = ["\u{b0}C".to_owned(), "series".to_owned()].into_iter().chain(parts).collect();
         page.push_str(&output::table(&heads, self.resistances.iter().map(ResistanceRow::parts), 0));
+        let changes = self.learned.iter().flat_map(|learned| &learned.changes);
+        if changes.clone().next().is_some() {
+            page.push_str("\nits latest changes\n");
+            let heads = ["time", "state", "capacity, Ah", "residuals, mV", ""];
+            page.push_str(&output::table(&heads, changes.map(ChangeRow::cells), 2));
+        }
         page.push_str(&self.verdict());
         page
     }
@@ -218,6 +237,7 @@ impl LearnedRow {
     fn new(learned: &LearnedFrom) -> Self {
         Self {
             fits: learned.fits,
+            changes: learned.changes.iter().map(ChangeRow::new).collect(),
             residual_v: learned.residual_v,
             chemistry: learned.chemistry,
             soc_share: learned.seen.soc_share(),
@@ -243,6 +263,31 @@ impl LearnedRow {
         let mut rows = vec![("fits", format!("{}, {residual}", self.fits)), ("seen", seen)];
         rows.extend(self.chemistry.map(|better| ("fits better", better.name().to_owned())));
         rows
+    }
+}
+
+impl ChangeRow {
+    fn new(change: &ModelChange) -> Self {
+        Self {
+            time: format_utc(change.time),
+            state: change.state,
+            capacity_ah: change.capacity.map(|it| it.mean),
+            capacity_std_ah: change.capacity.map(|it| it.std()),
+            residual_v: change.residual_v,
+            taken_back: change.is_taken_back,
+        }
+    }
+
+    fn cells(&self) -> Vec<String> {
+        let capacity = self.capacity_ah.zip(self.capacity_std_ah);
+        let note = if self.taken_back { "the one before holds again" } else { "" };
+        vec![
+            self.time.clone(),
+            state_words(self.state).to_owned(),
+            capacity.map_or("the label's".to_owned(), |(mean, std)| format!("{mean:.3} \u{b1} {std:.3}")),
+            self.residual_v.map_or(String::new(), |v| format!("{:.1}", 1e3 * v)),
+            note.to_owned(),
+        ]
     }
 }
 

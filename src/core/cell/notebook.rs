@@ -14,14 +14,16 @@ use super::CellStep;
 use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
-/// Most rows: with 60 bytes each below 8 kB.
-pub const MAX_ROWS: usize = 128;
+/// Most rows: with 64 bytes each below 8 kB.
+pub const MAX_ROWS: usize = 120;
 /// Most stretches: each has an SOC of its own to be found.
 const MAX_STRETCHES: usize = 16;
-/// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K.
+/// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K. A row of rest is
+/// at least as long as this part of the rest so far: a night is a few rows.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const ROW_K: f64 = 4.0;
+const REST_PART: f64 = 0.5;
 /// Below this SOC, where curves are steep and resistances rise, a row is shorter by a factor.
 const LOW_SOC: f64 = 0.15;
 const LOW_SOC_PART: f64 = 0.25;
@@ -52,6 +54,9 @@ pub struct Row {
     soc: f32,
     /// Duration, s.
     pub seconds: f32,
+    /// Time since the stretch began, s.
+    #[serde(default)]
+    pub elapsed_s: f32,
     /// Charge taken out since the stretch began, Ah.
     pub charge_ah: f32,
     /// Voltage, V.
@@ -100,6 +105,8 @@ struct Readings {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct RowSums {
     seconds: f64,
+    #[serde(default)]
+    elapsed_s: f64,
     charge_ah: f64,
     voltage_v: f64,
     current_a: f64,
@@ -114,10 +121,27 @@ struct RowSums {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Stretch {
     charge_ah: f64,
+    /// Time since it began, s.
+    #[serde(default)]
+    elapsed_s: f64,
     filtered_a: [f64; FILTERS],
     /// Current, fastest filter and voltage of the reading before.
     last: [f64; 3],
+    /// Time of rest so far, s.
+    #[serde(default)]
+    rest_s: f64,
     row: RowSums,
+}
+
+/// Where the present stretch stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PresentStretch {
+    /// Its number.
+    pub number: u32,
+    /// Charge taken out so far, Ah.
+    pub charge_ah: f64,
+    /// Time since it began, s.
+    pub elapsed_s: f64,
 }
 
 /// The notebook of a pack.
@@ -149,6 +173,11 @@ impl NotebookConfig {
     pub fn new(cells: u32, rated_ah: f64) -> Self {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
+
+    /// Currents below this are rest, A.
+    fn rest_a(&self) -> f64 {
+        REST_PER_H * self.rated_ah
+    }
 }
 
 impl Notebook {
@@ -177,15 +206,27 @@ impl Notebook {
         &self.rows[self.rows.len().saturating_sub(self.unread as usize)..]
     }
 
+    /// Charge moved in these, Ah, to and fro.
+    pub fn new_charge_ah(&self) -> f64 {
+        let first = self.rows.len() - self.new_rows().len();
+        let moved = |pair: &[Row]| {
+            let same = pair[0].stretch == pair[1].stretch;
+            if same { f64::from((pair[1].charge_ah - pair[0].charge_ah).abs()) } else { 0.0 }
+        };
+        self.rows[first.saturating_sub(1)..].windows(2).map(moved).sum()
+    }
+
     /// Number of these that are of a class of SOC, temperature and direction without any earlier row.
     pub fn rows_of_new_classes(&self, rated_ah: f64) -> usize {
         let (old, new) = self.rows.split_at(self.rows.len() - self.new_rows().len());
         new.iter().filter(|row| old.iter().all(|old| old.class(rated_ah) != row.class(rated_ah))).count()
     }
 
-    /// Charge taken out in the present stretch, Ah, with its number.
-    pub fn present(&self) -> Option<(u32, f64)> {
-        self.present.as_ref().map(|stretch| (self.number, stretch.charge_ah))
+    /// The present stretch as it is now.
+    pub fn present(&self) -> Option<PresentStretch> {
+        let of =
+            |it: &Stretch| PresentStretch { number: self.number, charge_ah: it.charge_ah, elapsed_s: it.elapsed_s };
+        self.present.as_ref().map(of)
     }
 
     /// Present current through the filters, A; `None` = no stretch is under way.
@@ -232,7 +273,14 @@ impl Notebook {
             // Under load the branches are taken as settled: the load before is not known.
             let filtered_a = [current_a; FILTERS];
             let last = [current_a, current_a, voltage_v];
-            self.present = Some(Stretch { charge_ah: 0.0, filtered_a, last, row: RowSums::default() });
+            self.present = Some(Stretch {
+                charge_ah: 0.0,
+                elapsed_s: 0.0,
+                filtered_a,
+                last,
+                rest_s: 0.0,
+                row: RowSums::default(),
+            });
             return false;
         };
         let mean_a = charge_as / measured_s;
@@ -242,11 +290,13 @@ impl Notebook {
         }
         let charge_before_ah = stretch.charge_ah;
         stretch.charge_ah += charge_as / cells / 3600.0;
+        stretch.elapsed_s += dt_s;
         // A single reading is of the end of its interval, several are of its middle.
         let late = if count > cells { 0.5 } else { 1.0 };
         let along = |before: f64, after: f64| before + late * (after - before);
         let filtered_a: [f64; FILTERS] = std::array::from_fn(|i| along(before_a[i], stretch.filtered_a[i]));
         let charge_ah = along(charge_before_ah, stretch.charge_ah);
+        stretch.rest_s = if mean_a.abs() > config.rest_a() { 0.0 } else { stretch.rest_s + dt_s };
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
@@ -257,6 +307,7 @@ impl Notebook {
         }
         let (first_ah, first_c) = *row.first.get_or_insert((charge_ah, temperature_c));
         row.seconds += dt_s;
+        row.elapsed_s += dt_s * stretch.elapsed_s;
         row.charge_ah += dt_s * charge_ah;
         row.voltage_v += dt_s * voltage_v;
         row.current_a += dt_s * current_a;
@@ -265,7 +316,7 @@ impl Notebook {
         let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
         let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
         (charge_ah - first_ah).abs() >= part * ROW_SOC * config.rated_ah
-            || row.seconds >= ROW_S
+            || row.seconds >= ROW_S.max(REST_PART * stretch.rest_s)
             || (temperature_c - first_c).abs() >= ROW_K
     }
 
@@ -282,6 +333,7 @@ impl Notebook {
             stretch: self.number,
             soc: soc as f32,
             seconds: sums.seconds as f32,
+            elapsed_s: mean(sums.elapsed_s),
             charge_ah: mean(sums.charge_ah),
             voltage_v: mean(sums.voltage_v),
             current_a: mean(sums.current_a),
@@ -355,19 +407,32 @@ impl Notebook {
             self.rows.len() <= MAX_ROWS,
             "the rows of the notebook",
             self.rows.len() as f64,
-            "at most 128",
+            "at most 120",
         )?;
         for row in &self.rows {
             let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
             let [a, b, c] = row.filtered_a;
-            let numbers = [row.soc, row.charge_ah, row.voltage_v, row.current_a, row.temperature_c, a, b, c];
+            let numbers =
+                [row.soc, row.elapsed_s, row.charge_ah, row.voltage_v, row.current_a, row.temperature_c, a, b, c];
             let all = numbers.into_iter().chain([ii, ix, xx, iv, xv]).map(f64::from);
             InvalidState::unless_numbers("a number of the notebook", all)?;
             InvalidState::unless_positive("the duration of a row of the notebook", f64::from(row.seconds))?;
         }
-        let Some(Stretch { charge_ah, filtered_a, last, row }) = &self.present else { return Ok(()) };
+        let Some(Stretch { charge_ah, elapsed_s, filtered_a, last, rest_s, row }) = &self.present else {
+            return Ok(());
+        };
         let numbers = filtered_a.iter().chain(last).chain(&row.filtered_a).chain(&row.steps).copied();
-        let sums = [*charge_ah, row.charge_ah, row.voltage_v, row.current_a, row.temperature_c, row.seconds];
+        let sums = [
+            *charge_ah,
+            *elapsed_s,
+            *rest_s,
+            row.elapsed_s,
+            row.charge_ah,
+            row.voltage_v,
+            row.current_a,
+            row.temperature_c,
+            row.seconds,
+        ];
         InvalidState::unless_numbers("a number of the notebook", numbers.chain(sums))
     }
 }

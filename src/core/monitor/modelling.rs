@@ -11,7 +11,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{EventKind, MonitorConfig};
+use super::{Event, EventKind, MonitorConfig};
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit::{self, Fit};
 use crate::cell::own_model::rows_cost;
@@ -22,8 +22,9 @@ use crate::cell::{
 use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Fewest new rows for which a fit is made: they cover 12 % of the charge, or half an hour.
+/// Fewest new rows for which a fit is made, and least charge that moved in them, part of the rated capacity.
 const LEAST_NEW_ROWS: usize = 6;
+const LEAST_NEW_CHARGE: f64 = 0.12;
 
 /// Shortest rest in which a model changes, s: longer than a red light.
 const REST_S: f64 = 120.0;
@@ -33,9 +34,16 @@ const REST_S: f64 = 120.0;
 /// cells, LFP from all others by hundreds.
 const CHEMISTRY_MARGIN: f64 = 4.0;
 
-/// Misfit above which a fit is not used: drives that a circuit describes have 0.25 to 0.4; heavy load in the cold, a faulty sensor
-/// or another pack half-way have more.
-const MOST_MISFIT: f64 = 0.45;
+/// The same from which on the model before is the better one.
+const BEFORE_MARGIN: f64 = 4.0;
+
+/// Misfit of drives that a circuit describes, at most.
+const USUAL_MISFIT: f64 = 0.45;
+/// Misfit above which a fit is not used: with usual sensors it is up to 0.65; heavy load in the cold, a faulty sensor or another pack
+/// half-way have more.
+const MOST_MISFIT: f64 = 0.7;
+/// The same above which the model in force is given up: rows deviate more than they should.
+const HOPELESS_MISFIT: f64 = 1.0;
 
 /// Deviation of the capacity above which a fit is not used, fraction: the label's is 0.1, and where the rows say little of the
 /// capacity they say little of the curve.
@@ -70,6 +78,27 @@ impl ModelState {
     }
 }
 
+/// Most changes of the model that are kept.
+const MAX_CHANGES: usize = 16;
+
+/// A change of the model: when, and what was known after it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelChange {
+    /// When.
+    pub time: Timestamp,
+    /// How well the model is known since.
+    pub state: ModelState,
+    /// Its capacity, Ah; `None` = the label's model.
+    pub capacity: Option<ScalarGaussian>,
+    /// Root mean square of the rows' residuals, V.
+    pub residual_v: Option<f64>,
+    /// The chemistry that explains the voltages better than that on the label.
+    pub chemistry: Option<Chemistry>,
+    /// The model before holds again.
+    pub is_taken_back: bool,
+}
+
 /// What is known of the cells' model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
@@ -87,6 +116,8 @@ pub struct ModelView<'a> {
     pub fits: u32,
     /// Models taken back.
     pub taken_back: u32,
+    /// The latest changes, oldest first.
+    pub changes: &'a [ModelChange],
 }
 
 /// The modelling stage.
@@ -137,6 +168,8 @@ pub(super) struct ModellingState {
     fits: u32,
     #[serde(default)]
     taken_back: u32,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    changes: Vec<ModelChange>,
 }
 
 /// Another model for the estimators.
@@ -154,12 +187,14 @@ impl ModellingState {
     /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.notebook.check()?;
-        self.own.iter().chain(&self.before).try_for_each(OwnModel::check)
+        self.own.iter().chain(&self.before).try_for_each(OwnModel::check)?;
+        let (count, most) = (self.changes.len(), MAX_CHANGES);
+        InvalidState::unless(count <= most, "the changes of the model", count as f64, "at most 16")
     }
 
     /// What is known of cells with this label; `None` = of a model file.
     fn view(&self, label: Option<Label>) -> ModelView<'_> {
-        let Self { notebook, own, chemistry, fits, taken_back, .. } = self;
+        let Self { notebook, own, chemistry, fits, taken_back, changes, .. } = self;
         let state = match (label, own) {
             (None, _) => ModelState::Given,
             _ if chemistry.is_some() => ModelState::Unfit,
@@ -175,6 +210,7 @@ impl ModellingState {
             chemistry: *chemistry,
             fits: *fits,
             taken_back: *taken_back,
+            changes,
         }
     }
 
@@ -277,6 +313,7 @@ impl Modelling {
         let is_settled = own.as_ref().is_some_and(OwnModel::is_settled) && chemistry.is_none();
         self.label.is_some()
             && notebook.unread() >= LEAST_NEW_ROWS
+            && notebook.new_charge_ah() >= LEAST_NEW_CHARGE * self.notebook.rated_ah
             && (!is_settled || notebook.rows_of_new_classes(self.notebook.rated_ah) >= LEAST_NEW_ROWS)
     }
 
@@ -288,15 +325,18 @@ impl Modelling {
         let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
         let fitted = fit::fit(&label, self.state.notebook.rows(), self.state.notebook.present());
         self.state.notebook.mark_read();
-        let fitted = fitted?;
-        self.state.fits = self.state.fits.saturating_add(1);
-        self.state.chemistry = better_chemistry(&label, &fitted, self.state.notebook.rows());
-        if self.state.chemistry.is_some() || fitted.misfit > MOST_MISFIT {
+        if fit::says_enough(&label, self.state.notebook.rows()) {
+            self.state.fits = self.state.fits.saturating_add(1);
+            self.state.chemistry = better_chemistry(&label, fitted.as_ref(), self.state.notebook.rows());
+        }
+        if self.state.chemistry.is_some() || fitted.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
             return self.return_to_label();
         }
+        let fitted = fitted?;
         // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
-        if is_flat || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
+        let is_rough = fitted.misfit > MOST_MISFIT;
+        if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
             return None;
         }
         let Fit { own, soc, soc_by_capacity, .. } = fitted;
@@ -328,7 +368,7 @@ impl Modelling {
         let new_rows = self.state.notebook.new_rows();
         let cost = |own: Option<&OwnModel>| rows_cost(label, own, new_rows);
         let (Some(present), Some(before)) = (cost(Some(own)), cost(self.state.before.as_ref())) else { return };
-        if before < present {
+        if before < present - BEFORE_MARGIN {
             self.state.own = self.state.before.take();
             self.state.taken_back = self.state.taken_back.saturating_add(1);
             self.outcome = FitOutcome::Returned;
@@ -345,18 +385,22 @@ impl Modelling {
         self.label.map(|_| self.state.clone())
     }
 
-    /// The event of the latest fit; `None` when nothing has changed. `before` is the state before it.
-    pub(super) fn event(&self, before: ModelState) -> Option<EventKind> {
+    /// Notes what the latest fit has changed, as the event it is; `None` when nothing has. `before` is the state before it.
+    pub(super) fn note_change(&mut self, time: Timestamp, before: ModelState) -> Option<Event> {
         let ModelView { state, own, chemistry, .. } = self.view();
-        let is_new = state != before || self.outcome != FitOutcome::Nothing;
-        is_new.then(|| EventKind::Model {
-            state,
-            capacity_ah: own.map(|own| own.capacity.mean),
-            capacity_std_ah: own.map(|own| own.capacity.std()),
-            residual_v: own.map(|own| own.residual_v),
-            chemistry,
-            is_taken_back: self.has_returned(),
-        })
+        if state == before && self.outcome == FitOutcome::Nothing {
+            return None;
+        }
+        let (capacity, residual_v) = own.map(|own| (own.capacity, own.residual_v)).unzip();
+        let is_taken_back = self.has_returned();
+        let changes = &mut self.state.changes;
+        if changes.len() == MAX_CHANGES {
+            changes.remove(0);
+        }
+        changes.push(ModelChange { time, state, capacity, residual_v, chemistry, is_taken_back });
+        let (capacity_ah, capacity_std_ah) = capacity.map(|it| (it.mean, it.std())).unzip();
+        let kind = EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back };
+        Some(Event { time, kind })
     }
 
     /// What is known.
@@ -373,10 +417,15 @@ impl Modelling {
     }
 }
 
-/// The chemistry that explains the rows clearly better than that of the label, if there is one.
-fn better_chemistry(label: &Label, fitted: &Fit, rows: &[Row]) -> Option<Chemistry> {
-    let margin = CHEMISTRY_MARGIN * (fitted.misfit / MOST_MISFIT).max(1.0);
-    let cost = |label: &Label| fit::label_cost(label, rows, fitted.own.capacity.mean);
+/// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the fit, if
+/// there is one, or the rated one, as suits it better.
+fn better_chemistry(label: &Label, fitted: Option<&Fit>, rows: &[Row]) -> Option<Chemistry> {
+    let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
+    let capacities = [Some(label.rated_ah), fitted.map(|it| it.own.capacity.mean)];
+    let cost = |label: &Label| {
+        let costs = capacities.iter().flatten().filter_map(|&capacity_ah| fit::label_cost(label, rows, capacity_ah));
+        costs.min_by(f64::total_cmp)
+    };
     let own = cost(label)?;
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
     let costs = others.filter_map(|chemistry| Some((chemistry, cost(&label.with_chemistry(chemistry))?)));

@@ -245,7 +245,7 @@ impl Stages {
         } else if modelling.has_returned() {
             estimation.use_model(modelling, &learning.state.learner);
         }
-        out.events.extend(self.modelling.event(before).map(|kind| Event { time: now, kind }));
+        out.events.extend(self.modelling.note_change(now, before));
     }
 
     /// Executes a command.

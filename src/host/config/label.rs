@@ -70,6 +70,7 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
         residual_v: view.own.map(|own| own.residual_v),
         chemistry: view.chemistry,
         fits: view.fits,
+        changes: view.changes.to_vec(),
         prior: Box::new(prior.clone()),
     };
     let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));

@@ -21,9 +21,9 @@ use nalgebra::{DMatrix, DVector};
 use super::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::cell::chemistry::curve::CurvePrior;
 use crate::cell::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C, usual_cold_sag_v};
-use crate::cell::notebook::Row;
+use crate::cell::notebook::{PresentStretch, Row};
 use crate::filter::ScalarGaussian;
-use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY};
+use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
 use noise::{NormalEquations, RepeatedErrors};
 
 /// Fewest rows, and least part of the capacity that a stretch of them must span.
@@ -37,10 +37,12 @@ const LEAST_GAIN: f64 = 0.02;
 const FIRST_DAMPING: f64 = 1e-3;
 const MOST_DAMPING: f64 = 1e6;
 /// Capacities of the grid relative to the rated one; the search begins at the rated one.
-const LEAST_CAPACITY: f64 = 0.80;
+const LEAST_CAPACITY: f64 = 0.52;
 const CAPACITY_STEP: f64 = 0.04;
-const CAPACITIES: usize = 11;
-const FIRST_CAPACITY: usize = 5;
+const CAPACITIES: usize = 20;
+const FIRST_CAPACITY: usize = 12;
+/// Cost above the least that a capacity at either end of the grid must have: what is most likely beyond it is not of this label.
+const LEAST_END_COST: f64 = 3.0;
 /// Cost above the least beyond which no further capacity is tried.
 const HOPELESS: f64 = 25.0;
 /// Points between two capacities of the grid at which the density is evaluated.
@@ -85,10 +87,14 @@ struct Search<'a> {
     rated_ah: f64,
 }
 
-/// Fits; `None` when the rows say too little, or the label has no model. `present` is the number of the present stretch and
-/// the charge taken out in it so far, Ah.
-pub fn fit(label: &Label, rows: &[Row], present: Option<(u32, f64)>) -> Option<Fit> {
-    if rows.len() < LEAST_ROWS || span_ah(rows) < LEAST_SPAN * label.rated_ah {
+/// Whether rows are enough for a fit.
+pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
+    rows.len() >= LEAST_ROWS && span_ah(rows) >= LEAST_SPAN * label.rated_ah
+}
+
+/// Fits; `None` when the rows say too little, are those of a capacity far from the label's, or the label has no model. `present`: where the present stretch stands.
+pub fn fit(label: &Label, rows: &[Row], present: Option<PresentStretch>) -> Option<Fit> {
+    if !says_enough(label, rows) {
         return None;
     }
     let (search, start) = Search::new(label, rows)?;
@@ -129,7 +135,7 @@ impl<'a> Search<'a> {
     /// With the parameters from which it begins.
     fn new(label: &Label, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
         let basis = Basis::new(label, rows)?;
-        let prior = prior::information(&basis.curve, basis.size())?;
+        let prior = prior::information(&basis.curve, label.rated_ah, basis.size())?;
         let start = basis.parameters(label, None);
         let mut expected = DVector::zeros(basis.size());
         expected[LOG_CAPACITY] = start[LOG_CAPACITY];
@@ -203,6 +209,10 @@ impl<'a> Search<'a> {
                 theta = next.theta;
             }
         }
+        let is_open = |end: Option<f64>| end.is_some_and(|cost| cost < least + LEAST_END_COST);
+        if is_open(found[0]) || is_open(found[CAPACITIES - 1]) {
+            return None;
+        }
         let (first, last) = (found.iter().position(Option::is_some)?, found.iter().rposition(Option::is_some)?);
         let costs: Vec<f64> = found[first..=last].iter().map(|cost| cost.unwrap_or(least + HOPELESS)).collect();
         let (mean, variance) = moments(&costs, least);
@@ -213,7 +223,7 @@ impl<'a> Search<'a> {
     }
 
     /// Model, present SOC and their deviations at the capacity that was found.
-    fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>, present: Option<(u32, f64)>) -> Option<Fit> {
+    fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>, present: Option<PresentStretch>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
@@ -222,12 +232,15 @@ impl<'a> Search<'a> {
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
         let last = self.basis.rows.last().zip(self.basis.stretch.last());
-        let present = present.zip(last).filter(|((number, _), (row, _))| *number == row.stretch);
-        let soc = present.map(|((_, present_ah), (_, stretch))| {
-            let (k, moved) = (BEGINNINGS + stretch, present_ah / capacity.mean);
-            let by_capacity = by_capacity[k] + moved * by_capacity[LOG_CAPACITY];
-            let variance = covariance[(k, k)] + by_capacity * by_capacity;
-            (ScalarGaussian { mean: theta[k] - moved, variance }, by_capacity * std_ah)
+        let present = present.zip(last).filter(|(present, (row, _))| present.number == row.stretch);
+        let soc = present.map(|(present, (_, stretch))| {
+            let (k, hours) = (BEGINNINGS + stretch, present.elapsed_s / 3600.0);
+            let moved = (present.charge_ah - hours * theta[OFFSET]) / capacity.mean;
+            let by_offset = hours / capacity.mean;
+            let by_capacity = by_capacity[k] + by_offset * by_capacity[OFFSET] + moved * by_capacity[LOG_CAPACITY];
+            let own = covariance[(k, k)]
+                + by_offset * (2.0 * covariance[(k, OFFSET)] + by_offset * covariance[(OFFSET, OFFSET)]);
+            (ScalarGaussian { mean: theta[k] - moved, variance: own + by_capacity * by_capacity }, by_capacity * std_ah)
         });
         covariance[(LOG_CAPACITY, LOG_CAPACITY)] = 0.0;
         covariance += &by_capacity * by_capacity.transpose();

@@ -4,7 +4,7 @@ use toml::{Table, Value};
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, Chemistry, Coverage, ModelBands};
-use crate::monitor::ModelState;
+use crate::monitor::{ModelChange, ModelState};
 
 /// Most that the end of a measured range is rounded.
 const ROUNDED: f64 = 0.01;
@@ -63,6 +63,8 @@ pub struct LearnedFrom {
     pub chemistry: Option<Chemistry>,
     /// Fits so far.
     pub fits: u32,
+    /// The latest changes, oldest first.
+    pub changes: Vec<ModelChange>,
 }
 
 impl ModelSource {

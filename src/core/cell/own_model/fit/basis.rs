@@ -12,14 +12,15 @@ use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 
 /// First indices of the parameters: the curve's deviations from the label's, V, at the SOC breakpoints; ln of the resistances'
 /// factors over SOC; their deviation from the law of temperature; the curve's sag in the cold less the label's, V; ln of the capacity,
-/// Ah; the SOC at which each stretch began.
+/// Ah; the offset of the current sensor, A (measured less true); the SOC at which each stretch began.
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
 pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
-pub(super) const BEGINNINGS: usize = LOG_CAPACITY + 1;
-/// Parameters of curve, SOC and capacity among those of a row.
-pub(super) const CURVE_AND_SOC: usize = 5;
+pub(super) const OFFSET: usize = LOG_CAPACITY + 1;
+pub(super) const BEGINNINGS: usize = OFFSET + 1;
+/// Parameters of curve and SOC among those of a row.
+pub(super) const CURVE_AND_SOC: usize = 6;
 
 /// Limits of the parameters: SOC at a beginning, ln of a factor, deviation from the law of temperature.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
@@ -50,7 +51,7 @@ pub(super) struct Prediction {
     pub(super) ohm: [f64; RESISTANCES],
     /// Change of ln of a resistance with each of its three parameters.
     pub(super) by_factor: [f64; 3],
-    /// Parameters on which the voltage depends: five of curve, SOC and capacity, then three of each resistance.
+    /// Parameters on which the voltage depends: six of curve and SOC, then three of each resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
 }
@@ -97,7 +98,7 @@ impl<'a> Basis<'a> {
             let (low, high) = match i {
                 ..BY_TEMPERATURE => (-MOST_LOG_FACTOR, MOST_LOG_FACTOR),
                 BY_TEMPERATURE..COLD_SAG => (-MOST_BY_TEMPERATURE, MOST_BY_TEMPERATURE),
-                COLD_SAG | LOG_CAPACITY => continue,
+                COLD_SAG..=OFFSET => continue,
                 BEGINNINGS.. => BEGINNING,
             };
             *value = value.clamp(low, high);
@@ -109,7 +110,8 @@ impl<'a> Basis<'a> {
         let row = &self.rows[at];
         let beginning = BEGINNINGS + self.stretch[at];
         let capacity_ah = libm::exp(theta[LOG_CAPACITY]);
-        let moved = f64::from(row.charge_ah) / capacity_ah;
+        let hours = f64::from(row.elapsed_s) / 3600.0;
+        let moved = (f64::from(row.charge_ah) - hours * theta[OFFSET]) / capacity_ah;
         let soc = theta[beginning] - moved;
         let temperature_c = f64::from(row.temperature_c);
         let position = self.model.grid_position(soc, temperature_c);
@@ -119,8 +121,8 @@ impl<'a> Basis<'a> {
             if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
         let slope_v = self.model.ocv_slope_v(&position, self.model.capacity_ah) + own_slope_v;
         let cold = cold_share(temperature_c);
-        let mut index = vec![node, node + 1, COLD_SAG, LOG_CAPACITY, beginning];
-        let mut slope = vec![1.0 - along, along, -cold, slope_v * moved, slope_v];
+        let mut index = vec![node, node + 1, COLD_SAG, LOG_CAPACITY, OFFSET, beginning];
+        let mut slope = vec![1.0 - along, along, -cold, slope_v * moved, slope_v * hours / capacity_ah, slope_v];
         let (low, part) = interval(&FACTOR_SOC, soc);
         let by_temperature = libm::log(arrhenius(temperature_c));
         let by_factor = [1.0 - part, part, by_temperature];

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use super::basis::{BEGINNINGS, BY_TEMPERATURE, COLD_SAG, FACTORS, LOG_CAPACITY};
+use super::basis::{BEGINNINGS, BY_TEMPERATURE, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
 use crate::cell::chemistry::curve::CurvePrior;
 use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
@@ -23,11 +23,13 @@ const LEAST_VARIANCE: f64 = 1e-4;
 const CAPACITY_STD: f64 = 0.1;
 /// Roughness of a curve beside the modes of its prior, V.
 const ROUGH_V: f64 = 0.002;
+/// Standard deviation of the current sensor's offset: the rated capacity over this time, h.
+const OFFSET_H: f64 = 700.0;
 /// Standard deviation of the SOC at which a stretch begins: it is found from the voltages.
 const BEGINNING_STD: f64 = 0.5;
 
 /// Information matrix about the label's values; `None` when a covariance has no factor.
-pub(super) fn information(curve: &CurvePrior, size: usize) -> Option<DMatrix<f64>> {
+pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Option<DMatrix<f64>> {
     let mut prior = DMatrix::zeros(size, size);
     let own = DMatrix::from_diagonal_element(SOC_NODES, SOC_NODES, ROUGH_V * ROUGH_V);
     let curve = (&curve.covariance + own).cholesky()?.inverse();
@@ -39,6 +41,7 @@ pub(super) fn information(curve: &CurvePrior, size: usize) -> Option<DMatrix<f64
     (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, BY_TEMPERATURE_STD));
     near(COLD_SAG, usual_cold_sag_v().std());
     near(LOG_CAPACITY, CAPACITY_STD);
+    near(OFFSET, rated_ah / OFFSET_H);
     (BEGINNINGS..size).for_each(|i| near(i, BEGINNING_STD));
     Some(prior)
 }
