@@ -1,6 +1,6 @@
 //! Files that are read in pieces: logs, journals, tables. Each lies in a folder in memory where there is one.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
@@ -99,7 +99,7 @@ pub fn table(data: &[u8]) {
         let _ = History::read(path);
         let names = ["x".to_owned(), "y".to_owned()];
         let wanted = ColumnSelection { columns: &names[..1], optional: &names[1..], missing: MissingPolicy::Skipped };
-        let files: [PathBuf; 1] = [path.to_owned()];
+        let files = [path.to_owned()];
         if let Ok(table) = ColumnTable::read(&files, &wanted, &PartColumn::Default) {
             assert_eq!(table.values.len(), table.len() * table.width(), "a row has another number of values");
         }
