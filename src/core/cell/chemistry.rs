@@ -104,6 +104,17 @@ pub struct Label {
     pub voltage_max_v: f64,
 }
 
+/// What is known of a cell by its label.
+#[derive(Debug, Clone)]
+pub struct LabelPrior {
+    /// The label.
+    pub label: Label,
+    /// Model of the mean cell.
+    pub model: CellModel,
+    /// Its open-circuit curve with the covariance between cells.
+    pub curve: CurvePrior,
+}
+
 /// Distance of a highest voltage from the usual one of a chemistry within which it is one of that chemistry, V.
 const USUAL_WITHIN_V: f64 = 0.2;
 
@@ -237,6 +248,11 @@ impl Label {
 
     /// The model of such a cell; `None` when no cell of this chemistry has these cut-offs.
     pub fn model(&self) -> Option<CellModel> {
+        self.prior().map(|prior| prior.model)
+    }
+
+    /// Model and curve of such a cell; `None` when no cell of this chemistry has these cut-offs.
+    pub fn prior(&self) -> Option<LabelPrior> {
         let curve = self.curve()?;
         let (modes_v, rest_v) = curve.modes_v();
         let spread = ModelSpread {
@@ -246,9 +262,11 @@ impl Label {
             capacity: CAPACITY_STD,
             drop_sqrt_s: DROP_SQRT_S,
         };
-        let CurvePrior { mean_v, electrodes, .. } = curve;
-        let curve = CurveOfCells { mean_v, modes_v, rest_v, cold_sag_v: usual_cold_sag_v(), electrodes };
-        Some(self.model_of(self.rated_ah, &curve, &ResistanceFactors::default(), &[0.0; TEMPERATURE_NODES], spread))
+        let CurvePrior { mean_v, electrodes, .. } = curve.clone();
+        let of_cells = CurveOfCells { mean_v, modes_v, rest_v, cold_sag_v: usual_cold_sag_v(), electrodes };
+        let factors = ResistanceFactors::default();
+        let model = self.model_of(self.rated_ah, &of_cells, &factors, &[0.0; TEMPERATURE_NODES], spread);
+        Some(LabelPrior { label: *self, model, curve })
     }
 
     /// The model of a cell with this present capacity, Ah, curve and these resistances. `drop_std`: standard deviation of ln(voltage drop) at each

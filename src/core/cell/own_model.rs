@@ -7,7 +7,9 @@ pub mod fit;
 
 use serde::{Deserialize, Serialize};
 
-use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, ResistanceFactors, TEMPERATURE_NODES, usual_cold_sag_v};
+use super::chemistry::{
+    CurveOfCells, FACTOR_SOC, Label, LabelPrior, ResistanceFactors, TEMPERATURE_NODES, usual_cold_sag_v,
+};
 use super::config::EstimatorConfig;
 use super::model::{CellModel, ModelSpread};
 use super::notebook::Row;
@@ -123,8 +125,8 @@ impl OwnModel {
 }
 
 /// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density; `None` when there are no rows.
-pub fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
-    fit::rows_cost(label, own, rows)
+pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
+    fit::rows_cost(prior, own, rows)
 }
 
 /// SOC nodes of the resistance factors.

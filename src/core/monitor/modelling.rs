@@ -16,8 +16,8 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::fit::{self, Fit};
 use crate::cell::own_model::rows_cost;
 use crate::cell::{
-    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, Notebook, NotebookConfig,
-    OwnModel,
+    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, LabelPrior, Notebook,
+    NotebookConfig, OwnModel,
 };
 use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Mode, Timestamp};
@@ -320,14 +320,15 @@ impl Modelling {
     /// Fits a model to all rows, after those in force were judged on the new ones. `None` = none is to be adopted.
     pub(super) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
+        let prior = label.prior()?;
         self.state.notebook.finish_row(&self.notebook);
-        self.take_back_if_worse(&label);
+        self.take_back_if_worse(&prior);
         let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
-        let fitted = fit::fit(&label, self.state.notebook.rows(), self.state.notebook.present());
+        let fitted = fit::fit(&prior, self.state.notebook.rows(), self.state.notebook.present());
         self.state.notebook.mark_read();
         if fit::says_enough(&label, self.state.notebook.rows()) {
             self.state.fits = self.state.fits.saturating_add(1);
-            self.state.chemistry = better_chemistry(&label, fitted.as_ref(), self.state.notebook.rows());
+            self.state.chemistry = better_chemistry(&prior, fitted.as_ref(), self.state.notebook.rows());
         }
         if self.state.chemistry.is_some() || fitted.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
             return self.return_to_label();
@@ -362,11 +363,11 @@ impl Modelling {
     }
 
     /// Returns to the model before when it predicts the new rows better.
-    fn take_back_if_worse(&mut self, label: &Label) {
+    fn take_back_if_worse(&mut self, prior: &LabelPrior) {
         self.outcome = FitOutcome::Nothing;
         let Some(own) = &self.state.own else { return };
         let new_rows = self.state.notebook.new_rows();
-        let cost = |own: Option<&OwnModel>| rows_cost(label, own, new_rows);
+        let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
         let (Some(present), Some(before)) = (cost(Some(own)), cost(self.state.before.as_ref())) else { return };
         if before < present - BEFORE_MARGIN {
             self.state.own = self.state.before.take();
@@ -419,16 +420,17 @@ impl Modelling {
 
 /// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the fit, if
 /// there is one, or the rated one, as suits it better.
-fn better_chemistry(label: &Label, fitted: Option<&Fit>, rows: &[Row]) -> Option<Chemistry> {
+fn better_chemistry(prior: &LabelPrior, fitted: Option<&Fit>, rows: &[Row]) -> Option<Chemistry> {
+    let LabelPrior { label, .. } = prior;
     let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
-    let capacities = [Some(label.rated_ah), fitted.map(|it| it.own.capacity.mean)];
-    let cost = |label: &Label| {
-        let costs = capacities.iter().flatten().filter_map(|&capacity_ah| fit::label_cost(label, rows, capacity_ah));
-        costs.min_by(f64::total_cmp)
-    };
-    let own = cost(label)?;
+    let fitted_ah = fitted.map(|it| it.own.capacity.mean);
+    let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();
+    let own = fit::label_cost(prior, rows, &capacities_ah)?;
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
-    let costs = others.filter_map(|chemistry| Some((chemistry, cost(&label.with_chemistry(chemistry))?)));
+    let costs = others.filter_map(|chemistry| {
+        let other = label.with_chemistry(chemistry).prior()?;
+        Some((chemistry, fit::label_cost(&other, rows, &capacities_ah)?))
+    });
     let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
     best.filter(|(_, cost)| *cost < own - margin).map(|(chemistry, _)| chemistry)
 }

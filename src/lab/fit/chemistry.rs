@@ -69,7 +69,7 @@ pub(super) fn note<'a>(
     let rows = rows(label, offset_a, stretches);
     let cost = |chemistry: Chemistry| {
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
-        Some((chemistry, fit::label_cost(&of, &rows, capacity_ah)?))
+        Some((chemistry, fit::label_cost(&of.prior()?, &rows, &[capacity_ah])?))
     };
     let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= LEAST_ROWS) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));

@@ -133,7 +133,7 @@ impl MeanCell {
         self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
     }
 
-    /// What follows does not hang together with what was: time passed that nobody knows.
+    /// The next reading begins another stretch: an unknown time has passed.
     fn end_stretch(&mut self) {
         if self.count > 0.0 {
             self.close();

@@ -20,7 +20,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::cell::chemistry::curve::CurvePrior;
-use crate::cell::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C, usual_cold_sag_v};
+use crate::cell::chemistry::{Label, LabelPrior, ResistanceFactors, SOC, TEMPERATURE_C, usual_cold_sag_v};
 use crate::cell::notebook::{PresentStretch, Row};
 use crate::filter::ScalarGaussian;
 use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
@@ -92,28 +92,30 @@ pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
     rows.len() >= LEAST_ROWS && span_ah(rows) >= LEAST_SPAN * label.rated_ah
 }
 
-/// Fits; `None` when the rows say too little, are those of a capacity far from the label's, or the label has no model. `present`: where the present stretch stands.
-pub fn fit(label: &Label, rows: &[Row], present: Option<PresentStretch>) -> Option<Fit> {
-    if !says_enough(label, rows) {
+/// Fits; `None` when the rows say too little or are those of a capacity far from the label's. `present`: where the present stretch
+/// stands.
+pub fn fit(prior: &LabelPrior, rows: &[Row], present: Option<PresentStretch>) -> Option<Fit> {
+    if !says_enough(&prior.label, rows) {
         return None;
     }
-    let (search, start) = Search::new(label, rows)?;
+    let (search, start) = Search::new(prior, rows)?;
     let capacity = search.capacity(&start)?;
     search.finish(capacity, &start, present)
 }
 
-/// Minus the logarithm of the probability of rows by a label at a capacity, Ah: comparable between labels.
-pub fn label_cost(label: &Label, rows: &[Row], capacity_ah: f64) -> Option<f64> {
-    let (search, start) = Search::new(label, rows)?;
-    let cost = search.conditional(capacity_ah, &start)?.cost;
-    Some(cost - 0.5 * prior::log_determinant(&search.prior)?)
+/// Minus the logarithm of the probability of rows by a label, at the capacity that suits it best of some, Ah: comparable between
+/// labels.
+pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Option<f64> {
+    let (search, start) = Search::new(prior, rows)?;
+    let costs = capacities_ah.iter().filter_map(|&ah| search.conditional(ah, &start).map(|found| found.cost));
+    Some(costs.min_by(f64::total_cmp)? - 0.5 * prior::log_determinant(&search.prior)?)
 }
 
 /// Cost of rows by a model, `None` = that of the label: minus the logarithm of their density, with the most likely SOC at the
-/// beginning of each stretch. `None` when the label has no model, or there are no rows.
-pub(super) fn rows_cost(label: &Label, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
-    let basis = Basis::new(label, rows)?;
-    let theta = basis.parameters(label, own);
+/// beginning of each stretch. `None` when there are no rows.
+pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
+    let basis = Basis::new(prior, rows);
+    let theta = basis.parameters(own);
     let size = basis.size();
     let mut sums =
         NormalEquations { normal: DMatrix::zeros(size, size), gradient: DVector::zeros(size), cost: 0.0, squares: 0.0 };
@@ -133,14 +135,15 @@ fn span_ah(rows: &[Row]) -> f64 {
 
 impl<'a> Search<'a> {
     /// With the parameters from which it begins.
-    fn new(label: &Label, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
-        let basis = Basis::new(label, rows)?;
-        let prior = prior::information(&basis.curve, label.rated_ah, basis.size())?;
-        let start = basis.parameters(label, None);
+    fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
+        let rated_ah = prior.label.rated_ah;
+        let basis = Basis::new(prior, rows);
+        let prior = prior::information(basis.curve, rated_ah, basis.size())?;
+        let start = basis.parameters(None);
         let mut expected = DVector::zeros(basis.size());
         expected[LOG_CAPACITY] = start[LOG_CAPACITY];
         (BEGINNINGS..basis.size()).for_each(|k| expected[k] = 0.5);
-        Some((Self { basis, prior, expected, rated_ah: label.rated_ah }, start))
+        Some((Self { basis, prior, expected, rated_ah }, start))
     }
 
     /// Sums of rows and prior at `theta`, without the capacity's.

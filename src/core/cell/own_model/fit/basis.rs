@@ -5,7 +5,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::cell::chemistry::curve::CurvePrior;
-use crate::cell::chemistry::{FACTOR_SOC, Label, RESISTANCES, SOC, cold_share, usual_cold_sag_v};
+use crate::cell::chemistry::{FACTOR_SOC, LabelPrior, RESISTANCES, SOC, cold_share, usual_cold_sag_v};
 use crate::cell::model::{CellModel, arrhenius};
 use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
@@ -33,8 +33,8 @@ const FIRST_DROP: f64 = 0.1;
 
 /// The label as the fit uses it.
 pub(super) struct Basis<'a> {
-    pub(super) model: CellModel,
-    pub(super) curve: CurvePrior,
+    pub(super) model: &'a CellModel,
+    pub(super) curve: &'a CurvePrior,
     pub(super) rows: &'a [Row],
     /// Stretch of each row, counted from 0.
     pub(super) stretch: Vec<usize>,
@@ -63,10 +63,10 @@ fn interval(nodes: &[f64], x: f64) -> (usize, f64) {
 }
 
 impl<'a> Basis<'a> {
-    pub(super) fn new(label: &Label, rows: &'a [Row]) -> Option<Self> {
+    pub(super) fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Self {
         let stretches = rows.chunk_by(|a, b| a.stretch == b.stretch);
         let stretch = stretches.enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
-        Some(Self { model: label.model()?, curve: label.curve()?, rows, stretch })
+        Self { model: &prior.model, curve: &prior.curve, rows, stretch }
     }
 
     /// Number of parameters.
@@ -75,9 +75,9 @@ impl<'a> Basis<'a> {
     }
 
     /// The parameters of a model, `None` = that of the label, with the SOC at which each stretch most likely began.
-    pub(super) fn parameters(&self, label: &Label, own: Option<&OwnModel>) -> DVector<f64> {
+    pub(super) fn parameters(&self, own: Option<&OwnModel>) -> DVector<f64> {
         let mut theta = DVector::zeros(self.size());
-        theta[LOG_CAPACITY] = libm::log(own.map_or(label.rated_ah, |own| own.capacity.mean));
+        theta[LOG_CAPACITY] = libm::log(own.map_or(self.model.rated_capacity_ah, |own| own.capacity.mean));
         if let Some(own) = own {
             (0..SOC_NODES).for_each(|s| theta[s] = own.curve_v[s] - self.curve.mean_v[s]);
             theta[COLD_SAG] = own.cold_sag_v.mean - usual_cold_sag_v().mean;
