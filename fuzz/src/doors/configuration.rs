@@ -36,7 +36,7 @@ fn drawn(source: &mut Source<'_>) -> Vec<u8> {
         let number = source.number();
         let number = if number.is_nan() {
             "nan".to_owned()
-        } else if source.byte() % 2 == 0 {
+        } else if source.byte().is_multiple_of(2) {
             format!("{number:e}")
         } else {
             format!("{}", number.trunc())
@@ -53,7 +53,7 @@ fn drawn(source: &mut Source<'_>) -> Vec<u8> {
 /// TOML of any kind, and numbers of any size.
 pub fn configuration(data: &[u8]) {
     let mut source = Source::new(data);
-    let pack = if source.byte() % 4 == 0 { source.rest().to_vec() } else { drawn(&mut source) };
+    let pack = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { drawn(&mut source) };
     if let Ok(config) = world::load(&pack, DBC, CELL.as_bytes()) {
         use_it(&config);
     }
@@ -62,7 +62,7 @@ pub fn configuration(data: &[u8]) {
 /// A cell model with changed numbers or of any kind.
 pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);
-    let model = if source.byte() % 4 == 0 { source.rest().to_vec() } else { changed(&mut source) };
+    let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };
     if let Ok(config) = world::load(PACK.as_bytes(), DBC, &model) {
         use_it(&config);
     }

@@ -46,7 +46,7 @@ impl Record {
 /// Frames, gaps and commands in; a second run must give the same.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
-    let is_repeated = source.byte() % 8 == 0;
+    let is_repeated = source.byte().is_multiple_of(8);
     let records = records(&mut source);
     let first = run(&records, &[], true);
     if is_repeated {
@@ -244,7 +244,7 @@ impl Vehicle {
                 ]);
                 self.push(Input::Bus { time, bus, event });
             }
-            17 => self.push(Input::Store { time, works: source.byte() % 2 == 0 }),
+            17 => self.push(Input::Store { time, works: source.byte().is_multiple_of(2) }),
             18 => self.identity = f64::from(source.byte() % 12),
             19 => self.contactor = f64::from(source.byte() % 16),
             20 => {
@@ -302,7 +302,7 @@ impl Vehicle {
     /// A command frame with any content and a right, repeated or wrong counter.
     fn command(&mut self, source: &mut Source<'_>) {
         let (profile, mut payload) = (Profile::P01A, source.array::<8>());
-        if source.byte() % 4 != 0 {
+        if !source.byte().is_multiple_of(4) {
             self.command_counter = profile.next_counter(self.command_counter);
         }
         Protection { profile, data_id: 0x0321 }

@@ -43,7 +43,7 @@ fn numbers(text: &str) -> Vec<(usize, usize)> {
 
 /// The state with some of its numbers replaced, or any bytes.
 fn changed(source: &mut Source<'_>) -> Vec<u8> {
-    if source.byte() % 16 == 0 {
+    if source.byte().is_multiple_of(16) {
         return source.rest().to_vec();
     }
     let mut text = stored().to_owned();
@@ -52,7 +52,7 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
         let (from, to) = places[usize::from(source.u16()) % places.len()];
         let number = source.number();
         let digits = if number.is_finite() { format!("{number:e}") } else { "null".to_owned() };
-        let digits = if source.byte() % 2 == 0 { digits } else { source.i16().to_string() };
+        let digits = if source.byte().is_multiple_of(2) { digits } else { source.i16().to_string() };
         text.replace_range(from..to, &digits);
     }
     text.into_bytes()

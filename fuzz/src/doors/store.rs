@@ -58,7 +58,7 @@ pub fn store(data: &[u8]) {
         let end = (at + length).min(bytes.len());
         bytes[at..end].iter_mut().for_each(|byte| *byte ^= source.byte());
     }
-    if source.byte() % 8 == 0 {
+    if source.byte().is_multiple_of(8) {
         bytes.truncate(usize::from(source.u16()));
     }
     let folder = folder();
