@@ -74,7 +74,9 @@
 //! | how well a cell model is known, what measurement is advised | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
 //! | what a cell model file holds | `host/config/cell_model.rs` (read), `host/config/cell_model/write.rs` (written) |
 //! | a picture of a cell model | `lab/model_pictures.rs` |
-//! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |
+//! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
+//! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
+//! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //!
 //! # Invariants

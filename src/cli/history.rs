@@ -109,7 +109,7 @@ fn when(text: &str) -> Result<Timestamp, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let folder = args.state.clone().unwrap_or_else(|| store::standard_folder().0);
+    let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {
         None => list(&reader, args),

@@ -30,7 +30,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if !args.yes || client.is_served() {
         return command::replace_pack(args.yes, &client);
     }
-    let folder = args.state.clone().unwrap_or_else(|| store::standard_folder().0);
+    let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let pack = store::replace_pack(&folder).map_err(Failure::new)?;
     print(&format!(
         "no daemon runs: in {} the history of pack {} is closed, that of pack {pack} starts; the stored state, with its \

@@ -45,7 +45,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
     /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
-    /// /var/lib/packwatch if that can be created). Its state is restored, unless --restore names another
+    /// $XDG_STATE_HOME/packwatch or ~/.local/state/packwatch: never the service's). Its state is restored, unless --restore names another
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     /// Store the state here on stopping
@@ -64,11 +64,12 @@ pub(crate) struct Args {
     #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = whole::<0, MAX_BUFFER_BYTES>)]
     receive_buffer: usize,
     /// Socket for `packwatch alarms` and other commands, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock
-    /// under systemd, else /run/packwatch/control.sock if that can be created)
+    /// under systemd, else in /run/packwatch for root and in $XDG_RUNTIME_DIR/packwatch for others)
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
     /// Socket for `packwatch status` and the exporter, or none for no socket; the stream of `--watch` is next to it
-    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else /run/packwatch/status.sock if that can be created)
+    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else in /run/packwatch for root and in
+    /// $XDG_RUNTIME_DIR/packwatch for others)
     #[arg(long, value_name = "PATH")]
     status: Option<PathBuf>,
 }

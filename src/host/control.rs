@@ -24,7 +24,7 @@ pub mod test_alarm;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::io::unix_socket::runtime_folder;
+use crate::io::unix_socket::{client_folder, runtime_folder};
 
 pub use server::{ControlServer, PendingRequest};
 
@@ -45,7 +45,12 @@ const FILE_NAME: &str = "control.sock";
 /// Owner and group may connect.
 const MODE: u32 = 0o660;
 
-/// The standard path of the socket.
-pub fn standard_path() -> PathBuf {
+/// The default path of a daemon's socket.
+pub fn daemon_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
+}
+
+/// The default path at which a client looks for it.
+pub fn standard_path() -> PathBuf {
+    client_folder().join(FILE_NAME)
 }

@@ -33,7 +33,7 @@ use std::time::Duration;
 
 pub use server::StatusServer;
 
-use crate::io::unix_socket::runtime_folder;
+use crate::io::unix_socket::{client_folder, runtime_folder};
 
 /// Clients at once, of both sockets: a display, an exporter and a few scripts, many times over; each is a descriptor and
 /// a few kilobytes.
@@ -50,9 +50,14 @@ const FILE_NAME: &str = "status.sock";
 /// Every user may connect.
 const MODE: u32 = 0o666;
 
-/// The standard path of the socket.
-pub fn standard_path() -> PathBuf {
+/// The default path of a daemon's socket.
+pub fn daemon_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
+}
+
+/// The default path at which a client looks for it.
+pub fn standard_path() -> PathBuf {
+    client_folder().join(FILE_NAME)
 }
 
 /// The streaming socket of a status socket: `status-stream.sock` next to `status.sock`.

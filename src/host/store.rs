@@ -70,16 +70,26 @@ pub use rows::HistoryTable;
 pub use verify::{BrokenRow, ChainReport, NotedHead};
 pub use writer::StoreProgress;
 
-/// State folder of a daemon that systemd did not start.
+/// State folder of the service.
 const STANDARD_FOLDER: &str = "/var/lib/packwatch";
 /// Period of the state in the runtime folder, s.
 const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Period of checkpoints while no frame comes, s: the state only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The standard state folder, and whether systemd created it.
-pub fn standard_folder() -> (PathBuf, bool) {
-    first_folder("STATE_DIRECTORY").map_or_else(|| (PathBuf::from(STANDARD_FOLDER), false), |folder| (folder, true))
+/// The service's state folder, in which clients look.
+pub fn standard_folder() -> PathBuf {
+    first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+}
+
+/// Default folder of a daemon, and whether systemd created it. One that is started from a shell, as in a tutorial, keeps its state
+/// apart from the service's: in `$XDG_STATE_HOME/packwatch`, by default `~/.local/state/packwatch`.
+pub fn daemon_folder() -> (PathBuf, bool) {
+    if let Some(folder) = first_folder("STATE_DIRECTORY") {
+        return (folder, true);
+    }
+    let own = first_folder("XDG_STATE_HOME").or_else(|| Some(first_folder("HOME")?.join(".local/state")));
+    (own.map_or_else(|| PathBuf::from(STANDARD_FOLDER), |folder| folder.join("packwatch")), false)
 }
 
 /// Source of the state that the next checkpoint overwrites.
@@ -136,7 +146,7 @@ impl Store {
         vehicle: &VehicleIdentity,
     ) -> Result<(Option<Self>, StoredStates), String> {
         let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
-        let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
+        let Some((path, is_needed)) = setting.resolve(daemon_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone(), config.max_half_cycles);
         match folder.lock() {

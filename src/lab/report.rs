@@ -11,6 +11,7 @@ mod html;
 mod limits;
 mod model;
 mod pictures;
+mod raised;
 mod reference;
 mod series;
 mod summary;

@@ -30,6 +30,7 @@ mod export_cli;
 mod fit_cli;
 mod fit_logs;
 mod fit_logs_bad;
+mod fuzz_seeds;
 #[cfg(feature = "lab")]
 mod gp_measured;
 #[cfg(feature = "lab")]

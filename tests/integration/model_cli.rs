@@ -215,8 +215,8 @@ fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
     assert!(["learning", "learned"].contains(&document["state"].as_str().unwrap()), "{document}");
     assert!(document["learned"]["fits"].as_u64().unwrap() >= 1 && document["learned"]["residual_v"].is_number());
     assert!(document["learned"]["soc_share"].as_f64().unwrap() > 0.2, "{document}");
-    let known: Vec<&str> =
-        document["curve"].as_array().unwrap().iter().map(|row| row["known_by"].as_str().unwrap()).collect();
+    let rows = ["curve", "resistances"].map(|table| document[table].as_array().unwrap());
+    let known: Vec<&str> = rows.into_iter().flatten().map(|row| row["known_by"].as_str().unwrap()).collect();
     assert!(known.contains(&"data") && known.contains(&"prior"), "{known:?}");
     let prior = json(&["model", "show", "--json", &pack]);
     let points = |document: &Value| document["soc_error_points"].as_f64().unwrap();

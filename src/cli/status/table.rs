@@ -13,6 +13,8 @@ use crate::status::document::{CellStatus, Intruder, IntruderKind, LossStatus, Pa
 
 /// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;
+/// An outlier is this many times as far from the median as half of the cells are.
+const OUTLYING: f64 = 3.0;
 /// Most outliers listed of more cells.
 const MAX_OUTLIERS: usize = 8;
 
@@ -230,20 +232,28 @@ fn row(cell: &CellStatus) -> Vec<String> {
     ]
 }
 
-/// A quantity compared over the cells: name, unit, decimals, value.
-type Quantity = (&'static str, &'static str, usize, fn(&CellStatus) -> Option<f64>);
+/// A quantity compared over the cells.
+struct Quantity {
+    name: &'static str,
+    unit: &'static str,
+    decimals: usize,
+    /// Distance from the median up to which no cell is an outlier, in the unit and as a part of the median: what sensors and equal
+    /// cells differ by.
+    floor: (f64, f64),
+    of: fn(&CellStatus) -> Option<f64>,
+}
 
 const QUANTITIES: [Quantity; 5] = [
-    ("voltage", " V", 3, |cell| cell.voltage_v),
-    ("SOC", " %", 1, |cell| cell.soc.map(|soc| 100.0 * soc)),
-    ("temp.", " °C", 1, |cell| cell.temperature_c),
-    ("capacity", " Ah", 3, |cell| cell.capacity_ah),
-    ("resistance", "", 2, |cell| cell.resistance_ratio),
+    Quantity { name: "voltage", unit: " V", decimals: 3, floor: (0.010, 0.0), of: |cell| cell.voltage_v },
+    Quantity { name: "SOC", unit: " %", decimals: 1, floor: (1.0, 0.0), of: |cell| cell.soc.map(|soc| 100.0 * soc) },
+    Quantity { name: "temp.", unit: " °C", decimals: 1, floor: (2.0, 0.0), of: |cell| cell.temperature_c },
+    Quantity { name: "capacity", unit: " Ah", decimals: 3, floor: (0.0, 0.01), of: |cell| cell.capacity_ah },
+    Quantity { name: "resistance", unit: "", decimals: 2, floor: (0.05, 0.0), of: |cell| cell.resistance_ratio },
 ];
 
 /// Least and greatest of every quantity, with their cells.
 fn spread(text: &mut String, cells: &[CellStatus]) {
-    for (name, unit, decimals, of) in QUANTITIES {
+    for Quantity { name, unit, decimals, of, .. } in QUANTITIES {
         let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
         let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
         let greatest = known().rev().max_by(|a, b| a.1.total_cmp(&b.1));
@@ -263,14 +273,15 @@ fn spread(text: &mut String, cells: &[CellStatus]) {
 /// Outliers: cells that are not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
 fn outliers(cells: &[CellStatus]) -> Vec<&CellStatus> {
     let mut ranked: Vec<(f64, &CellStatus)> = cells.iter().map(|cell| (0.0, cell)).collect();
-    for (_, _, _, of) in QUANTITIES {
+    for Quantity { floor, of, .. } in QUANTITIES {
         let mut known: Vec<f64> = cells.iter().filter_map(of).collect();
         known.sort_by(f64::total_cmp);
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
-        // Relative to the median distance; equal cells have no outlier.
-        let typical = distances[distances.len() / 2].max(1e-9);
+        // Relative to the median distance; cells within the floor are no outliers.
+        let floor = floor.0.max(floor.1 * median.abs());
+        let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {
             // A cell with an unknown value ranks first.
             *rank = rank.max(of(cell).map_or(f64::MAX, |value| (value - median).abs() / typical));
@@ -282,7 +293,7 @@ fn outliers(cells: &[CellStatus]) -> Vec<&CellStatus> {
     // A stable sort: the first cells of equal rank.
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut found: Vec<&CellStatus> =
-        ranked.into_iter().filter(|(rank, _)| *rank > 3.0).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();
+        ranked.into_iter().filter(|(rank, _)| *rank > OUTLYING).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();
     found.sort_by_key(|cell| cell.cell);
     found
 }

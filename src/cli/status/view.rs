@@ -5,6 +5,7 @@
 
 mod app;
 mod draw;
+mod event_words;
 mod feed;
 mod pages;
 mod plot;
@@ -21,8 +22,6 @@ use tokio::sync::mpsc;
 use tokio::time::interval;
 
 use app::App;
-
-use crate::status::stream_path;
 
 /// Longest time between two drawings: the screen shows the time without a document.
 const DRAW_PERIOD: Duration = Duration::from_secs(1);
@@ -43,7 +42,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
     }
     // https://no-color.org: set and not empty.
     let has_colour = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
-    let app = App::new(stream_path(socket), has_colour);
+    let app = App::new(socket.to_owned(), has_colour);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
     // From here on a panic restores the terminal, too.

@@ -66,11 +66,15 @@ impl ControlClient {
     }
 
     fn explain(&self, request: Request, error: &io::Error) -> String {
+        let option = match self.path == standard_path() {
+            true => String::new(),
+            false => format!(" --control {}", self.path.display()),
+        };
         let path = self.path.display();
         match error.kind() {
             ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-                "{path}: no daemon listens there; start one with \"packwatch run -c FILE --control {path}\", or name its \
-                 socket with --control"
+                "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or name its socket with \
+                 --control"
             ),
             ErrorKind::PermissionDenied => {
                 format!("{path}: permission denied; the daemon's own user, its group and root may connect")

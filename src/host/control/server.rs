@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
-use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
+use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, daemon_path};
 use crate::io::place::PlaceSetting;
 use crate::io::places::{Activity, PlaceLimits, Places};
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
@@ -40,7 +40,7 @@ impl ControlServer {
     /// # Errors
     /// When another daemon uses it, or a requested one cannot be created.
     pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
-        let Some((path, is_needed)) = setting.resolve(|| (standard_path(), false)) else { return Ok(None) };
+        let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {
             Ok(bound) => {
                 let server = Self::serve(bound, requests, MAX_SILENCE);

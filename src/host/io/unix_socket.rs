@@ -14,12 +14,35 @@ use super::place::first_folder;
 /// Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// The folder of a daemon that systemd did not start.
+/// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
+/// Others may look into the folder that is made; the sockets' own modes decide who may connect.
+const FOLDER_MODE: u32 = 0o755;
 
-/// Default folder of the sockets: the one systemd made, else `/run/packwatch`.
+/// Default folder of a daemon's sockets: the one systemd made; else `/run/packwatch` for root, and the user's own folder for others.
 pub fn runtime_folder() -> PathBuf {
-    first_folder("RUNTIME_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+    let is_root = || std::fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
+    let own = || own_folder().filter(|_| !is_root());
+    first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+}
+
+/// Default folder in which a client looks: the service's where there is one, else that of the user's own daemon.
+pub fn client_folder() -> PathBuf {
+    let standard = PathBuf::from(STANDARD_FOLDER);
+    let own = || own_folder().filter(|own| !standard.exists() && own.exists());
+    first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or(standard)
+}
+
+fn own_folder() -> Option<PathBuf> {
+    Some(first_folder("XDG_RUNTIME_DIR")?.join("packwatch"))
+}
+
+/// Creates the default folder where systemd did not. Where that fails, so does the bind, which is reported.
+fn make_default_folder(path: &Path) {
+    let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
+    if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
+        let _ = std::fs::set_permissions(folder, Permissions::from_mode(FOLDER_MODE));
+    }
 }
 
 /// A bound socket and its file, which is removed on drop.
@@ -73,6 +96,7 @@ impl BindError {
 
 /// Binds a socket at `path`; the file mode `mode` decides who may connect.
 pub async fn bind(path: &Path, mode: u32) -> Result<BoundSocket, BindError> {
+    make_default_folder(path);
     remove_stale(path).await?;
     let listener = UnixListener::bind(path)?;
     std::fs::set_permissions(path, Permissions::from_mode(mode))?;
@@ -121,6 +145,12 @@ impl Drop for SocketFile {
             && let Err(error) = std::fs::remove_file(&self.path)
         {
             tracing::warn!(path = %self.path.display(), %error, "socket not removed");
+        }
+        // The default folder goes with its last socket, unless it is systemd's.
+        if let Some(folder) = self.path.parent().filter(|folder| *folder == runtime_folder())
+            && first_folder("RUNTIME_DIRECTORY").is_none()
+        {
+            let _ = std::fs::remove_dir(folder);
         }
     }
 }

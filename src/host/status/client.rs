@@ -66,11 +66,12 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
 
 /// Explains why there is no document, and names the remedy.
 pub fn explain(path: &Path, error: &io::Error) -> String {
+    let option = if path == standard_path() { String::new() } else { format!(" --status {}", path.display()) };
     let path = path.display();
     match error.kind() {
         ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-            "{path}: no daemon listens there; start one with \"packwatch run -c FILE --status {path}\", or name its \
-             socket with --socket"
+            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or name its socket with \
+             --socket"
         ),
         ErrorKind::PermissionDenied => format!("{path}: only root may read the service's folder; try sudo"),
         ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: no document in time"),

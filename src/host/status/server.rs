@@ -15,7 +15,7 @@ use tokio::time::{Instant, timeout};
 
 use super::counters::ClientCounts;
 use super::document::StatusDocument;
-use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, standard_path, stream_path};
+use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, daemon_path, stream_path};
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
@@ -71,7 +71,7 @@ impl StatusServer {
     /// # Errors
     /// When another daemon uses them, or a requested one cannot be created.
     pub fn start(setting: &PlaceSetting) -> Result<Option<Self>, String> {
-        let Some((path, is_needed)) = setting.resolve(|| (standard_path(), false)) else { return Ok(None) };
+        let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match Self::open(path.clone(), Limits { max_silence: MAX_SILENCE, stale: STALE }) {
             Ok(server) => {
                 tracing::info!(path = %path.display(), "status socket open");

@@ -144,10 +144,10 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a time with the precision of the step.
+/// Formats a time with the precision of the step; midnight is the day that begins.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
-    let part = if step >= DAY {
+    let part = if step >= DAY || (step >= MINUTE && time_s.rem_euclid(DAY) == 0.0) {
         5..10
     } else if step >= MINUTE {
         11..16
@@ -184,6 +184,7 @@ mod tests {
         let start = 1_207_141_697.0; // 2008-04-02T13:08:17Z
         assert_eq!(words(&axis.ticks((start, start + 6.0 * HOUR), 6.0))[..2], ["14:00", "15:00"]);
         assert_eq!(words(&axis.ticks((start, start + 50.0 * DAY), 5.0))[0], "04-11");
+        assert_eq!(words(&axis.ticks((start, start + 2.0 * DAY), 5.0)), ["04-03", "12:00", "04-04", "12:00"]);
         assert_eq!(words(&axis.ticks((start, start + 400.0 * DAY), 5.0)), ["2008-07", "2008-10", "2009-01", "2009-04"]);
         assert_eq!(words(&axis.ticks((start, start + 4000.0 * DAY), 6.0))[..2], ["2010", "2012"]);
     }

@@ -2,6 +2,8 @@
 //!
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
+use std::collections::BTreeSet;
+
 use super::trace::Trace;
 
 use crate::fields::Fields;
@@ -94,6 +96,8 @@ pub struct Data {
     /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
+    /// Cells whose estimate is not trusted at the end.
+    pub(super) untrusted: BTreeSet<usize>,
     /// Offset of the current sensor, A: mean and standard deviation.
     pub(super) current_offset: Option<(f64, f64)>,
     first_s: f64,
@@ -111,6 +115,7 @@ impl Data {
             alarms: Vec::new(),
             incidents: Vec::new(),
             trace: Trace::default(),
+            untrusted: BTreeSet::new(),
             current_offset: None,
             first_s: f64::INFINITY,
             last_s: f64::NEG_INFINITY,
@@ -234,6 +239,13 @@ impl Data {
     }
 
     fn take_incident(&mut self, time_s: f64, kind: &EventKind) {
+        if let EventKind::Trust { cell, trusted, .. } = *kind {
+            if trusted {
+                self.untrusted.remove(&cell.index())
+            } else {
+                self.untrusted.insert(cell.index())
+            };
+        }
         let number = |cell: CellIndex| cell.index() + 1;
         let what = match *kind {
             EventKind::FilterReset { cell } => format!("filter of cell {} started again", number(cell)),
@@ -259,6 +271,7 @@ impl Data {
         self.halves.clear();
         self.learned.clear();
         self.recharges.clear();
+        self.untrusted.clear();
     }
 
     /// Adds an estimate of a replay.

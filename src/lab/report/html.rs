@@ -5,12 +5,15 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::pictures::{self, NOT_STORED};
-use super::{forecast, model, summary};
+use super::{forecast, model, raised, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 
 /// Most rows of a table; the pictures and `packwatch history` show all.
 const MAX_ROWS: usize = 200;
+
+/// The section that the alarms follow.
+const ALARMS_AFTER: &str = "temperature";
 
 /// A section of the page.
 struct Section {
@@ -77,8 +80,8 @@ const SECTIONS: [Section; 8] = [
         id: "model",
         title: "How well do I know this battery",
         pictures: &["model_curve", "model_resistance", "model_temperature", "model_soc_error"],
-        note: "The model with which voltages are read as a state of charge. Bands hold a cell of this kind 95 % of the time; every \
-               \u{b1} is one standard deviation. Dashed lines were not measured.",
+        note: "The model with which voltages are read as a state of charge. Bands hold a cell of this kind 95 % of the time. \
+               Dashed lines were not measured.",
         none: |_| "unknown: make this report again with the configuration (-c), which names the cells",
     },
     Section {
@@ -111,7 +114,7 @@ pub fn page(data: &Data, context: &PageContext<'_>) -> String {
                         (self::section(section, data, &pictures))
                         @match section.id {
                             "capacity" => { (forecast_note(data, &outlook)) }
-                            "temperature" => { (alarms(data, &pictures)) }
+                            ALARMS_AFTER => { (alarms(data, context, outlook.as_ref().ok(), &pictures)) }
                             "model" => { (knowledge(data, context)) }
                             "estimator" => { (estimator(data)) }
                             _ => {}
@@ -140,17 +143,22 @@ fn head(title: &str) -> Markup {
 }
 
 fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
+    let pack = data.source.pack.map_or_else(String::new, |pack| format!("pack {pack} of this history, "));
     let cells = match data.cells() {
         0 => "cells unknown".to_owned(),
         1 => "one cell".to_owned(),
         cells => format!("{cells} cells"),
     };
-    let links = SECTIONS.iter().map(|section| (section.id, section.title));
+    // In the order of the page.
+    let links = SECTIONS.iter().flat_map(|section| {
+        let alarms = (section.id == ALARMS_AFTER).then_some(("alarms", "Alarms"));
+        [Some((section.id, section.title)), alarms].into_iter().flatten()
+    });
     html! {
         h1 { (context.title) }
-        p.soft { "Battery report, " (cells) ", " (span(data)) }
+        p.soft { "Battery report, " (pack) (cells) ", " (span(data)) ". Every \u{b1} is one standard deviation." }
         nav {
-            @for (id, title) in links.chain([("alarms", "Alarms"), ("origin", "Origin")]) {
+            @for (id, title) in links.chain([("origin", "Origin")]) {
                 a href={ "#" (id) } { (title) }
             }
         }
@@ -160,8 +168,7 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
 /// First and last time of the data, and their distance.
 fn span(data: &Data) -> String {
     let Some((first_s, last_s)) = data.ends_s() else { return "there is no record".to_owned() };
-    let days = (last_s - first_s) / 86_400.0;
-    let long = if days >= 2.0 { format!("{days:.0} days") } else { format!("{:.1} h", 24.0 * days) };
+    let long = summary::length(last_s - first_s);
     match data.is_dated() {
         true => format!("{} to {} ({long})", summary::moment(data, first_s), summary::moment(data, last_s)),
         false => long,
@@ -186,6 +193,7 @@ fn verdict(summary: &summary::Summary) -> Markup {
                     div.name { (tile.name) }
                     div.value { (tile.value) }
                     div.note { (tile.note) }
+                    @if let Some(doubt) = &tile.doubt { div.doubt { (doubt) } }
                 }
             }
         }
@@ -253,7 +261,12 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
     )
 }
 
-fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
+fn alarms(
+    data: &Data,
+    context: &PageContext<'_>,
+    outlook: Option<&forecast::Outlook>,
+    pictures: &[(String, Picture)],
+) -> Markup {
     // What many cells share is one row: the alarms of a rule that change in the same second.
     let is_alike = |a: &AlarmRecord, b: &AlarmRecord| {
         let kind = |row: &AlarmRecord| (row.rule.clone(), row.severity.clone(), row.change.clone(), row.cell.is_some());
@@ -264,11 +277,15 @@ fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
         let row = &group[0];
         let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
         let when = summary::moment(data, row.time_s);
-        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row) + &more]
+        vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row, "was") + &more]
     };
     let rows = groups.iter().rev().map(row);
     let incidents = data.incidents.iter().rev();
     let incidents = incidents.map(|(time_s, what)| vec![summary::moment(data, *time_s), what.clone()]);
+    let raised = raised::raised(data);
+    let now: Vec<Vec<String>> =
+        raised::grouped(&raised).iter().map(|group| group.row(data, context, outlook)).collect();
+    let count = now.len();
     html! {
         section {
             h2 #alarms { "Alarms" }
@@ -276,6 +293,11 @@ fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
                 (figure(picture))
             } @else if data.alarms.is_empty() {
                 p.none { "no alarm was raised in this record" }
+            }
+            @if count > 0 {
+                h3 { "Raised now" }
+                (table(&["Rule", "Severity", "Of", "Since", "Value now", "Limit"], now.into_iter(), count))
+                h3 { "All changes" }
             }
             @if !data.alarms.is_empty() {
                 (table(&["When", "Rule", "Severity", "Change", "What"], rows, groups.len()))
@@ -342,7 +364,10 @@ fn estimator(data: &Data) -> Markup {
         }),
     );
     rows.extend(data.current_offset.map(|(mean, std)| {
-        ("Offset of the current sensor: reading less true current".to_owned(), format!("{mean:+.3} \u{b1} {std:.3} A"))
+        ("Offset of the current sensor: reading less true current".to_owned(), {
+            let mean = summary::without_minus_zero(format!("{mean:+.3}"));
+            format!("{mean} \u{b1} {std:.3} A")
+        })
     }));
     pairs(&rows)
 }
@@ -388,7 +413,7 @@ fn settings(config: &Config) -> Vec<(String, String)> {
     let capacity = format!("{} Ah (rated {} Ah)", model.capacity_ah, model.rated_capacity_ah);
     let mut rows = vec![
         ("Cell model".to_owned(), model.name.clone()),
-        ("Capacity of a new cell".to_owned(), capacity),
+        ("Capacity of a new cell, as the cell model assumes".to_owned(), capacity),
         ("Cells".to_owned(), config.monitor.sample.cells.to_string()),
     ];
     rows.extend(config.monitor.rules.iter().map(|rule| {

@@ -82,10 +82,11 @@ impl TimeAxis {
             return Self { axis: axis.within(first_s, last_s), zero_s: 0.0, unit_s: 1.0 };
         }
         let zero_s = data.ends_s().map_or(0.0, |ends| ends.0);
-        let (unit_s, label) = if last_s - first_s > 4.0 * 86_400.0 {
-            (86_400.0, "time since the start, days")
-        } else {
-            (3600.0, "time since the start, h")
+        let (unit_s, label) = match last_s - first_s {
+            long if long > 4.0 * 86_400.0 => (86_400.0, "time since the start, days"),
+            long if long > 4.0 * 3600.0 => (3600.0, "time since the start, h"),
+            long if long > 600.0 => (60.0, "time since the start, min"),
+            _ => (1.0, "time since the start, s"),
         };
         let axis = Axis::number(label).within((first_s - zero_s) / unit_s, (last_s - zero_s) / unit_s);
         Self { axis, zero_s, unit_s }
@@ -123,7 +124,7 @@ fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
         .map(|row| Point {
             x: clock.x(row.time_s),
             y: 0.0,
-            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, summary::words(row)),
+            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, summary::words(row, "was")),
         })
         .collect();
     (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
@@ -473,7 +474,7 @@ fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f6
         from: clock.x(from.time_s),
         to: clock.x(to_s),
         ink: ink_of(&from.severity),
-        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), summary::words(from), moment(data, to_s)),
+        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), summary::words(from, "was"), moment(data, to_s)),
     }
 }
 

@@ -1,10 +1,11 @@
 //! The summary at the top: the battery's condition, since when, what to do; "unknown" where nothing is known.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
+use super::raised::{ActiveAlarm, doubt, raised, value};
 use super::{forecast, series};
 use crate::alarm::{Rule, Severity};
 use crate::io::stamp::format_utc;
@@ -50,6 +51,8 @@ pub(super) struct Tile {
     pub(super) name: &'static str,
     pub(super) value: String,
     pub(super) note: String,
+    /// Why its estimate is not to be trusted, and whose; `None` = it is, or it is none.
+    pub(super) doubt: Option<String>,
 }
 
 /// Content of the summary.
@@ -62,18 +65,18 @@ pub(super) struct Summary {
     pub(super) tiles: Vec<Tile>,
 }
 
-/// An alarm that is raised at the end of the data.
-struct ActiveAlarm<'a> {
-    row: &'a AlarmRecord,
-    since_s: f64,
-}
-
 /// Makes the summary.
 pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
     let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
     let unknown = unknown(data, context);
+    let why = worst.or(measuring.first().copied()).map_or_else(String::new, |alarm| {
+        match value(alarm.row, data, context, outlook.as_ref().ok()) {
+            Some(now) => format!(" Now {}.", words(&AlarmRecord { value: Some(now), ..alarm.row.clone() }, "is")),
+            None => format!(" When the alarm came, {}.", words(alarm.row, "was")),
+        }
+    });
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
         Some("severe") => Condition::Act,
         Some("warning") => Condition::Plan,
@@ -85,7 +88,7 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     };
     Summary {
         verdict,
-        how: how(verdict, worst, &measuring, data, unknown),
+        how: how(verdict, worst.or(measuring.first().copied()), data, unknown, &why),
         since: since(data, &battery, &measuring),
         what: what(verdict, worst, &measuring, knows_limits(data, context)),
         tiles: tiles(data, context, outlook, &raised),
@@ -124,25 +127,11 @@ fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
     (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
 }
 
-fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
-    let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
-    for row in &data.alarms {
-        let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // The row that raised it holds the value; later rows may hold none.
-        if row.is_active {
-            last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
-        } else {
-            last.remove(&key);
-        }
-    }
-    last.into_values().collect()
-}
-
-fn rank(severity: &str) -> usize {
+pub(super) fn rank(severity: &str) -> usize {
     Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
 }
 
-fn rule(name: &str) -> Option<Rule> {
+pub(super) fn rule(name: &str) -> Option<Rule> {
     Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }
 
@@ -169,43 +158,50 @@ fn unit(name: &str) -> &'static str {
     rule(name).map_or("", |rule| rule.spec().unit.symbol())
 }
 
+/// A formatted number that is zero, without a sign.
+pub(super) fn without_minus_zero(digits: String) -> String {
+    let is_zero = digits.bytes().all(|byte| matches!(byte, b'-' | b'+' | b'0' | b'.'));
+    if is_zero { digits.trim_start_matches(['-', '+']).to_owned() } else { digits }
+}
+
+/// A length of time in a unit in which it has two digits or more: `90 s`, `45.0 min`, `6.0 h`, `3 days`.
+pub(super) fn length(seconds: f64) -> String {
+    match seconds {
+        s if s < 120.0 => format!("{s:.0} s"),
+        s if s < 7200.0 => format!("{:.1} min", s / 60.0),
+        s if s < 172_800.0 => format!("{:.1} h", s / 3600.0),
+        s => format!("{:.0} days", s / 86_400.0),
+    }
+}
+
 /// Formats a rule's value with its unit, without trailing zeros.
 pub(super) fn amount(value: f64, rule: &str) -> String {
-    let digits = format!("{value:.3}");
+    let digits = without_minus_zero(format!("{value:.3}"));
     let digits = digits.trim_end_matches('0').trim_end_matches('.');
     format!("{digits} {}", unit(rule).replace("degrees C", "\u{b0}C")).trim_end().to_owned()
 }
 
-/// "a cell's usable capacity is 1.38 Ah, limit 1.4 Ah (cell 3)".
-pub(super) fn words(row: &AlarmRecord) -> String {
+/// "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)", with the verb in its tense.
+pub(super) fn words(row: &AlarmRecord, verb: &str) -> String {
     let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
     let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
     let cell = row.cell.map_or_else(String::new, |cell| format!(" (cell {})", cell + 1));
-    format!("{} was {}, limit {}{cell}", about(&row.rule), value, limit)
+    format!("{} {verb} {value}, limit {limit}{cell}", about(&row.rule))
 }
 
-fn how(
-    verdict: Condition,
-    worst: Option<&ActiveAlarm<'_>>,
-    measuring: &[&ActiveAlarm<'_>],
-    data: &Data,
-    unknown: Option<String>,
-) -> String {
+fn how(verdict: Condition, alarm: Option<&ActiveAlarm<'_>>, data: &Data, unknown: Option<String>, why: &str) -> String {
     let head = match verdict {
         Condition::Good => "Good: no limit is passed.",
-        Condition::Watch if worst.is_none() && measuring.is_empty() => {
-            "No limit is passed, but the capacity is below that of the end of life."
+        Condition::Watch if alarm.is_none() => "No limit is passed, but the capacity is below that of the end of life.",
+        Condition::Watch if alarm.is_some_and(|alarm| !is_of_battery(&alarm.row.rule)) => {
+            "The battery passes no limit, but its measurements are faulty."
         }
-        Condition::Watch if worst.is_none() => "The battery passes no limit, but its measurements are faulty.",
         Condition::Watch => "Worth watching.",
         Condition::Plan => "Worn: plan a visit to the workshop.",
         Condition::Act => "Past its limit: act now.",
         Condition::Unknown => unknown.as_deref().unwrap_or("Unknown."),
     };
-    let why = worst
-        .or(measuring.first().copied())
-        .map_or(String::new(), |raised| format!(" When the alarm came, {}.", words(raised.row)));
     let lost = data.trace.health().coverage().filter(|share| *share < 0.8);
     let doubt = lost.map_or(String::new(), |_| {
         " The estimator's intervals are too narrow (see its health below): use the figures with care.".to_owned()
@@ -215,13 +211,13 @@ fn how(
     format!("{head}{why}{doubt}{changed}")
 }
 
-/// Formats a time: a date, or hours after the start.
+/// Formats a time: a date, or the time after the start.
 pub(super) fn moment(data: &Data, time_s: f64) -> String {
     if data.is_dated() {
         format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")
     } else {
-        let after_h = data.ends_s().map_or(0.0, |(first_s, _)| time_s - first_s) / 3600.0;
-        format!("{after_h:.1} h after the start of the record")
+        let after_s = data.ends_s().map_or(0.0, |(first_s, _)| time_s - first_s);
+        format!("{} after the start of the record", length(after_s))
     }
 }
 
@@ -232,7 +228,7 @@ fn since(data: &Data, battery: &[&ActiveAlarm<'_>], measuring: &[&ActiveAlarm<'_
         (None, Some((first, last))) if data.is_dated() => {
             format!("No alarm is raised. Watched from {} to {}.", moment(data, first), moment(data, last))
         }
-        (None, Some((first, last))) => format!("No alarm is raised. Watched for {:.1} h.", (last - first) / 3600.0),
+        (None, Some((first, last))) => format!("No alarm is raised. Watched for {}.", length(last - first)),
         (None, None) => "Unknown: there is no record.".to_owned(),
     }
 }
@@ -273,7 +269,7 @@ fn what(
 }
 
 fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> Tile {
-    Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into() }
+    Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into(), doubt: None }
 }
 
 fn tiles(
@@ -293,14 +289,15 @@ fn tiles(
     let health_note = match (rated_ah, capacity) {
         (None, _) => "rated capacity not known without -c".to_owned(),
         (Some(_), None) => "no capacity learned yet".to_owned(),
-        (Some(rated), Some(step)) => format!("of {rated} Ah rated{}", of_cell(&step)),
+        (Some(rated), Some(step)) => format!("of {rated} Ah rated{}{}", of_cell(&step), assumed(data, step.cell)),
     };
     let note = |step: Option<series::CellStep>, none: &str| {
-        let std =
-            |step: series::CellStep| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
+        let std = |step: series::CellStep| {
+            format!("\u{b1} {:.3}{}{}", step.worst.1, of_cell(&step), assumed(data, step.cell))
+        };
         step.map_or_else(|| none.to_owned(), std)
     };
-    vec![
+    let mut estimates = vec![
         tile("State of health", health, health_note),
         tile("Capacity", capacity.as_ref().map(figure), note(capacity, "no capacity learned yet")),
         tile("Usable capacity", usable.as_ref().map(figure), note(usable, "no load configured, or none learned yet")),
@@ -316,13 +313,25 @@ fn tiles(
             outlook.as_ref().ok().map(Outlook::value),
             outlook.as_ref().map_or_else(Clone::clone, |outlook| outlook.note(data.cells())),
         ),
+    ];
+    // The worst of all cells: one that is not trusted may be it.
+    let doubt = doubt(data, raised);
+    estimates.iter_mut().filter(|tile| tile.value != "unknown").for_each(|tile| tile.doubt.clone_from(&doubt));
+    estimates.extend([
         tile(
             "Use so far",
             series::full_cycles(data, rated_ah).map(|cycles| format!("{cycles:.0} cycles")),
             "equivalent full cycles in this record",
         ),
         tile("Alarms raised now", Some(raised.len().to_string()), format!("{} entries in all", data.alarms.len())),
-    ]
+    ]);
+    estimates
+}
+
+/// Marks a capacity that no half-cycle of the cell has measured: it is what was configured, as it has aged since.
+fn assumed(data: &Data, cell: usize) -> &'static str {
+    let is_measured = data.learned.iter().any(|row| row.cell == cell && row.measured_ah.is_some());
+    if is_measured { "" } else { "; assumed, not measured yet" }
 }
 
 /// Returns the tile of the cell that has lost most lithium.
@@ -443,5 +452,32 @@ mod tests {
         let summary = summary(vec![alarm(1.0, "input_missing", "severe", true)]);
         assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.what.contains("Check sensors"), "{}", summary.what);
+    }
+
+    #[test]
+    fn the_headline_has_the_value_of_now_and_cards_their_doubt_and_assumption() {
+        let mut data = Data::new(Origin::Replay);
+        data.alarms = vec![alarm(1.7e9, "usable_capacity_low", "severe", true)];
+        data.learned = vec![CapacityRecord { usable_ah: Some((0.9, 0.01)), ..learned(1.71e9, 2, Some(1.0)) }];
+        let of = |data: &Data| of(data, &PageContext::default(), &Err("too little".into()));
+        let said = of(&data);
+        assert_eq!(said.how, "Past its limit: act now. Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 3).");
+        let capacity = |summary: &Summary| summary.tiles.iter().find(|tile| tile.name == "Capacity").cloned().unwrap();
+        assert_eq!((capacity(&said).note.as_str(), capacity(&said).doubt), ("\u{b1} 0.010, cell 3", None));
+        data.learned = vec![learned(1.71e9, 2, None)];
+        data.untrusted.insert(2);
+        let doubted = capacity(&of(&data));
+        assert_eq!(doubted.note, "\u{b1} 0.010, cell 3; assumed, not measured yet");
+        assert_eq!(doubted.doubt.as_deref(), Some("not trusted: cell 3"));
+        let unmarked = of(&data).tiles.into_iter().filter(|tile| tile.doubt.is_none() && tile.value != "unknown");
+        assert_eq!(unmarked.map(|tile| tile.name).collect::<Vec<_>>(), ["Use so far", "Alarms raised now"]);
+    }
+
+    #[test]
+    fn short_times_have_seconds_and_no_number_is_minus_zero() {
+        assert_eq!([42.0, 600.0, 36_000.0, 1e6].map(length), ["42 s", "10.0 min", "10.0 h", "12 days"]);
+        assert_eq!(amount(-0.0001, "capacity_low"), "0 Ah");
+        assert_eq!(without_minus_zero("-0.000".to_owned()), "0.000");
+        assert_eq!(without_minus_zero("-0.010".to_owned()), "-0.010");
     }
 }

@@ -62,6 +62,24 @@ fn a_failing_store_and_late_estimates_are_shown() {
 }
 
 #[test]
+fn cells_that_differ_by_less_than_their_sensors_are_no_outliers() {
+    let mut document = sample(96);
+    for cell in &mut document.cells {
+        (cell.voltage_v, cell.soc, cell.temperature_c) = (Some(3.7), Some(0.5), Some(25.0));
+        (cell.capacity_ah, cell.resistance_ratio, cell.trusted) = (Some(2.4), Some(1.0), Some(true));
+    }
+    document.cells[7].voltage_v = Some(3.709);
+    document.cells[8].soc = Some(0.508);
+    document.cells[9].temperature_c = Some(26.5);
+    document.cells[10].capacity_ah = Some(2.38);
+    document.cells[11].resistance_ratio = Some(1.04);
+    assert!(table(&document, false).contains("no outliers"), "{}", table(&document, false));
+    document.cells[7].voltage_v = Some(3.711);
+    let text = table(&document, false);
+    assert!(text.contains("outliers (--cells lists all):\n") && text.contains("\n   8  3.711 V"), "{text}");
+}
+
+#[test]
 fn of_many_cells_only_the_outliers_are_listed() {
     let mut document = sample(96);
     document.cells[40].soc = Some(0.1);

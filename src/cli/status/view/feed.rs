@@ -13,6 +13,7 @@ use super::app::FeedUpdate;
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 use crate::status::client::{check_length, explain, parse};
+use crate::status::stream_path;
 
 /// Pause before a reconnection.
 const RETRY: Duration = Duration::from_secs(1);
@@ -24,7 +25,8 @@ pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Starts reading the socket at `path`.
+/// Starts reading the stream beside the status socket at `path`; faults name the status socket, which is what `--status` and `--socket`
+/// name.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     // One is drawn while the next is read.
     let (updates, received) = mpsc::channel(1);
@@ -43,7 +45,7 @@ pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
 /// Reads until the connection fails (`Err`) or the view has ended.
 async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
     let failed = |error: io::Error| explain(path, &error);
-    let mut stream = UnixStream::connect(path).await.map_err(failed)?;
+    let mut stream = UnixStream::connect(stream_path(path)).await.map_err(failed)?;
     let mut unread = Vec::new();
     loop {
         let read = timeout(SILENCE, stream.read_buf(&mut unread)).await;

@@ -8,6 +8,7 @@ use ratatui::widgets::{Block, Paragraph, Sparkline};
 use serde_json::Value;
 
 use super::app::{App, Page, Quantity};
+use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
 use crate::cli::alarm_groups::{AlarmGroup, grouped};
@@ -20,6 +21,8 @@ use crate::status::document::StatusDocument;
 const LABEL: usize = 5;
 /// Lines of the list of cells and of the plot below the map that are always there.
 const LIST_LINES: usize = 4;
+/// Least range of the bars of SOC: smaller differences are not of interest.
+const LEAST_SOC_RANGE: f64 = 0.05;
 /// Height of the chosen cell's plot, its title included.
 const PLOT_LINES: usize = 5;
 
@@ -84,10 +87,12 @@ fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: u
     let cells = &document.cells;
     let known = ValueRange::of(cells.iter().filter_map(|cell| app.quantity.of(cell)));
     let (title, scale) = match (app.quantity, known) {
-        (Quantity::Soc, Some(known)) => (
-            format!("SOC {:.1} to {:.1} %, bars from 0 to 100 %", 100.0 * known.least, 100.0 * known.greatest),
-            Some(ValueRange { least: 0.0, greatest: 1.0 }),
-        ),
+        (Quantity::Soc, Some(known)) => {
+            let bars = known.at_least(LEAST_SOC_RANGE);
+            let [least, greatest, from, to] =
+                [known.least, known.greatest, bars.least, bars.greatest].map(|soc| 100.0 * soc);
+            (format!("SOC {least:.1} to {greatest:.1} %, bars from {from:.1} to {to:.1} %"), Some(bars))
+        }
         (Quantity::Voltage, Some(known)) => {
             (format!("voltage, bars from {:.3} to {:.3} V", known.least, known.greatest), Some(known))
         }
@@ -274,27 +279,16 @@ fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
 
 /// Newest first.
 fn events(document: &StatusDocument) -> Vec<Line<'static>> {
-    let mut text: Vec<Line<'_>> = document.events.iter().rev().map(|event| Line::from(event_line(event))).collect();
+    let mut text: Vec<Line<'_>> =
+        document.events.iter().rev().map(|event| Line::from(event_line(event, document))).collect();
     if text.is_empty() {
         text.push(Line::from("no event yet"));
     }
     text
 }
 
-fn event_line(event: &Value) -> String {
+fn event_line(event: &Value, document: &StatusDocument) -> String {
     let Value::Object(keys) = event else { return event.to_string() };
     let time = keys.get("time").and_then(Value::as_i64).map(Timestamp::from_nanos);
-    let name = keys.get("event").and_then(Value::as_str).unwrap_or("?");
-    let mut line = format!("{} {name}", time.map_or_else(|| "?".to_owned(), clock));
-    for (key, value) in keys.iter().filter(|(key, _)| !matches!(key.as_str(), "time" | "event")) {
-        let value = match value {
-            Value::String(word) => word.clone(),
-            // Cells count from 1 on the screen.
-            Value::Number(cell) if key == "cell" => (cell.as_u64().unwrap_or(0) + 1).to_string(),
-            Value::Number(number) if number.is_f64() => format!("{:.4}", number.as_f64().unwrap_or(f64::NAN)),
-            other => other.to_string(),
-        };
-        line.push_str(&format!(" {key} {value}"));
-    }
-    line
+    format!("{} {}", time.map_or_else(|| "?".to_owned(), clock), event_words::words(keys, document))
 }

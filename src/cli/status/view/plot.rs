@@ -37,6 +37,12 @@ impl ValueRange {
         })
     }
 
+    /// A range of at least this width around the same middle.
+    pub(super) fn at_least(self, width: f64) -> Self {
+        let room = (0.5 * (width - (self.greatest - self.least))).max(0.0);
+        Self { least: self.least - room, greatest: self.greatest + room }
+    }
+
     /// Where a value is between them, 0 to 1; all alike are in the middle.
     pub(super) fn share(&self, value: f64) -> Option<f64> {
         let range = self.greatest - self.least;

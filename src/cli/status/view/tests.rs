@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 use crate::status::document::StatusDocument;
 
 fn app() -> App {
-    App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)
+    App::new(PathBuf::from("/run/packwatch/status.sock"), true)
 }
 
 /// A pack that was watched for so many seconds.
@@ -89,8 +89,8 @@ fn screens_of_the_other_pages() {
 fn screens_without_a_daemon() {
     check("waiting_80x24", &mut app(), SMALL);
     let mut app = watched(96, 3);
-    app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
-    app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
+    app.handle_update(FeedUpdate::Lost("/run/packwatch/status.sock: no daemon listens there".to_owned()));
+    app.handle_update(FeedUpdate::Lost("/run/packwatch/status.sock: no daemon listens there".to_owned()));
     check("lost_80x24", &mut app, SMALL);
     // No stale value is on the screen.
     assert!(!drawn(&mut app, LARGE).to_string().contains("SOC"));

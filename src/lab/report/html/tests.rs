@@ -140,3 +140,19 @@ fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everythin
     assert!(!page.contains("class=\"none\""), "a part has no picture");
     assert!(!page.contains("NaN") && !page.contains("inf\""), "a number that is none");
 }
+
+#[test]
+fn the_menu_has_the_order_of_the_page() {
+    let page = page(&Data::new(Origin::Replay), &PageContext::default());
+    let menu: Vec<&str> = page.split("<a href=\"#").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    let headings = page.split("<h2").skip(1).filter_map(|rest| rest.split("id=\"").nth(1)?.split('"').next());
+    assert_eq!(menu, headings.collect::<Vec<_>>());
+    assert!(menu.len() == SECTIONS.len() + 2 && menu.contains(&"alarms"), "{menu:?}");
+}
+
+#[test]
+fn the_pack_of_a_history_stands_under_the_title() {
+    let mut data = Data::new(Origin::Store);
+    data.source.pack = Some(3);
+    assert!(page(&data, &PageContext::default()).contains("pack 3 of this history"));
+}

@@ -1,0 +1,4 @@
+//! Fuzz target of the door `dbc`.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| packwatch_fuzz::doors::door("dbc")(data));

@@ -1,0 +1,4 @@
+//! Fuzz target of the door `table`.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| packwatch_fuzz::doors::door("table")(data));

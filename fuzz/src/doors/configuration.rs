@@ -1,0 +1,101 @@
+//! Configurations and cell models: what is accepted runs and accepts its own stored state.
+
+use packwatch::config::Config;
+use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};
+
+use super::core::records;
+use super::source::Source;
+use super::world::{self, CELL, DBC, PACK};
+
+const REFERENCE: &str = include_str!("../../../config/REFERENCE.md");
+
+/// Tables and keys that the reference page lists with a number.
+fn keys() -> &'static [(&'static str, &'static str)] {
+    static KEYS: std::sync::OnceLock<Vec<(&str, &str)>> = std::sync::OnceLock::new();
+    KEYS.get_or_init(|| {
+        let (mut keys, mut table) = (Vec::new(), "");
+        for line in REFERENCE.lines() {
+            if let Some(name) = line.strip_prefix("## `[").and_then(|rest| rest.split(']').next()) {
+                table = name.trim_start_matches('[');
+            }
+            let mut parts = line.split('|').map(str::trim);
+            let (Some(""), Some(name), Some(value)) = (parts.next(), parts.next(), parts.next()) else { continue };
+            if value.contains("number") && !table.is_empty() {
+                keys.push((table, name.trim_matches('`')));
+            }
+        }
+        keys
+    })
+}
+
+/// The base with numbers of any size in some keys.
+fn drawn(source: &mut Source<'_>) -> Vec<u8> {
+    let mut text = PACK.to_owned();
+    for _ in 0..=source.byte() % 6 {
+        let (table, name) = keys()[usize::from(source.u16()) % keys().len()];
+        let number = source.number();
+        let number = if number.is_nan() {
+            "nan".to_owned()
+        } else if source.byte().is_multiple_of(2) {
+            format!("{number:e}")
+        } else {
+            format!("{}", number.trunc())
+        };
+        let header = format!("[{table}]\n");
+        match text.find(&header) {
+            Some(at) => text.insert_str(at + header.len(), &format!("{name} = {number}\n")),
+            None => text += &format!("{header}{name} = {number}\n"),
+        }
+    }
+    text.into_bytes()
+}
+
+/// TOML of any kind, and numbers of any size.
+pub fn configuration(data: &[u8]) {
+    let mut source = Source::new(data);
+    let pack = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { drawn(&mut source) };
+    if let Ok(config) = world::load(&pack, DBC, CELL.as_bytes()) {
+        use_it(&config);
+    }
+}
+
+/// A cell model with changed numbers or of any kind.
+pub fn cell_model(data: &[u8]) {
+    let mut source = Source::new(data);
+    let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };
+    if let Ok(config) = world::load(PACK.as_bytes(), DBC, &model) {
+        use_it(&config);
+    }
+}
+
+fn changed(source: &mut Source<'_>) -> Vec<u8> {
+    let mut text = CELL.to_owned();
+    for _ in 0..=source.byte() % 6 {
+        let starts: Vec<usize> = text
+            .char_indices()
+            .filter(|(at, character)| character.is_ascii_digit() && text[..*at].ends_with([' ', '[', ',', '=', '-']))
+            .map(|(at, _)| at)
+            .collect();
+        let from = starts[usize::from(source.u16()) % starts.len()];
+        let length =
+            text[from..].find(|c: char| !(c.is_ascii_digit() || matches!(c, '.' | 'e' | '-' | '+' | '_'))).unwrap_or(1);
+        let number = source.number();
+        text.replace_range(from..from + length, &format!("{number:e}"));
+    }
+    text.into_bytes()
+}
+
+/// A short drive, and the state after it.
+fn use_it(config: &Config) {
+    const DRIVE: &[u8] = &[7, 0xE8, 3, 0, 20, 6, 20, 7, 0x18, 0xFC, 6, 20];
+    let mut monitor = Monitor::new(config.monitor.clone());
+    let mut out = Outputs { want_estimates: true, ..Outputs::default() };
+    for record in records(&mut Source::new(DRIVE)).iter().take(200) {
+        out.clear();
+        monitor.handle(record.input(), &mut out);
+    }
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
+    let accepted = Monitor::new(config.monitor.clone()).restore(snapshot, Downtime::AsStamped);
+    assert!(accepted.is_ok() || !super::is_strict(), "its own state is refused: {accepted:?}");
+}

@@ -1,0 +1,313 @@
+//! The core: a small vehicle whose driver, faults, testers and attackers follow from the bytes, for up to some thousand inputs.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use packwatch::alarm::{Change, Rule, Selector};
+use packwatch::can::e2e::{Profile, Protection};
+use packwatch::can::encode::InputEncoder;
+use packwatch::can::{CanId, Frame};
+use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Monitor, Outputs, Snapshot};
+use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
+
+use super::source::Source;
+use super::world;
+
+/// Most inputs of one execution: some 50 ms of work.
+const MAX_INPUTS: usize = 3000;
+/// Most outputs of one input: the largest pack of the configuration has two cells and eleven rules.
+const MAX_OUTPUTS: usize = 2000;
+/// Inputs of all executions of this process, for tests/fuzz.
+static INPUTS: AtomicU64 = AtomicU64::new(0);
+/// Inputs between two lines about their number.
+const REPORT_EVERY: u64 = 1_000_000;
+const BUS: BusIndex = BusIndex(0);
+/// Identifiers that the configuration sends: output messages and diagnostic requests.
+const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
+/// Address of the J1939 node, and that of a node which has none.
+const OWN_ADDRESSES: [u32; 2] = [249, 254];
+const MS: i64 = 1_000_000;
+
+/// An input that owns its frame.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Record {
+    Frame(Timestamp, Frame),
+    Other(Input<'static>),
+}
+
+impl Record {
+    pub(super) fn input(&self) -> Input<'_> {
+        match self {
+            Self::Frame(time, frame) => Input::Frame { time: *time, bus: BUS, frame },
+            Self::Other(input) => *input,
+        }
+    }
+}
+
+/// Frames, gaps and commands in; a second run must give the same.
+pub fn core(data: &[u8]) {
+    let mut source = Source::new(data);
+    let is_repeated = source.byte().is_multiple_of(8);
+    let records = records(&mut source);
+    let first = run(&records, &[], true);
+    if is_repeated {
+        assert!(first == run(&records, &[], false), "a second run gives other outputs");
+    }
+}
+
+/// The same with snapshots that are taken and restored after every so many inputs.
+pub fn cuts(data: &[u8]) {
+    let mut source = Source::new(data);
+    let steps = [1 + usize::from(source.byte()), 1 + usize::from(source.byte())];
+    let records = records(&mut source);
+    run(&records, &steps, true);
+}
+
+/// Runs the inputs through a monitor, checks its outputs and digests them.
+fn run(records: &[Record], cut_after: &[usize], is_checked: bool) -> u64 {
+    let config = &world::config().monitor;
+    let mut monitor = Monitor::new(config.clone());
+    let mut out = Outputs { want_estimates: true, ..Outputs::default() };
+    let (mut digest, mut until_cut, mut cuts) = (0xCBF2_9CE4_8422_2325, cut_after.first().copied(), 0);
+    for record in records {
+        out.clear();
+        monitor.handle(record.input(), &mut out);
+        if is_checked {
+            check(record, &out);
+        }
+        for byte in out.frames.iter().flat_map(|sent| sent.frame.data()) {
+            digest = (digest ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01B3);
+        }
+        for estimate in &out.estimates {
+            digest = (digest ^ estimate.soc.to_bits() ^ estimate.capacity_ah.to_bits()).wrapping_mul(0x0100_0000_01B3);
+        }
+        digest = digest.wrapping_add(out.events.len() as u64);
+        until_cut = until_cut.map(|left| left.saturating_sub(1));
+        if until_cut == Some(0) {
+            cuts += 1;
+            until_cut = Some(cut_after[cuts % cut_after.len()]);
+            monitor = restored(&monitor);
+        }
+    }
+    let count = records.len() as u64;
+    let before = INPUTS.fetch_add(count, Ordering::Relaxed);
+    if (before + count) / REPORT_EVERY > before / REPORT_EVERY {
+        eprintln!("inputs of the core: {}", before + count);
+    }
+    digest
+}
+
+/// A monitor that continues from the state of another, through its stored form.
+fn restored(monitor: &Monitor) -> Monitor {
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
+    let mut restored = Monitor::new(world::config().monitor.clone());
+    restored.restore(snapshot, Downtime::AsStamped).expect("its own state is accepted");
+    restored
+}
+
+pub(super) fn check(record: &Record, out: &Outputs) {
+    assert!(out.frames.len() + out.events.len() + out.estimates.len() < MAX_OUTPUTS, "{record:?}: too many outputs");
+    for sent in &out.frames {
+        let is_own = match sent.frame.id() {
+            CanId::Standard(id) => OWN.contains(&id),
+            CanId::Extended(id) => OWN_ADDRESSES.contains(&(id & 0xFF)),
+        };
+        assert!(is_own, "{record:?} sends a foreign identifier: {:?}", sent.frame);
+    }
+    for e in &out.estimates {
+        let numbers = [e.soc, e.soc_std, e.capacity_ah, e.capacity_std_ah, e.resistance_ratio, e.resistance_ratio_std];
+        assert!(numbers.iter().all(|number| number.is_finite()), "{record:?}: {e:?}");
+        assert!(e.soc_std >= 0.0 && e.capacity_std_ah >= 0.0 && e.resistance_ratio_std >= 0.0, "{record:?}: {e:?}");
+    }
+    let is_asked = out.events.iter().any(|event| {
+        use EventKind::{Command, PackIdentity, PackReplaced, PackReturned};
+        matches!(event.kind, Command { .. } | PackIdentity { .. } | PackReplaced { .. } | PackReturned { .. })
+    });
+    for event in &out.events {
+        if let EventKind::Alarm { change: Change::Cleared, value: None, .. } = event.kind {
+            assert!(is_asked, "{record:?}: an unknown value cleared an alarm: {event:?}");
+        }
+    }
+}
+
+/// The vehicle at one moment.
+struct Vehicle {
+    encoder: InputEncoder,
+    now_ns: i64,
+    counter: u8,
+    command_counter: u8,
+    current_a: f64,
+    soc: f64,
+    temperature_c: f64,
+    offset_v: f64,
+    identity: f64,
+    contactor: f64,
+    records: Vec<Record>,
+}
+
+/// The inputs that the bytes stand for.
+pub(super) fn records(source: &mut Source<'_>) -> Vec<Record> {
+    let mut vehicle = Vehicle {
+        encoder: InputEncoder::new(&world::config().monitor.input),
+        now_ns: 1_700_000_000_000 * MS,
+        counter: 0,
+        command_counter: 0,
+        current_a: 0.0,
+        soc: 0.7,
+        temperature_c: 25.0,
+        offset_v: 0.0,
+        identity: 7.0,
+        contactor: 1.0,
+        records: Vec::new(),
+    };
+    while !source.is_empty() && vehicle.records.len() < MAX_INPUTS {
+        vehicle.act(source);
+    }
+    vehicle.records.truncate(MAX_INPUTS);
+    vehicle.records
+}
+
+impl Vehicle {
+    fn push(&mut self, input: Input<'static>) {
+        self.records.push(Record::Other(input));
+    }
+
+    fn frame(&mut self, id: CanId, data: &[u8]) {
+        if let Some(frame) = Frame::classic(id, data) {
+            self.records.push(Record::Frame(Timestamp::from_nanos(self.now_ns), frame));
+        }
+    }
+
+    fn act(&mut self, source: &mut Source<'_>) {
+        let (time, bus) = (Timestamp::from_nanos(self.now_ns), BUS);
+        match source.byte() % 24 {
+            0..=5 => (0..=source.byte() % 32).for_each(|_| self.drive(100 * MS)),
+            6 => (0..=source.byte() % 32).for_each(|_| self.drive(1000 * MS)),
+            7 => self.current_a = f64::from(source.i16()) / 1000.0,
+            8 => self.temperature_c = f64::from(source.byte()) - 50.0,
+            9 => self.offset_v = f64::from(source.i16()) / 20_000.0,
+            10 => {
+                let id = source.one_of(&[0x100, 0x101, 0x110, 0x6B3, 0x6B0, 0x7BB, 0x79B, 0x7DF]);
+                let (length, data) = (source.byte() % 9, source.array::<8>());
+                self.frame(CanId::Standard(id), &data[..usize::from(length)]);
+            }
+            11 => {
+                let data = source.array();
+                self.protected(Profile::P01A, 0x0123, data);
+            }
+            12 => {
+                let steps = [
+                    1,
+                    20,
+                    700,
+                    6000,
+                    90_000,
+                    3_600_000,
+                    86_400_000,
+                    10_000_000_000,
+                    -200,
+                    -4000,
+                    -3_600_000,
+                    i64::MAX / MS / 2,
+                ];
+                self.now_ns = self.now_ns.saturating_add(source.one_of(&steps) * MS);
+                self.push(Input::Tick { time: Timestamp::from_nanos(self.now_ns) });
+            }
+            13 => self.push(Input::UnknownGap { time }),
+            14 => {
+                let (rule, seconds) = (Rule::from_number(source.byte() % 16).unwrap_or(Rule::SocLow), source.number());
+                let cell = source.one_of(&[None, Some(CellIndex(0)), Some(CellIndex(1)), Some(CellIndex(900))]);
+                let which = Selector { rule: source.one_of(&[None, Some(rule)]), severity: None, cell };
+                let commands = [
+                    Command::Acknowledge(which),
+                    Command::Clear(which),
+                    Command::PackReplaced,
+                    Command::Poll { standby: true },
+                    Command::Poll { standby: false },
+                    Command::Test { rule, seconds: if seconds.is_finite() { seconds } else { 1.0 } },
+                ];
+                let command = source.one_of(&commands);
+                self.push(Input::Command { time, command });
+            }
+            15 => self.command(source),
+            16 => {
+                let count = u64::from(source.u16());
+                let class = u32::from(source.u16());
+                let event = source.one_of(&[
+                    BusEvent::Up,
+                    BusEvent::Down,
+                    BusEvent::Missing,
+                    BusEvent::Dropped { frames: count },
+                    BusEvent::Dropped { frames: u64::MAX },
+                    BusEvent::ErrorFrame { class },
+                    BusEvent::SendFailed { frames: count },
+                ]);
+                self.push(Input::Bus { time, bus, event });
+            }
+            17 => self.push(Input::Store { time, works: source.byte().is_multiple_of(2) }),
+            18 => self.identity = f64::from(source.byte() % 12),
+            19 => self.contactor = f64::from(source.byte() % 16),
+            20 => {
+                let data = source.array::<8>();
+                self.frame(CanId::Standard(0x7BB), &data);
+            }
+            21 => {
+                let (pgn, source_address, data) = (source.u16(), source.byte(), source.array::<8>());
+                let id =
+                    u32::from(pgn) << 8 | u32::from(source_address) | u32::from(source.byte() % 2) << 26 | 0x1800_0000;
+                self.frame(CanId::Extended(id & 0x1FFF_FFFF), &data[..usize::from(source.byte() % 9)]);
+            }
+            // A flood of one identifier.
+            22 => (0..u16::from(source.byte()) * 2).for_each(|_| self.frame(CanId::Standard(0x110), &[1; 8])),
+            // An answer of a controller as it is meant.
+            _ => self.frame(CanId::Standard(0x7BB), &[4, 0x61, 1, 0x20, source.byte(), 0, 0, 0]),
+        }
+    }
+
+    /// What a healthy pack sends in one period, and the tick after it.
+    fn drive(&mut self, period_ns: i64) {
+        self.soc = (self.soc - self.current_a * period_ns as f64 / 1e9 / 3600.0 / 2.6 * 10.0).clamp(0.02, 0.98);
+        let voltage_v = 3.3 + 0.8 * self.soc - 0.03 * self.current_a + self.offset_v;
+        let values = [
+            (Channel::Current, Some(self.current_a)),
+            (Channel::Temperature(SensorIndex(0)), Some(self.temperature_c)),
+            (Channel::Temperature(SensorIndex(1)), Some(25.0)),
+            (Channel::ReportedSoc, Some(self.soc)),
+            (Channel::PackIdentity, Some(self.identity)),
+            (Channel::Contactor, Some(self.contactor)),
+            (Channel::CellVoltage(CellIndex(0)), Some(voltage_v)),
+            (Channel::CellVoltage(CellIndex(1)), Some(voltage_v - 0.02)),
+        ];
+        let mut made = Vec::new();
+        self.encoder.encode(&values, &mut made);
+        for (_, frame) in made {
+            match frame.id() {
+                CanId::Standard(0x100) => {
+                    self.protected(Profile::P01A, 0x0123, frame.data().try_into().unwrap_or_default())
+                }
+                id => self.frame(id, frame.data()),
+            }
+            self.now_ns = self.now_ns.saturating_add(MS / 3);
+        }
+        self.now_ns = self.now_ns.saturating_add(period_ns);
+        self.push(Input::Tick { time: Timestamp::from_nanos(self.now_ns) });
+    }
+
+    fn protected(&mut self, profile: Profile, data_id: u16, mut payload: [u8; 8]) {
+        self.counter = profile.next_counter(self.counter);
+        Protection { profile, data_id }.protect(&mut payload, self.counter).expect("8 bytes are enough");
+        self.frame(CanId::Standard(0x100), &payload);
+    }
+
+    /// A command frame with any content and a right, repeated or wrong counter.
+    fn command(&mut self, source: &mut Source<'_>) {
+        let (profile, mut payload) = (Profile::P01A, source.array::<8>());
+        if !source.byte().is_multiple_of(4) {
+            self.command_counter = profile.next_counter(self.command_counter);
+        }
+        Protection { profile, data_id: 0x0321 }
+            .protect(&mut payload, self.command_counter)
+            .expect("8 bytes are enough");
+        self.frame(CanId::Standard(0x6B3), &payload);
+    }
+}

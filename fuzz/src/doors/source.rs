@@ -1,0 +1,71 @@
+//! Takes bytes apart into values: numbers, choices, moments. After the end everything is zero, so that any input is whole.
+
+/// The bytes that are left.
+pub(super) struct Source<'a> {
+    bytes: &'a [u8],
+}
+
+impl<'a> Source<'a> {
+    pub(super) fn new(bytes: &'a [u8]) -> Self {
+        Self { bytes }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.bytes.is_empty()
+    }
+
+    /// All that is left.
+    pub(super) fn rest(&mut self) -> &'a [u8] {
+        std::mem::take(&mut self.bytes)
+    }
+
+    pub(super) fn array<const N: usize>(&mut self) -> [u8; N] {
+        let count = N.min(self.bytes.len());
+        let (taken, rest) = self.bytes.split_at(count);
+        self.bytes = rest;
+        let mut array = [0; N];
+        array[..count].copy_from_slice(taken);
+        array
+    }
+
+    pub(super) fn byte(&mut self) -> u8 {
+        self.array::<1>()[0]
+    }
+
+    pub(super) fn u16(&mut self) -> u16 {
+        u16::from_le_bytes(self.array())
+    }
+
+    pub(super) fn i16(&mut self) -> i16 {
+        i16::from_le_bytes(self.array())
+    }
+
+    /// One of a list.
+    pub(super) fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
+        choices[usize::from(self.byte()) % choices.len()]
+    }
+
+    /// Any number: a usual one, one of any order of magnitude, or any bits.
+    pub(super) fn number(&mut self) -> f64 {
+        match self.byte() % 4 {
+            0 => f64::from(self.i16()) / 100.0,
+            1 => f64::from(self.i16()) * 10.0_f64.powi(i32::from(self.byte() % 40) - 20),
+            2 => self.one_of(&[
+                0.0,
+                -0.0,
+                1.0,
+                -1.0,
+                1e-300,
+                1e300,
+                f64::MIN_POSITIVE,
+                f64::MAX,
+                f64::INFINITY,
+                f64::NAN,
+                0.5,
+                1e-9,
+                1e9,
+            ]),
+            _ => f64::from_le_bytes(self.array()),
+        }
+    }
+}

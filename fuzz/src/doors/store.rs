@@ -1,0 +1,70 @@
+//! The store: a database with changed bytes is opened, or the reason is reported; afterwards it is written and read again.
+
+use std::path::Path;
+use std::sync::OnceLock;
+
+use packwatch::config::VehicleIdentity;
+use packwatch::io::place::PlaceSetting;
+use packwatch::monitor::{Monitor, Outputs};
+use packwatch::quantity::Timestamp;
+use packwatch::store::{HistoryQuery, HistoryReader, Store};
+
+use super::core::records;
+use super::files::folder;
+use super::source::Source;
+use super::world;
+
+/// Bytes of a drive with a half-cycle.
+const DRIVE: &[u8] = &[7, 0xE8, 3, 6, 31, 6, 31, 7, 0x18, 0xFC, 6, 31, 6, 31, 7, 0xE8, 3, 6, 31];
+
+/// The database of a daemon that has learned something.
+fn database() -> &'static [u8] {
+    static DATABASE: OnceLock<Vec<u8>> = OnceLock::new();
+    DATABASE.get_or_init(|| {
+        let folder = folder();
+        write(folder.path());
+        std::fs::read(folder.path().join("packwatch.db")).expect("a database")
+    })
+}
+
+/// Opens the store, drives and stops as a daemon does.
+fn write(path: &Path) {
+    let config = world::config();
+    let setting = PlaceSetting::At(path.to_owned());
+    let Ok((store, found)) = Store::open(&setting, &config.store, &VehicleIdentity::default()) else { return };
+    let mut monitor = Monitor::new(config.monitor.clone());
+    for state in found.states {
+        let _ = monitor.restore(state.snapshot, state.downtime);
+    }
+    let Some(mut store) = store else { return };
+    let (mut out, mut now) = (Outputs::default(), Timestamp::ZERO);
+    for record in records(&mut Source::new(DRIVE)) {
+        out.clear();
+        monitor.handle(record.input(), &mut out);
+        now = record.input().time();
+        store.learned(&out.events, &monitor, now);
+    }
+    store.finish(&monitor, now);
+}
+
+/// See the module.
+pub fn store(data: &[u8]) {
+    let mut source = Source::new(data);
+    let mut bytes = database().to_vec();
+    for _ in 0..=source.byte() % 8 {
+        let (at, length) =
+            (usize::from(source.u16()) | usize::from(source.byte()) << 16, 1 + usize::from(source.byte() % 8));
+        let at = at % bytes.len();
+        let end = (at + length).min(bytes.len());
+        bytes[at..end].iter_mut().for_each(|byte| *byte ^= source.byte());
+    }
+    if source.byte().is_multiple_of(8) {
+        bytes.truncate(usize::from(source.u16()));
+    }
+    let folder = folder();
+    std::fs::write(folder.path().join("packwatch.db"), &bytes).expect("written");
+    if let Ok(reader) = HistoryReader::open(folder.path()) {
+        let _ = (reader.verify(), reader.snapshot(), reader.entries(&HistoryQuery::default()));
+    }
+    write(folder.path());
+}

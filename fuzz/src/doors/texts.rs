@@ -1,0 +1,47 @@
+//! Texts that are taken as a whole: DBC, requests of the control socket, signal sets and BPX files.
+
+use packwatch::can::dbc::Database;
+use packwatch::control::protocol::{AlarmList, CommandOutcome, Request, contents};
+
+/// A DBC file.
+pub fn dbc(data: &[u8]) {
+    let Ok(database) = Database::parse_bytes(data) else { return };
+    let written = database.to_dbc();
+    let again = Database::parse(&written)
+        .unwrap_or_else(|error| panic!("what is written does not read back: {error}\n{written}"));
+    assert_eq!(again.to_dbc(), written, "what is written reads back as something else");
+}
+
+/// A line of a client, and of a daemon.
+pub fn control(data: &[u8]) {
+    if let Ok(request) = Request::parse(data) {
+        let line = request.to_line();
+        let again = Request::parse(line.trim_end().as_bytes());
+        assert_eq!(again.as_ref(), Ok(&request), "{line}");
+    }
+    let _ = contents::<AlarmList>(data);
+    let _ = contents::<CommandOutcome>(data);
+    if let Ok(document) = packwatch::status::client::parse(data) {
+        packwatch::status::metrics::openmetrics(Some(document));
+    }
+}
+
+/// A signal set of OBDb.
+#[cfg(feature = "lab")]
+pub fn obdb(data: &[u8]) {
+    use packwatch::lab::import::obdb::{ObdbSettings, import};
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let _ = import(text, &ObdbSettings { source: "fuzz.json".to_owned(), ..ObdbSettings::default() });
+}
+
+/// A BPX file: the model that is made of it is accepted.
+#[cfg(feature = "lab")]
+pub fn bpx(data: &[u8]) {
+    use packwatch::lab::import::bpx::{BpxSettings, import};
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let settings = BpxSettings { source: "fuzz.json".to_owned(), name: None };
+    if let Ok(made) = import(text, &settings) {
+        let read = super::files::with_file("cell.toml", made.text.as_bytes(), packwatch::config::cell_model::load);
+        assert!(read.is_ok(), "the written model is refused: {:?}\n{}", read.err(), made.text);
+    }
+}

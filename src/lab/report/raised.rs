@@ -1,0 +1,203 @@
+//! What holds at the end of the record: the alarms that are raised, with their values then, and the cells whose estimate is not
+//! trusted.
+
+use std::collections::BTreeMap;
+
+use super::context::PageContext;
+use super::data::{AlarmRecord, Data};
+use super::forecast::Outlook;
+use super::{series, summary};
+use crate::alarm::{Direction, Rule};
+use crate::health::RechargeAlarm;
+
+/// Cells that a group names; of more, their number follows.
+const MAX_NAMED: usize = 8;
+
+/// An alarm that is raised at the end of the data.
+pub(super) struct ActiveAlarm<'a> {
+    /// The row that raised it.
+    pub(super) row: &'a AlarmRecord,
+    pub(super) since_s: f64,
+}
+
+/// Raised alarms of one rule and severity.
+pub(super) struct AlarmGroup<'a> {
+    pub(super) alarms: Vec<&'a ActiveAlarm<'a>>,
+}
+
+/// The alarms that are raised at the end, one of each rule, severity and cell.
+pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
+    let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
+    for row in &data.alarms {
+        let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
+        // The row that raised it holds the value; later rows may hold none.
+        if row.is_active {
+            last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
+        } else {
+            last.remove(&key);
+        }
+    }
+    last.into_values().collect()
+}
+
+/// Groups alarms by rule and severity, the highest severity first.
+pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> {
+    let mut groups: Vec<AlarmGroup<'a>> = Vec::new();
+    for alarm in raised {
+        let is_same = |group: &&mut AlarmGroup<'a>| {
+            let first = group.alarms[0].row;
+            (&first.rule, &first.severity) == (&alarm.row.rule, &alarm.row.severity)
+        };
+        match groups.iter_mut().find(is_same) {
+            Some(group) => group.alarms.push(alarm),
+            None => groups.push(AlarmGroup { alarms: vec![alarm] }),
+        }
+    }
+    groups.sort_by_key(|group| std::cmp::Reverse(summary::rank(&group.alarms[0].row.severity)));
+    groups
+}
+
+impl AlarmGroup<'_> {
+    /// One row of a table: rule, severity, whose, since when, worst value at the end, limit.
+    pub(super) fn row(&self, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<String> {
+        let first = self.alarms[0].row;
+        let since_s = self.alarms.iter().map(|alarm| alarm.since_s).fold(f64::INFINITY, f64::min);
+        let values = self.alarms.iter().filter_map(|alarm| value(alarm.row, data, context, outlook));
+        let is_below = summary::rule(&first.rule).is_some_and(|rule| rule.spec().direction == Direction::Below);
+        let worst = values.reduce(if is_below { f64::min } else { f64::max });
+        let amount =
+            |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |v| summary::amount(v, &first.rule));
+        vec![
+            first.rule.clone(),
+            first.severity.clone(),
+            cells(self.alarms.iter().filter_map(|alarm| alarm.row.cell)),
+            summary::moment(data, since_s),
+            amount(worst),
+            amount(first.threshold),
+        ]
+    }
+}
+
+/// Numbers of cells from 1: `cell 3`, `cells 1, 2 and 94 more`, or `pack`.
+pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
+    let numbers: Vec<String> = cells.map(|cell| (cell + 1).to_string()).collect();
+    match numbers.len() {
+        0 => "pack".to_owned(),
+        1 => format!("cell {}", numbers[0]),
+        count if count <= MAX_NAMED => format!("cells {}", numbers.join(", ")),
+        count => format!("cells {} and {} more", numbers[..MAX_NAMED].join(", "), count - MAX_NAMED),
+    }
+}
+
+/// The value that an alarm judges as it is at the end of the record; `None` = the record does not keep it.
+pub(super) fn value(
+    row: &AlarmRecord,
+    data: &Data,
+    context: &PageContext<'_>,
+    outlook: Option<&Outlook>,
+) -> Option<f64> {
+    let last = |pick: series::ValueSelector, high_is_bad: bool| match row.cell {
+        Some(cell) => data.learned.iter().rev().filter(|row| row.cell == cell).find_map(|row| Some(pick(row)?.0)),
+        None => series::steps(data, pick, high_is_bad).last().map(|step| step.worst.0),
+    };
+    match summary::rule(&row.rule)? {
+        Rule::CapacityLow => last(series::capacity, false),
+        Rule::UsableCapacityLow => last(series::usable, false),
+        Rule::ResistanceHigh => last(series::resistance, true),
+        Rule::RechargePeriodLow => {
+            let is_raw = context.config.is_some_and(|it| it.monitor.health.recharge.alarm_on == RechargeAlarm::Raw);
+            let normalised = || data.recharges.iter().rev().find_map(|row| Some(row.normalised_s?.0));
+            let raw = || data.recharges.iter().rev().find_map(|row| row.raw_s);
+            if is_raw { raw() } else { normalised().or_else(raw) }
+        }
+        Rule::RemainingLifeLow => {
+            let outlook = outlook.filter(|outlook| row.cell.is_none_or(|cell| cell == outlook.cell))?;
+            outlook.life.cycles.map(|left| left.median)
+        }
+        _ => None,
+    }
+}
+
+/// Why the estimates are not to be trusted, and whose; `None` = they are.
+pub(super) fn doubt(data: &Data, raised: &[ActiveAlarm<'_>]) -> Option<String> {
+    let alarms = raised.iter().filter(|alarm| summary::rule(&alarm.row.rule) == Some(Rule::EstimateUntrusted));
+    let mut doubtful: Vec<Option<usize>> = alarms.map(|alarm| alarm.row.cell).collect();
+    doubtful.extend(data.untrusted.iter().map(|cell| Some(*cell)));
+    doubtful.sort_unstable();
+    doubtful.dedup();
+    if doubtful.is_empty() {
+        return None;
+    }
+    let named = doubtful.iter().copied().flatten();
+    Some(if data.cells() > 1 { format!("not trusted: {}", cells(named)) } else { "not trusted".to_owned() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::Origin;
+    use crate::report::data::CapacityRecord;
+
+    fn alarm(rule: &str, cell: Option<usize>) -> AlarmRecord {
+        AlarmRecord {
+            time_s: 1.7e9,
+            rule: rule.to_owned(),
+            severity: "severe".to_owned(),
+            cell,
+            change: "raised".to_owned(),
+            is_active: true,
+            value: Some(1.809),
+            threshold: Some(1.82),
+        }
+    }
+
+    fn worn(cells: usize) -> Data {
+        let mut data = Data::new(Origin::Store);
+        for cell in 0..cells {
+            data.alarms.push(alarm("capacity_low", Some(cell)));
+            data.learned.push(CapacityRecord {
+                time_s: 1.71e9,
+                cell,
+                measured_ah: Some(0.252),
+                measured_std_ah: Some(0.01),
+                capacity_ah: (0.252 + 0.1 * cell as f64, 0.01),
+                usable_ah: None,
+                losses: None,
+                resistance: (1.0, 0.1),
+            });
+        }
+        data
+    }
+
+    #[test]
+    fn the_value_is_that_of_the_end_and_not_of_the_alarm() {
+        let data = worn(2);
+        let value = |cell| value(&alarm("capacity_low", cell), &data, &PageContext::default(), None);
+        assert_eq!((value(Some(1)), value(None), value(Some(7))), (Some(0.352), Some(0.252), None));
+        let hot = alarm("temperature_high", None);
+        assert_eq!(super::value(&hot, &data, &PageContext::default(), None), None);
+    }
+
+    #[test]
+    fn alarms_that_many_cells_share_are_one_row_with_the_worst_value() {
+        let mut data = worn(96);
+        data.alarms.push(AlarmRecord { severity: "warning".to_owned(), ..alarm("recharge_period_low", None) });
+        let raised = raised(&data);
+        let groups = grouped(&raised);
+        let rows: Vec<_> = groups.iter().map(|group| group.row(&data, &PageContext::default(), None)).collect();
+        assert_eq!(rows.len(), 2);
+        assert_eq!(rows[0][0..3], ["capacity_low", "severe", "cells 1, 2, 3, 4, 5, 6, 7, 8 and 88 more"]);
+        assert_eq!(rows[0][4..], ["0.252 Ah", "1.82 Ah"]);
+        assert_eq!(rows[1][0..3], ["recharge_period_low", "warning", "pack"]);
+    }
+
+    #[test]
+    fn doubt_names_the_cells_and_ends_with_them() {
+        let mut data = worn(3);
+        assert_eq!(doubt(&data, &raised(&data)), None);
+        data.untrusted.insert(1);
+        assert_eq!(doubt(&data, &raised(&data)).as_deref(), Some("not trusted: cell 2"));
+        data.alarms.push(alarm("estimate_untrusted", Some(2)));
+        assert_eq!(doubt(&data, &raised(&data)).as_deref(), Some("not trusted: cells 2, 3"));
+    }
+}
