@@ -58,8 +58,8 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
     if held {
         // No nominal measurement moves it either.
-        text += "\n[estimator]\ncapacity_state = \"held\"\n\n[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\n\
-                 nominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
+        let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
+        text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
     }
     let path = folder.join("config.toml");
     std::fs::write(&path, text).unwrap();
