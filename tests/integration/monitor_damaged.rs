@@ -95,7 +95,7 @@ fn a_refused_state_names_the_number_and_its_range() {
     let mut rig = Rig::new("");
     let error = rig.monitor.restore(serde_json::from_value(document).unwrap(), Downtime::AsStamped).unwrap_err();
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
-    let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-40 to 1e20";
+    let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-150 to 1e20";
     assert_eq!(error.to_string(), reported);
     // Nothing of it was used: the monitor begins as a new one.
     rig.seconds(5);

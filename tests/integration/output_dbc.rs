@@ -34,8 +34,8 @@ const RULES: [(&str, f64, f64); 14] = [
     ("CellImbalance", 100.0, 1.0),
     ("RemainingLifeLow", 1.0, 5000.0),
     ("BmsDisagrees", 100.0, 1.0),
-    ("StoreFailed", 1.0, 5000.0),
-    ("BusFault", 1.0, 5000.0),
+    ("StoreFailed", 1.0, 4094.0),
+    ("BusFault", 1.0, 4094.0),
 ];
 
 /// A configuration of the matrix.

@@ -269,7 +269,7 @@ section! {
         /// Upper SOC.
         to_soc: f64, "fraction", Between(0.0, 1.0), Default("0.9");
         /// Current of the reference charger, per cell, constant over the whole window: the normalised period is the window's share of the learned capacity divided by this current. Without it: the rated capacity over 2 h (C/2).
-        reference_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional
+        reference_current_a: Option<f64>, "A", Between(1e-6, 1e6), Optional
             => reference_current_a: keys.reference_current_a.unwrap_or(rated_ah / 2.0);
         /// Part of the window that a charge must cover for a normalised period to be reported (a raw period needs all of it).
         min_coverage: f64, "fraction", Above(0.0, 1.0), Default("0.5");
