@@ -104,7 +104,7 @@ impl InvalidState {
 
     /// Rejects numbers at or near 0 as well, so that the caller can divide by the square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
-        Self::unless((1e-150..=1e20).contains(&found), what, found, "1e-150 to 1e20")
+        bounds::VARIANCE.check(what, found)
     }
 
     /// Rejects a capacity that no cell can have, Ah.

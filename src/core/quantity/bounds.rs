@@ -99,6 +99,9 @@ pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of t
 /// Most of a number without a bound of its own: its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
+/// Variance, in the square of its unit: a caller can divide by its square.
+pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
+
 /// Standard deviation or noise density of the configuration, in its unit.
 pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 

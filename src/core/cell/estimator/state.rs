@@ -86,7 +86,9 @@ impl CellState {
 fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let place = |i| place_of(i, N);
     let mean = (0..N).map(|i| x.mean[place(i)]).collect();
-    let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))]).collect();
+    // A variance that has decayed to nothing is stored as the least one.
+    let least = |i: usize| if i / N == i % N { bounds::VARIANCE.low } else { f64::NEG_INFINITY };
+    let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))].max(least(i))).collect();
     let by_constant =
         (0..N * CONSTANT_ERRORS).map(|i| x.by_constant[(place(i / CONSTANT_ERRORS), i % CONSTANT_ERRORS)]);
     (mean, covariance, by_constant.collect())
