@@ -26,8 +26,9 @@ RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
 # A new mode counts after 10 ms (min_duration_s of the configuration); the frame after that decides.
 MODE_S = 0.012
-# A half-cycle flows at little more than nothing, so that it may last seconds and still be weak; a strong one has a pulse.
-IDLE_A, PULSE_A, PULSE_S = 0.008, 20.0, 0.006
+# A half-cycle flows at little more than nothing, so that it may last a second and still be weak; its pulse makes it weak or strong: with
+# the configuration's swing 0.3 Ah or 3.2 Ah, which a cell of 2.6 Ah can have even where a pulse lasts twice as long.
+IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.7, 8.0, 0.006
 # The first half-cycles have no whole one before them.
 WARM_UP = 4
 PEERS = {
@@ -117,7 +118,7 @@ def measure_alarm(count):
                 without += 1
             else:
                 late_ns.append(answered - asked)
-        sender.send(cell(sign * (PULSE_A if strong else IDLE_A)))
+        sender.send(cell(sign * (STRONG_A if strong else WEAK_A)))
         time.sleep(PULSE_S)
         sender.send(cell(sign * IDLE_A))
         pause()
