@@ -45,7 +45,7 @@ use status_publisher::StatusPublisher;
 /// Frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
-/// Threads for work that would block the loop: reading a configuration, long answers. More would only wait for the disk.
+/// Threads for work that would block the loop: reading a configuration, long answers, the fit of a model. More would only wait for the disk.
 const BLOCKING_THREADS: usize = 4;
 
 /// The settings of a run.
@@ -120,6 +120,8 @@ impl Service {
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         // Spawned as a task: waking the future of `block_on` itself goes through the kernel, for every frame.
         let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
+        // A fit under way is begun again after the next start.
+        runtime.shutdown_background();
         served.unwrap_or_else(|stopped| std::panic::resume_unwind(stopped.into_panic()))
     }
 
@@ -151,6 +153,7 @@ impl Service {
             batch: Vec::new(),
             left_out_reported: Instant::now(),
             status_publisher,
+            model_fit: None,
         };
         self.config.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
         let VehicleIdentity { name: vehicle, id, pack } = &self.config.vehicle;

@@ -6,10 +6,11 @@ use std::path::Path;
 
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
+use packwatch::cell::own_model::task::FitFindings;
 use packwatch::cell::{Branch, CellModel, Chemistry, Table};
 use packwatch::config::{self, ConfigFiles};
 use packwatch::monitor::{Downtime, Event, EventKind, Input, ModelState, Monitor, MonitorConfig, Outputs, Snapshot};
-use packwatch::quantity::{BusIndex, CellIndex, Timestamp};
+use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
 /// On the label, and in truth.
@@ -18,6 +19,8 @@ const TRUE_AH: f64 = 4.7;
 const TRUE_RESISTANCE: f64 = 0.7;
 /// Between two cycles, s.
 const NIGHT_S: f64 = 30_000.0;
+/// At the end of a deep cycle, at rest, V.
+const FULL_V: f64 = 4.14;
 
 fn configuration(chemistry: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -76,6 +79,27 @@ fn vehicle(
         }
         night_s = all.first().map_or(0.0, |(first, ..)| last.since(*first)) + NIGHT_S;
     }
+    all
+}
+
+/// The same with the vehicle awake for some minutes after each cycle.
+fn with_rests(
+    config: &MonitorConfig,
+    frames: Vec<(Timestamp, BusIndex, Frame)>,
+    voltage_v: f64,
+) -> Vec<(Timestamp, BusIndex, Frame)> {
+    let encoder = InputEncoder::new(&config.input);
+    let rest = [(Channel::Current, Some(0.0)), (Channel::CellVoltage(CellIndex(0)), Some(voltage_v))];
+    let mut resting = Vec::new();
+    encoder.encode(&rest, &mut resting);
+    let ends = frames.iter().zip(frames.iter().skip(1)).filter(|(a, b)| b.0.since(a.0) >= NIGHT_S).map(|(a, _)| a.0);
+    let ends: Vec<Timestamp> = ends.chain(frames.last().map(|frame| frame.0)).collect();
+    let mut all = frames;
+    for end in ends {
+        let seconds = (1..=240).map(|second| end.plus_secs(f64::from(second)));
+        all.extend(seconds.flat_map(|time| resting.iter().map(move |(bus, frame)| (time, *bus, *frame))));
+    }
+    all.sort_by_key(|frame| frame.0);
     all
 }
 
@@ -179,6 +203,47 @@ fn a_state_of_any_moment_continues_as_if_there_had_been_no_restart() {
         }
     }
     assert!(whole.monitor.model().own.is_some(), "{:?}", whole.monitor.model().state);
+}
+
+#[test]
+fn a_fit_beside_the_monitor_is_the_one_that_it_would_make_itself() {
+    let config = configuration("nmc811-graphite");
+    let (mut alone, mut helped, mut fits) = (Live::new(&config), Live::new(&config), 0);
+    let frames = vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 2);
+    for frame in with_rests(&config, frames, FULL_V) {
+        alone.take(&frame);
+        helped.take(&frame);
+        if let Some(task) = helped.monitor.take_model_fit() {
+            fits += 1;
+            let findings = task.run();
+            helped.monitor.give_model_fit(task, findings);
+        }
+    }
+    assert!(fits >= 2, "{fits} fits begun at rest");
+    let differ = alone.said.iter().zip(&helped.said).find(|(a, b)| a != b);
+    assert_eq!((differ, alone.said.len()), (None, helped.said.len()));
+    assert!(alone.monitor.model().own.is_some());
+}
+
+#[test]
+fn findings_count_for_their_own_task_only() {
+    let config = configuration("nmc811-graphite");
+    let frames = with_rests(&config, vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 2), FULL_V);
+    let unfit_with = |is_first: bool| {
+        let (mut live, mut first) = (Live::new(&config), None);
+        for frame in &frames {
+            live.take(frame);
+            if let Some(task) = live.monitor.take_model_fit() {
+                let findings = FitFindings { chemistry: Some(Chemistry::LfpGraphite), ..task.run() };
+                let given = first.get_or_insert((task.clone(), findings.clone())).clone();
+                let given = if is_first { given } else { (task, findings) };
+                live.monitor.give_model_fit(given.0, given.1);
+            }
+        }
+        live.monitor.model().state == ModelState::Unfit
+    };
+    assert!(unfit_with(false), "what is given is used");
+    assert!(!unfit_with(true), "findings of an earlier task are not");
 }
 
 #[test]

@@ -4,6 +4,7 @@
 //! filters is made. Where the notes say nothing it is the label's, with the label's spread.
 
 pub mod fit;
+pub mod task;
 
 use serde::{Deserialize, Serialize};
 

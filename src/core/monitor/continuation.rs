@@ -33,6 +33,7 @@ pub(super) struct Continuation {
     has_second_sender: bool,
     is_current_doubtful: bool,
     rest_since: Option<Timestamp>,
+    fit_since: Option<Timestamp>,
     has_row: bool,
     /// Every alarm, also those at rest, with the latest value.
     alarms: Vec<RunningAlarm>,
@@ -57,6 +58,7 @@ impl Monitor {
             has_second_sender: sampling.has_second_sender,
             is_current_doubtful: self.stages.estimation.is_current_doubtful,
             rest_since: self.stages.modelling.rest_since,
+            fit_since: self.stages.modelling.fit_since,
             has_row: self.stages.modelling.has_row,
             alarms: alarming.engine.running(),
             inputs_shown_at: alarming.inputs_shown_at,
@@ -80,7 +82,8 @@ impl Monitor {
             (stored.has_usable_reading, stored.has_second_sender);
         self.stages.estimation.is_current_doubtful = stored.is_current_doubtful;
         let modelling = &mut self.stages.modelling;
-        (modelling.rest_since, modelling.has_row) = (stored.rest_since, stored.has_row);
+        (modelling.rest_since, modelling.fit_since) = (stored.rest_since, stored.fit_since);
+        modelling.has_row = stored.has_row;
         alarming.engine.resume(&stored.alarms);
         (alarming.inputs_shown_at, alarming.innovations_shown_at) =
             (stored.inputs_shown_at, stored.innovations_shown_at);

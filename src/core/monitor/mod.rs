@@ -57,6 +57,7 @@ use crate::can::diagnostic::Heard;
 use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::can::secoc::MacCheck;
+use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
 
 pub use command_gate::CommandCounts;
@@ -274,6 +275,17 @@ impl Monitor {
         let secoc = commands.plan.authentication()?;
         let is_command = commands.bus == bus && commands.plan.id() == frame.id();
         is_command.then(|| self.intake.gate_of_commands.mac_check(secoc, frame.data()))
+    }
+
+    /// The fit of the cells' model that has begun, once. It takes longer than a tick may: a live driver runs it on another thread and
+    /// passes what it finds to [`Self::give_model_fit`]. Without that the monitor runs it when it is due, with the same outcome.
+    pub fn take_model_fit(&mut self) -> Option<FitTask> {
+        self.stages.modelling.take_task()
+    }
+
+    /// Takes the findings of a fit.
+    pub fn give_model_fit(&mut self, task: FitTask, findings: FitFindings) {
+        self.stages.modelling.give(task, findings);
     }
 
     /// Steps the cells with a waiting sample, without waiting for the others. The core does so itself before anything that

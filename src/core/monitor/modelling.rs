@@ -5,19 +5,18 @@
 //! one; that of a model file is given.
 //!
 //! A model is fitted again when the vehicle rests and enough new rows have come, and the estimators change to it there, never while
-//! driving. Before that the model in force and the one before it are judged on the new rows, which neither has seen: the
-//! one that predicts them worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
+//! driving. The fit is a [`FitTask`]: it begins some time before the change, so that a host can run it on another thread. Before the
+//! change the model in force and the one before it are judged on the new rows, which neither has seen: the one that predicts them
+//! worse is not kept. Once a model is settled it is fitted again only where the pack has seen another
 //! temperature or part of the charge; the capacity is then left to the half-cycles.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Event, EventKind, MonitorConfig};
-use crate::cell::notebook::Row;
-use crate::cell::own_model::fit::{self, Fit};
-use crate::cell::own_model::rows_cost;
+use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::cell::{
-    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, LabelPrior, Notebook,
-    NotebookConfig, OwnModel,
+    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, Notebook, NotebookConfig,
+    OwnModel,
 };
 use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Mode, Timestamp};
@@ -26,19 +25,12 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
-/// Shortest rest in which a model changes, s: longer than a red light.
+/// Shortest rest in which a fit begins, s: longer than a red light.
 const REST_S: f64 = 120.0;
 
-/// Difference of the costs (minus the logarithms of the probabilities) from which on another chemistry is the cell's: 50 times more
-/// likely; more where the rows deviate from either by more than they should. NCA and NMC differ by 4 to 9 on the drives of four
-/// cells, LFP from all others by hundreds.
-const CHEMISTRY_MARGIN: f64 = 4.0;
+/// Time from there to the change of the model, s: for a thread of a slow computer.
+const FIT_S: f64 = 30.0;
 
-/// The same from which on the model before is the better one.
-const BEFORE_MARGIN: f64 = 4.0;
-
-/// Misfit of drives that a circuit describes, at most.
-const USUAL_MISFIT: f64 = 0.45;
 /// Misfit above which a fit is not used: with usual sensors it is up to 0.65; heavy load in the cold, a faulty sensor or another pack
 /// half-way have more.
 const MOST_MISFIT: f64 = 0.7;
@@ -131,8 +123,14 @@ pub(super) struct Modelling {
     pub(super) state: ModellingState,
     /// Since when the pack rests.
     pub(super) rest_since: Option<Timestamp>,
+    /// Since when a fit is under way; no row ends meanwhile.
+    pub(super) fit_since: Option<Timestamp>,
     /// A row is complete.
     pub(super) has_row: bool,
+    /// The fit under way has not been offered to the host.
+    is_offered: bool,
+    /// A task that the host has run.
+    given: Option<(FitTask, FitFindings)>,
     /// Of the latest fit.
     outcome: FitOutcome,
 }
@@ -235,7 +233,10 @@ impl Modelling {
             notebook: NotebookConfig::new(u32::from(config.sample.cells), rated_ah),
             state: ModellingState::default(),
             rest_since: None,
+            fit_since: None,
             has_row: false,
+            is_offered: false,
+            given: None,
             outcome: FitOutcome::Nothing,
         }
     }
@@ -248,12 +249,13 @@ impl Modelling {
     /// Forgets what was learned: another pack is connected.
     pub(super) fn forget(&mut self) {
         self.state = ModellingState::default();
-        (self.rest_since, self.has_row) = (None, false);
+        (self.rest_since, self.fit_since, self.has_row) = (None, None, false);
     }
 
     /// Continues from a stored state. What was learned with another label is forgotten, its rows are not.
     pub(super) fn restore(&mut self, state: ModellingState) {
         let Some(label) = &self.label else { return };
+        self.fit_since = None;
         self.state = if state.fits_label(label) {
             state
         } else {
@@ -283,7 +285,7 @@ impl Modelling {
     /// Whether [`Self::close_row`] is due.
     #[inline]
     pub(super) fn has_row(&self) -> bool {
-        self.has_row
+        self.has_row && self.fit_since.is_none()
     }
 
     /// Ends a row, at the mean SOC of the cells.
@@ -292,14 +294,37 @@ impl Modelling {
         self.state.notebook.close_row(&self.notebook, soc);
     }
 
-    /// Takes the pack's mode; whether the vehicle has rested long enough for another model.
+    /// Takes the pack's mode; whether a fit ends: [`Self::refit`] is due.
     pub(super) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
         if self.label.is_none() || mode != Mode::Rest {
-            self.rest_since = None;
+            (self.rest_since, self.fit_since) = (None, None);
             return false;
         }
-        let since = *self.rest_since.get_or_insert(now);
-        now.since(since) >= REST_S && self.is_due()
+        let rest_since = *self.rest_since.get_or_insert(now);
+        if let Some(since) = self.fit_since {
+            return now.since(since) >= FIT_S;
+        }
+        if now.since(rest_since) >= REST_S && self.is_due() {
+            self.state.notebook.finish_row(&self.notebook);
+            (self.fit_since, self.is_offered) = (Some(now), true);
+        }
+        false
+    }
+
+    /// The fit under way, once: for a host that runs it beside the monitor.
+    pub(super) fn take_task(&mut self) -> Option<FitTask> {
+        let is_new = std::mem::take(&mut self.is_offered) && self.fit_since.is_some();
+        is_new.then(|| self.task()).flatten()
+    }
+
+    /// Takes the findings of a task. They change nothing but who computes them.
+    pub(super) fn give(&mut self, task: FitTask, findings: FitFindings) {
+        self.given = Some((task, findings));
+    }
+
+    fn task(&self) -> Option<FitTask> {
+        let ModellingState { notebook, own, before, .. } = &self.state;
+        Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
     }
 
     /// Whether half-cycles teach the capacity: while the model is the label's, its errors would be taken for lost capacity.
@@ -320,27 +345,37 @@ impl Modelling {
     /// Fits a model to all rows, after those in force were judged on the new ones. `None` = none is to be adopted.
     pub(super) fn refit(&mut self) -> Option<Adoption> {
         let label = self.label?;
-        let prior = label.prior()?;
-        self.state.notebook.finish_row(&self.notebook);
-        self.take_back_if_worse(&prior);
-        let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
-        let fitted = fit::fit(&prior, self.state.notebook.rows(), self.state.notebook.present());
-        self.state.notebook.mark_read();
-        if fit::says_enough(&label, self.state.notebook.rows()) {
-            self.state.fits = self.state.fits.saturating_add(1);
-            self.state.chemistry = better_chemistry(&prior, fitted.as_ref(), self.state.notebook.rows());
+        if self.fit_since.take().is_none() {
+            self.state.notebook.finish_row(&self.notebook);
         }
-        if self.state.chemistry.is_some() || fitted.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
+        let task = self.task()?;
+        let given = self.given.take().filter(|(given, _)| *given == task).map(|(_, findings)| findings);
+        let FitFindings { is_before_better, is_enough, fit, chemistry } = given.unwrap_or_else(|| task.run());
+        self.outcome = FitOutcome::Nothing;
+        if is_before_better {
+            self.state.own = self.state.before.take();
+            self.state.taken_back = self.state.taken_back.saturating_add(1);
+            self.outcome = FitOutcome::Returned;
+        }
+        let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
+        self.state.notebook.mark_read();
+        if is_enough {
+            self.state.fits = self.state.fits.saturating_add(1);
+            self.state.chemistry = chemistry;
+        }
+        if self.state.chemistry.is_some() || fit.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
             return self.return_to_label();
         }
-        let fitted = fitted?;
+        let fitted = fit?;
         // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
             return None;
         }
-        let Fit { own, soc, soc_by_capacity, .. } = fitted;
+        let (soc, soc_by_capacity) = fitted.soc(self.state.notebook.present()).unzip();
+        let soc_by_capacity = soc_by_capacity.unwrap_or(0.0);
+        let own = fitted.own;
         let filtered_a = self.state.notebook.filtered_a();
         let mean = AdoptedState { soc, soc_by_capacity, capacity: own.capacity, log_resistance: 0.0, filtered_a };
         self.state.label = Some(label);
@@ -360,20 +395,6 @@ impl Modelling {
         let capacity = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
         let mean = AdoptedState { soc: None, soc_by_capacity: 0.0, capacity, log_resistance: 0.0, filtered_a: None };
         Some(Adoption { model: self.model.clone(), config: self.estimator, mean, with_capacity: true })
-    }
-
-    /// Returns to the model before when it predicts the new rows better.
-    fn take_back_if_worse(&mut self, prior: &LabelPrior) {
-        self.outcome = FitOutcome::Nothing;
-        let Some(own) = &self.state.own else { return };
-        let new_rows = self.state.notebook.new_rows();
-        let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
-        let (Some(present), Some(before)) = (cost(Some(own)), cost(self.state.before.as_ref())) else { return };
-        if before < present - BEFORE_MARGIN {
-            self.state.own = self.state.before.take();
-            self.state.taken_back = self.state.taken_back.saturating_add(1);
-            self.outcome = FitOutcome::Returned;
-        }
     }
 
     /// Whether the latest fit ended with the model before.
@@ -411,26 +432,9 @@ impl Modelling {
 
     /// What follows does not hang together with the rows so far.
     pub(super) fn end_stretch(&mut self) {
-        self.rest_since = None;
+        (self.rest_since, self.fit_since) = (None, None);
         if self.label.is_some() {
             self.state.notebook.end_stretch(&self.notebook);
         }
     }
-}
-
-/// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the fit, if
-/// there is one, or the rated one, as suits it better.
-fn better_chemistry(prior: &LabelPrior, fitted: Option<&Fit>, rows: &[Row]) -> Option<Chemistry> {
-    let LabelPrior { label, .. } = prior;
-    let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
-    let fitted_ah = fitted.map(|it| it.own.capacity.mean);
-    let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();
-    let own = fit::label_cost(prior, rows, &capacities_ah)?;
-    let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
-    let costs = others.filter_map(|chemistry| {
-        let other = label.with_chemistry(chemistry).prior()?;
-        Some((chemistry, fit::label_cost(&other, rows, &capacities_ah)?))
-    });
-    let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
-    best.filter(|(_, cost)| *cost < own - margin).map(|(chemistry, _)| chemistry)
 }

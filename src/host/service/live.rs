@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use sd_notify::NotifyState;
 use tokio::sync::{mpsc, watch};
-use tokio::task::JoinSet;
+use tokio::task::{JoinHandle, JoinSet, spawn_blocking};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
@@ -13,6 +13,7 @@ use super::pending_answers::PendingAnswers;
 use super::reload::{Reload, ReloadStep, log_outcome};
 use super::status_publisher::StatusPublisher;
 use super::{INBOX, ServiceError, notify};
+use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::control::protocol::{Answer, CommandOutcome, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
@@ -45,6 +46,8 @@ pub(super) struct ServiceLoop {
     pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
+    /// The fit of the cells' model under way, beside the loop.
+    pub(super) model_fit: Option<JoinHandle<(FitTask, FitFindings)>>,
 }
 
 impl ServiceLoop {
@@ -64,6 +67,7 @@ impl ServiceLoop {
                     self.status_publisher.note_tick(now);
                     self.pending_answers.note_time(now);
                     let time = self.tick().await;
+                    self.begin_model_fit();
                     self.notify_manager(now);
                     self.status_publisher.publish(&self.engine, now, time);
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
@@ -79,6 +83,9 @@ impl ServiceLoop {
                     self.pending_answers.note_progress(&progress);
                     self.engine.handle_store_progress(progress, self.clock.now());
                 }
+                Some((task, findings)) = next_model_fit(&mut self.model_fit) => {
+                    self.engine.monitor.give_model_fit(task, findings);
+                }
                 // At most one request per connection waits.
                 Some(request) = self.requests.recv() => self.answer(request).await,
                 // At most one file a second is read.
@@ -87,6 +94,18 @@ impl ServiceLoop {
                     if received > 0 { self.handle_batch() }
                 }
             }
+        }
+    }
+
+    /// Runs the fit that the core has begun on another thread: it takes longer than frames and ticks can wait.
+    fn begin_model_fit(&mut self) {
+        if self.model_fit.is_none()
+            && let Some(task) = self.engine.monitor.take_model_fit()
+        {
+            self.model_fit = Some(spawn_blocking(move || {
+                let findings = task.run();
+                (task, findings)
+            }));
         }
     }
 
@@ -245,6 +264,14 @@ async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> S
     *stored = None;
     tracing::error!("the store's thread has ended: state and history are no longer written");
     StoreProgress { works: false, failures: last.failures + 1, ..last }
+}
+
+/// Waits for a fit; `None` = it has failed, and the core runs it itself.
+async fn next_model_fit(fit: &mut Option<JoinHandle<(FitTask, FitFindings)>>) -> Option<(FitTask, FitFindings)> {
+    let Some(running) = fit else { return std::future::pending().await };
+    let found = running.await.ok();
+    *fit = None;
+    found
 }
 
 #[cfg(test)]

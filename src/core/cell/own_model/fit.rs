@@ -53,17 +53,45 @@ const CAPACITY_FACTOR: f64 = 1.4;
 const LEAST_CAPACITY_STD: f64 = 0.015;
 
 /// A fit.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
     /// Root mean square of the rows' residuals in standard deviations: about 1 when the cells are of the label's chemistry and the
     /// errors of a circuit model as assumed.
     pub misfit: f64,
-    /// Present SOC, fraction; `None` = the present stretch has no rows.
-    pub soc: Option<ScalarGaussian>,
-    /// Covariance of that with the capacity, Ah.
-    pub soc_by_capacity: f64,
+    /// Where the last stretch began; `None` without rows.
+    beginning: Option<Beginning>,
+}
+
+/// Where a stretch began. SOC after a charge q and a time t: soc - (q - t offset) / capacity.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Beginning {
+    stretch: u32,
+    /// SOC then and offset of the current sensor, A; their covariance at the most likely capacity.
+    means: [f64; 2],
+    covariance: [[f64; 2]; 2],
+    /// Change of both with one standard deviation of the capacity.
+    by_capacity: [f64; 2],
+}
+
+impl Fit {
+    /// Present SOC, fraction, and its covariance with the capacity, Ah; `None` = the present stretch has no rows.
+    pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
+        let (present, beginning) = present.zip(self.beginning)?;
+        let Beginning { stretch, means, covariance, by_capacity } = beginning;
+        if present.number != stretch {
+            return None;
+        }
+        let (capacity_ah, std_ah) = (self.own.capacity.mean, self.own.capacity.std());
+        let hours = present.elapsed_s / 3600.0;
+        let moved = (present.charge_ah - hours * means[1]) / capacity_ah;
+        let by_offset = hours / capacity_ah;
+        let by_capacity = by_capacity[0] + by_offset * by_capacity[1] + moved * std_ah / capacity_ah;
+        let own = covariance[0][0] + by_offset * (2.0 * covariance[0][1] + by_offset * covariance[1][1]);
+        let soc = ScalarGaussian { mean: means[0] - moved, variance: own + by_capacity * by_capacity };
+        Some((soc, by_capacity * std_ah))
+    }
 }
 
 /// The most likely parameters at one capacity.
@@ -92,15 +120,14 @@ pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
     rows.len() >= LEAST_ROWS && span_ah(rows) >= LEAST_SPAN * label.rated_ah
 }
 
-/// Fits; `None` when the rows say too little or are those of a capacity far from the label's. `present`: where the present stretch
-/// stands.
-pub fn fit(prior: &LabelPrior, rows: &[Row], present: Option<PresentStretch>) -> Option<Fit> {
+/// Fits; `None` when the rows say too little or are those of a capacity far from the label's.
+pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     if !says_enough(&prior.label, rows) {
         return None;
     }
     let (search, start) = Search::new(prior, rows)?;
     let capacity = search.capacity(&start)?;
-    search.finish(capacity, &start, present)
+    search.finish(capacity, &start)
 }
 
 /// Minus the logarithm of the probability of rows by a label, at the capacity that suits it best of some, Ah: comparable between
@@ -225,8 +252,8 @@ impl<'a> Search<'a> {
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Model, present SOC and their deviations at the capacity that was found.
-    fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>, present: Option<PresentStretch>) -> Option<Fit> {
+    /// Model, beginning of the last stretch and their deviations at the capacity that was found.
+    fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
@@ -235,24 +262,18 @@ impl<'a> Search<'a> {
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
         let last = self.basis.rows.last().zip(self.basis.stretch.last());
-        let present = present.zip(last).filter(|(present, (row, _))| present.number == row.stretch);
-        let soc = present.map(|(present, (_, stretch))| {
-            let (k, hours) = (BEGINNINGS + stretch, present.elapsed_s / 3600.0);
-            let moved = (present.charge_ah - hours * theta[OFFSET]) / capacity.mean;
-            let by_offset = hours / capacity.mean;
-            let by_capacity = by_capacity[k] + by_offset * by_capacity[OFFSET] + moved * by_capacity[LOG_CAPACITY];
-            let own = covariance[(k, k)]
-                + by_offset * (2.0 * covariance[(k, OFFSET)] + by_offset * covariance[(OFFSET, OFFSET)]);
-            (ScalarGaussian { mean: theta[k] - moved, variance: own + by_capacity * by_capacity }, by_capacity * std_ah)
+        let beginning = last.map(|(row, stretch)| {
+            let of = [BEGINNINGS + stretch, OFFSET];
+            Beginning {
+                stretch: row.stretch,
+                means: of.map(|i| theta[i]),
+                covariance: of.map(|i| of.map(|j| covariance[(i, j)])),
+                by_capacity: of.map(|i| by_capacity[i]),
+            }
         });
         covariance[(LOG_CAPACITY, LOG_CAPACITY)] = 0.0;
         covariance += &by_capacity * by_capacity.transpose();
-        Some(Fit {
-            own: self.own_model(&theta, &covariance, capacity),
-            misfit,
-            soc: soc.map(|(soc, _)| soc),
-            soc_by_capacity: soc.map_or(0.0, |(_, by_capacity)| by_capacity),
-        })
+        Some(Fit { own: self.own_model(&theta, &covariance, capacity), misfit, beginning })
     }
 
     fn own_model(&self, theta: &DVector<f64>, covariance: &DMatrix<f64>, capacity: ScalarGaussian) -> OwnModel {

@@ -1,0 +1,88 @@
+//! A fit of the on-board model as a task: what it needs, and what it finds.
+//!
+//! It takes hundreds of times as long as a tick may, and depends on nothing but the task. So a live host can run it on a thread
+//! beside the monitor; a replay runs it in place and finds the same.
+
+use super::fit::{self, Fit};
+use super::{OwnModel, rows_cost};
+use crate::cell::chemistry::{Chemistry, Label, LabelPrior};
+use crate::cell::notebook::{Notebook, Row};
+
+/// Difference of the costs (minus the logarithms of the probabilities) from which on another chemistry is the cell's: 50 times more
+/// likely; more where the rows deviate from either by more than they should. NCA and NMC differ by 4 to 9 on the drives of four
+/// cells, LFP from all others by hundreds.
+const CHEMISTRY_MARGIN: f64 = 4.0;
+
+/// The same from which on the model before is the better one.
+const BEFORE_MARGIN: f64 = 4.0;
+
+/// Misfit of drives that a circuit describes, at most.
+const USUAL_MISFIT: f64 = 0.45;
+
+/// What a fit is made from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitTask {
+    label: Label,
+    rows: Vec<Row>,
+    /// How many of them, the last ones, no model has seen.
+    new_rows: usize,
+    /// The model in force and the one before; `None` = the label's.
+    own: Option<OwnModel>,
+    before: Option<OwnModel>,
+}
+
+/// What a task finds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitFindings {
+    /// The model before predicts the new rows better than that in force.
+    pub is_before_better: bool,
+    /// The rows were enough for a fit.
+    pub is_enough: bool,
+    /// The fit to all rows; `None` = they are too few, or those of a capacity far from the label's.
+    pub fit: Option<Fit>,
+    /// The chemistry that explains the rows clearly better than that on the label.
+    pub chemistry: Option<Chemistry>,
+}
+
+impl FitTask {
+    /// For the rows of a notebook, the model in force and the one before.
+    pub fn new(label: Label, notebook: &Notebook, own: Option<&OwnModel>, before: Option<&OwnModel>) -> Self {
+        let new_rows = notebook.new_rows().len();
+        Self { label, rows: notebook.rows().to_vec(), new_rows, own: own.cloned(), before: before.cloned() }
+    }
+
+    /// Runs it.
+    pub fn run(&self) -> FitFindings {
+        let is_enough = fit::says_enough(&self.label, &self.rows);
+        let nothing = FitFindings { is_before_better: false, is_enough, fit: None, chemistry: None };
+        let Some(prior) = self.label.prior() else { return nothing };
+        let fit = fit::fit(&prior, &self.rows);
+        let chemistry = if is_enough { self.better_chemistry(&prior, fit.as_ref()) } else { None };
+        FitFindings { is_before_better: self.is_before_better(&prior), fit, chemistry, ..nothing }
+    }
+
+    fn is_before_better(&self, prior: &LabelPrior) -> bool {
+        let Some(own) = &self.own else { return false };
+        let new_rows = &self.rows[self.rows.len() - self.new_rows..];
+        let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
+        let costs = cost(Some(own)).zip(cost(self.before.as_ref()));
+        costs.is_some_and(|(present, before)| before < present - BEFORE_MARGIN)
+    }
+
+    /// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the
+    /// fit, if there is one, or the rated one, as suits it better.
+    fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
+        let Self { label, rows, .. } = self;
+        let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
+        let fitted_ah = fitted.map(|it| it.own.capacity.mean);
+        let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();
+        let own = fit::label_cost(prior, rows, &capacities_ah)?;
+        let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
+        let costs = others.filter_map(|chemistry| {
+            let other = label.with_chemistry(chemistry).prior()?;
+            Some((chemistry, fit::label_cost(&other, rows, &capacities_ah)?))
+        });
+        let best = costs.min_by(|a, b| a.1.total_cmp(&b.1));
+        best.filter(|(_, cost)| *cost < own - margin).map(|(chemistry, _)| chemistry)
+    }
+}
