@@ -12,6 +12,7 @@
 //! | | [`sample`] | plausibility of readings, alignment of values of different times and rates |
 //! | | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
 //! | | [`health`] | charge/discharge transitions, capacity, recharge period, usable capacity, remaining life |
+//! | | [`findings`] | each cell against its pack: leaks, contacts, weak cells, channels |
 //! | | [`alarm`] | alarm rules over named values, debounce, hysteresis, latch |
 //! | | [`monitor`] | wires the stages above: `Input` in, `Outputs` out, snapshot and restore |
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
@@ -51,6 +52,7 @@
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
 //! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/modelling.rs` (when); on another thread: `host/service/live.rs` |
+//! | what a fault of one cell looks like; from when on it is told | `core/findings/difference.rs`, `core/findings/channels.rs`; `core/findings/finding.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |
@@ -85,7 +87,7 @@
 //! * Inside, current is positive for discharge, SOC is a fraction; wire units end in [`can`].
 //! * A bad reading is data with a fault; an unknown value never looks healthy.
 
-pub use packwatch_core::{alarm, can, cell, doctor, filter, health, monitor, quantity, sample, sim};
+pub use packwatch_core::{alarm, can, cell, doctor, filter, findings, health, monitor, quantity, sample, sim};
 pub use packwatch_host::{config, control, diagnosis, exporter, io, logging, replay, service, status, store};
 #[cfg(feature = "lab")]
 pub use packwatch_lab::{self as lab, ident};

@@ -11,6 +11,7 @@
 //! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
 //! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
 //! | modelling | steps of the cells, rests → the cells' own model | `monitor/modelling.rs` | [`cell`]: notebook, own model |
+//! | diagnosing | cell samples, estimates → findings | `monitor/diagnosing.rs` | [`findings`]: each cell against its pack |
 //! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
 //! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
@@ -36,6 +37,7 @@
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
+//! | a kind of finding | `findings/finding.rs` (kind, limit), `findings/diagnosis.rs` (its judgement) |
 //! | what a cell has lost | `cell/loss_modes.rs` |
 //! | bands of a cell model, which measurement helps most | `cell/model_bands.rs` |
 //! | how far two cell models are apart | `cell/model_comparison.rs` |
@@ -54,6 +56,7 @@ pub mod can;
 pub mod cell;
 pub mod doctor;
 pub mod filter;
+pub mod findings;
 pub mod health;
 pub mod monitor;
 pub mod quantity;

@@ -19,35 +19,37 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("sample", &["quantity"], Core::Pure),
     ("cell", &["quantity", "filter", "sample"], Core::Pure),
     ("health", &["quantity", "filter", "sample", "cell"], Core::Pure),
+    ("findings", &["quantity", "filter", "cell"], Core::Pure),
     ("alarm", &["quantity"], Core::Pure),
-    ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "alarm"], Core::Pure),
+    ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "findings", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
     ("doctor", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("config", CORE, Core::Shell),
     ("token_bucket", &["quantity"], Core::Shell),
-    ("io", MODULES.split_at(12).0, Core::Shell),
-    ("logging", MODULES.split_at(13).0, Core::Shell),
-    ("control", MODULES.split_at(14).0, Core::Shell),
-    ("store", MODULES.split_at(15).0, Core::Shell),
-    ("status", MODULES.split_at(15).0, Core::Shell),
-    ("service", MODULES.split_at(17).0, Core::Shell),
-    ("exporter", MODULES.split_at(18).0, Core::Shell),
-    ("replay", MODULES.split_at(18).0, Core::Shell),
-    ("diagnosis", MODULES.split_at(18).0, Core::Shell),
+    ("io", MODULES.split_at(13).0, Core::Shell),
+    ("logging", MODULES.split_at(14).0, Core::Shell),
+    ("control", MODULES.split_at(15).0, Core::Shell),
+    ("store", MODULES.split_at(16).0, Core::Shell),
+    ("status", MODULES.split_at(16).0, Core::Shell),
+    ("service", MODULES.split_at(18).0, Core::Shell),
+    ("exporter", MODULES.split_at(19).0, Core::Shell),
+    ("replay", MODULES.split_at(19).0, Core::Shell),
+    ("diagnosis", MODULES.split_at(19).0, Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// The modules of `src/core` and `src/host`, lowest first, then those of the lab.
-const MODULES: [&str; 24] = [
+const MODULES: [&str; 25] = [
     "quantity",
     "filter",
     "can",
     "sample",
     "cell",
     "health",
+    "findings",
     "alarm",
     "monitor",
     "sim",
@@ -67,8 +69,8 @@ const MODULES: [&str; 24] = [
     "ident",
     "lab",
 ];
-const CORE: &[&str] = MODULES.split_at(10).0;
-const BELOW_LAB: &[&str] = MODULES.split_at(23).0;
+const CORE: &[&str] = MODULES.split_at(11).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(24).0;
 /// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
 const CRATES: [(&str, Option<&str>); 4] =
     [("core", None), ("host", None), ("lab", Some("lab")), ("regress", Some("regress"))];

@@ -109,6 +109,11 @@ impl Estimation {
         model_id(self.bank.model(), self.bank.config().initial.log_resistance_std)
     }
 
+    /// Temperature where none is measured, degrees C.
+    pub(super) fn ambient_c(&self) -> f64 {
+        self.ambient_c
+    }
+
     /// Number of cells.
     pub(super) fn cells(&self) -> usize {
         self.progress.len()

@@ -15,6 +15,7 @@ use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
 use crate::cell::Chemistry;
+use crate::findings::Finding;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -282,6 +283,8 @@ pub enum EventKind {
         /// The model before was the better one and holds again.
         is_taken_back: bool,
     },
+    /// A cell stands out from its pack in a way that tells what is wrong with it.
+    Finding(Finding),
     /// A cell's filter failed and started again from its voltage.
     FilterReset {
         /// Which cell.

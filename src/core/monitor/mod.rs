@@ -22,6 +22,7 @@ mod clock;
 mod command_gate;
 mod config;
 mod continuation;
+mod diagnosing;
 mod digest;
 mod estimation;
 mod event;

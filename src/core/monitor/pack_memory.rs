@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::learning::LearningState;
 use super::modelling::ModellingState;
 use super::snapshot::StoredCell;
+use crate::findings::Diagnosis;
 use crate::quantity::InvalidState;
 
 /// Packs kept beside the connected one: more than a vehicle exchanges in turn.
@@ -36,6 +37,9 @@ pub(super) struct StoredPack {
     /// What is learned of the cells' model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) modelling: Option<ModellingState>,
+    /// What is known of single cells.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) diagnosis: Option<Diagnosis>,
     pub(super) learning: LearningState,
 }
 
@@ -94,6 +98,7 @@ impl PackMemory {
             InvalidState::unless(pack.number.is_finite(), "the number of a pack", pack.number, "a finite number")?;
             pack.learning.check()?;
             pack.modelling.iter().try_for_each(ModellingState::check)?;
+            pack.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(pack.cells.len()))?;
             pack.cells.iter().try_for_each(StoredCell::check)?;
         }
         Ok(())

@@ -22,6 +22,7 @@ use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, St
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
+use crate::findings::Diagnosis;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig, SamplerState};
@@ -68,6 +69,9 @@ pub struct Snapshot {
     statistics: Statistics,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     modelling: Option<ModellingState>,
+    /// `None` in states of earlier programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    diagnosis: Option<Diagnosis>,
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
@@ -149,8 +153,18 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
-        let Stages { sampling, estimation, modelling, learning, alarming, sender, statistics, sleep, packs } =
-            &self.stages;
+        let Stages {
+            sampling,
+            estimation,
+            modelling,
+            learning,
+            diagnosing,
+            alarming,
+            sender,
+            statistics,
+            sleep,
+            packs,
+        } = &self.stages;
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
@@ -168,6 +182,7 @@ impl Monitor {
             identity: sampling.identity,
             statistics: statistics.clone(),
             modelling: modelling.stored(),
+            diagnosis: diagnosing.stored(),
             asleep_since: sleep.since,
             packs: packs.clone(),
             continuation: Some(Box::new(self.continuation())),
@@ -256,6 +271,7 @@ impl Stages {
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
         let batch = CellBatch::restore(has_reported, snapshot.waiting);
         self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
+        self.diagnosing.restore(snapshot.diagnosis, is_continued);
         // Its shape is checked in `Monitor::restore`.
         self.sampling.sampler.restore(snapshot.sampler);
         self.sampling.identity = snapshot.identity;
@@ -309,6 +325,7 @@ impl Stages {
             number: self.sampling.identity.known.unwrap_or(0.0),
             cells: cells.collect(),
             modelling: self.modelling.stored(),
+            diagnosis: self.diagnosing.stored(),
             learning: self.learning.state.learned_only(),
         }
     }
@@ -319,6 +336,8 @@ impl Stages {
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
+        self.diagnosing.restore(pack.diagnosis, false);
+        self.diagnosing.diagnosis.forget_charge();
         let capacity = self.learning.weakest_capacity();
         let kind = EventKind::PackReturned {
             identity: pack.number,
@@ -394,6 +413,7 @@ impl Snapshot {
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
+        self.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(self.cells.len()))?;
         self.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
@@ -431,6 +451,7 @@ impl Snapshot {
         self.waiting.iter_mut().for_each(|sample| sample.time = sample.time.plus_nanos(by_nanos));
         self.sampler.rebase(by_nanos);
         self.learning.rebase(by_nanos);
+        self.diagnosis.iter_mut().for_each(|diagnosis| diagnosis.rebase(by_nanos));
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
         self.buses.rebase(by_nanos);

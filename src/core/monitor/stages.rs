@@ -4,6 +4,7 @@
 //! input at hand.
 
 use super::alarming::Alarming;
+use super::diagnosing::Diagnosing;
 use super::estimation::Estimation;
 use super::learning::Learning;
 use super::modelling::Modelling;
@@ -29,6 +30,7 @@ pub(super) struct Stages {
     pub(super) estimation: Estimation,
     pub(super) modelling: Modelling,
     pub(super) learning: Learning,
+    pub(super) diagnosing: Diagnosing,
     pub(super) alarming: Alarming,
     pub(super) sender: Sender,
     pub(super) statistics: Statistics,
@@ -43,6 +45,7 @@ impl Stages {
             estimation: Estimation::new(config),
             modelling: Modelling::new(config),
             learning: Learning::new(config),
+            diagnosing: Diagnosing::new(usize::from(config.sample.cells)),
             alarming: Alarming::new(config),
             sender: Sender::new(config),
             statistics: Statistics::default(),
@@ -191,6 +194,7 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
+        self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
     }
 
@@ -300,6 +304,7 @@ impl Stages {
         self.estimation.forget(&self.modelling);
         self.estimation.bank.set_current_offset_std(self.learning.config.capacity.current_offset_std_a);
         self.learning.forget(&self.estimation.bank);
+        self.diagnosing.forget(self.estimation.cells());
         self.forget_pack_state();
         self.alarming.knows_all_valid = false;
         self.publisher(now, out).apply(AlarmInput::ForgetLearned);
@@ -348,6 +353,7 @@ impl Stages {
         self.sender.restart(time);
         self.sender.claim_address(time, out);
         self.estimation.handle_unknown_gap();
+        self.diagnosing.diagnosis.forget_charge();
     }
 
     /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.

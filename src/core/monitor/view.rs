@@ -9,6 +9,7 @@ use crate::can::guard::GuardCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::filter::ScalarGaussian;
+use crate::findings::{Difference, Finding};
 use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
@@ -137,6 +138,16 @@ impl Monitor {
     /// How well the model of the cells is known.
     pub fn model(&self) -> ModelView<'_> {
         self.stages.modelling.view()
+    }
+
+    /// What is wrong with single cells.
+    pub fn findings(&self) -> &[Finding] {
+        self.stages.diagnosing.diagnosis.findings()
+    }
+
+    /// What is known of a cell's difference from its pack; `None` = the pack is too small for a comparison.
+    pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
+        self.stages.diagnosing.diagnosis.difference(cell)
     }
 
     /// Why no diagnostic request is sent (`None` = they are), and how many are refused for good; `None` without `[poll]`.

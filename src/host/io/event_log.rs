@@ -15,6 +15,7 @@ use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
 use crate::cell::Chemistry;
 use crate::config::VehicleIdentity;
+use crate::findings::Finding;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -131,6 +132,11 @@ impl EventLog {
             EventKind::BusAsleep { asleep: false, seconds } => tracing::info!(seconds, "the buses are awake"),
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::Model { .. } => log_model(&event.kind),
+            EventKind::Finding(Finding { kind, cells, size, probability, .. }) => {
+                let (first, last) = (number(cells.0), number(cells.1));
+                let (size, size_std) = (rounded(size.mean), rounded(size.std()));
+                tracing::warn!(first, last, size, size_std, probability, "{}: {}", kind.words(), kind.advice());
+            }
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
                 tracing::warn!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate not to be trusted");

@@ -134,6 +134,7 @@ pub(super) fn note_event(
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",
         EventKind::Model { .. } => "model",
+        EventKind::Finding(_) => "finding",
         EventKind::Trust { .. } => "trust",
         EventKind::Command { .. } => "command",
         EventKind::BadCommand { .. } => "bad_command",

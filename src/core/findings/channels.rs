@@ -1,0 +1,107 @@
+//! Voltage channels that show no cell of their own: frozen at one value, or that of another.
+
+use serde::{Deserialize, Serialize};
+
+use super::row::CellSums;
+
+/// Change of the other cells while a channel stays at one value, V.
+const FROZEN_V: f64 = 0.03;
+/// Fewest changes of the voltage in a row for a comparison with other channels, and rows that must agree.
+const LEAST_CHANGES: u32 = 10;
+const DOUBLED_ROWS: u8 = 3;
+
+/// What is known of one channel.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct Channel {
+    /// Voltage of the middle cells in the row in which the channel last changed, V; `None` = it has never changed.
+    middle_v: Option<f64>,
+    pub(super) is_frozen: bool,
+    /// The channel whose values it has shown, and in how many rows.
+    same_as: Option<(u16, u8)>,
+}
+
+impl Channel {
+    /// Ends a row in which the middle cells had this voltage, V.
+    pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
+        if sums.changes > 0 {
+            (self.middle_v, self.is_frozen) = (Some(middle_v), false);
+        } else if sums.count > 1 {
+            let was_v = *self.middle_v.get_or_insert(middle_v);
+            self.is_frozen |= (middle_v - was_v).abs() > FROZEN_V;
+        }
+    }
+
+    /// The channel whose values it shows.
+    pub(super) fn doubled(&self) -> Option<u16> {
+        self.same_as.filter(|(_, rows)| *rows >= DOUBLED_ROWS).map(|(other, _)| other)
+    }
+
+    pub(super) fn numbers(&self) -> Option<f64> {
+        self.middle_v
+    }
+}
+
+/// Compares the channels of a row: which two have shown the same values throughout. Cells that are all alike are not doubled.
+pub(super) fn compare(channels: &mut [Channel], sums: &[CellSums]) {
+    let compared = |cell: &usize| sums[*cell].changes >= LEAST_CHANGES;
+    let mut order: Vec<usize> = (0..sums.len()).filter(compared).collect();
+    if order.len() < sums.len() / 2 + 1 {
+        return;
+    }
+    order.sort_by_key(|&cell| (sums[cell].digest, cell));
+    let alike: Vec<&[usize]> = order.chunk_by(|&a, &b| sums[a].digest == sums[b].digest).collect();
+    let are_cells_distinct = 2 * alike.len() > sums.len();
+    for group in alike {
+        for &cell in group {
+            let other = (are_cells_distinct && group.len() == 2).then(|| group[usize::from(group[0] == cell)] as u16);
+            let channel = &mut channels[cell];
+            channel.same_as = match (other, channel.same_as) {
+                (None, _) => None,
+                (Some(other), Some((before, rows))) if before == other => Some((other, rows.saturating_add(1))),
+                (Some(other), _) => Some((other, 1)),
+            };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quantity::Timestamp;
+
+    fn doubled(channels: &[Channel]) -> Vec<Option<u16>> {
+        channels.iter().map(Channel::doubled).collect()
+    }
+
+    fn row(voltages_v: &[f64]) -> CellSums {
+        let mut sums = CellSums::default();
+        voltages_v.iter().enumerate().for_each(|(i, v)| sums.add(Timestamp::from_secs(i as f64), *v, 0.0, 0.0));
+        sums
+    }
+
+    #[test]
+    fn a_frozen_channel_is_told_when_the_others_have_moved() {
+        let mut channel = Channel::default();
+        channel.end_row(&row(&[3.7, 3.71]), 3.70);
+        for middle_v in [3.69, 3.68, 3.675] {
+            channel.end_row(&row(&[3.71, 3.71]), middle_v);
+            assert!(!channel.is_frozen, "the others have moved by less");
+        }
+        channel.end_row(&row(&[3.71, 3.71]), 3.66);
+        assert!(channel.is_frozen);
+        channel.end_row(&row(&[3.71, 3.70]), 3.66);
+        assert!(!channel.is_frozen, "it lives again");
+    }
+
+    #[test]
+    fn two_channels_with_the_same_values_are_doubled_and_a_pack_of_like_cells_is_not() {
+        let shown = |offset: f64| -> Vec<f64> { (0..30).map(|i| 3.7 + offset + f64::from(i % 7) * 0.001).collect() };
+        let mut channels = vec![Channel::default(); 4];
+        let one_doubled = [shown(0.0), shown(0.002), shown(0.0), shown(0.005)].map(|v| row(&v));
+        (0..3).for_each(|_| compare(&mut channels, &one_doubled));
+        assert_eq!(doubled(&channels), [Some(2), None, Some(0), None]);
+        let alike = [shown(0.0), shown(0.0), shown(0.0), shown(0.0)].map(|v| row(&v));
+        compare(&mut channels, &alike);
+        assert_eq!(doubled(&channels), [None; 4]);
+    }
+}

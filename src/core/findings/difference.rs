@@ -1,0 +1,261 @@
+//! The difference of one cell from the middle of its pack, filtered.
+//!
+//! In: its voltage less that of the middle cells, row by row. Out: what explains it. A linear Kalman filter whose observation is
+//! taken at the cell's own SOC. The states differ in what they follow, which is how they are told apart:
+//!
+//! | state | the voltage's difference follows |
+//! | --- | --- |
+//! | charge | the slope of the open-circuit curve |
+//! | capacity | the charge moved |
+//! | resistance | the whole voltage drop, so load and temperature, with its delay |
+//! | contact | the current alone, without delay and temperature |
+//! | channel | nothing |
+//! | leak | time |
+//!
+//! Source: the separation in a mean cell and differences is Plett's bar-delta filtering (Battery Management Systems II, section 4.11);
+//! contact resistance of one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
+
+use serde::{Deserialize, Serialize};
+
+use crate::filter::ScalarGaussian;
+use crate::quantity::InvalidState;
+
+/// States: difference of SOC; of capacity, of resistance and of contact resistance (to the mean cell's), fractions; offset of the
+/// voltage channel, V; leak, fraction of the capacity in a day.
+pub const SOC: usize = 0;
+/// See [`SOC`].
+pub const CAPACITY: usize = 1;
+/// See [`SOC`].
+pub const RESISTANCE: usize = 2;
+/// See [`SOC`].
+pub const CONTACT: usize = 3;
+/// See [`SOC`].
+pub const CHANNEL: usize = 4;
+/// See [`SOC`].
+pub const LEAK: usize = 5;
+/// Number of states.
+pub const STATES: usize = 6;
+const PAIRS: usize = STATES * (STATES + 1) / 2;
+
+/// Standard deviations before the first row. The channel's is that of usual cell monitors.
+const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
+/// Growth of the deviations in a day, and of the charge's per unit of moved SOC.
+const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
+const MOVED_STD: f64 = 5e-4;
+/// Deviations that are added when the cell has changed at once. The capacity may be another cell's.
+const JUMP_STD: [f64; STATES] = [0.05, 0.05, 0.2, 0.5, 0.03, 0.01];
+/// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it tells of a jump; and how many of these do.
+const HUBER: f64 = 3.0;
+const JUMP: f64 = 4.0;
+const JUMP_ROWS: u8 = 3;
+
+/// The filter of one cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Difference {
+    mean: [f64; STATES],
+    /// Upper triangle, row by row.
+    covariance: [f64; PAIRS],
+    /// Rows in a row that deviate to one side.
+    odd_rows: i8,
+}
+
+/// An observation: its value less what is expected of it, its slopes by the states, and the variance of its error.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Observation {
+    pub(super) innovation: f64,
+    pub(super) slope: [f64; STATES],
+    pub(super) variance: f64,
+}
+
+/// Place of a pair of states in the triangle.
+const fn pair(i: usize, j: usize) -> usize {
+    let (a, b) = if i < j { (i, j) } else { (j, i) };
+    a * STATES - a * (a + 1) / 2 + b
+}
+
+impl Difference {
+    /// A cell of which nothing is known.
+    pub(super) fn new() -> Self {
+        let mut covariance = [0.0; PAIRS];
+        for (i, std) in FIRST_STD.iter().enumerate() {
+            covariance[pair(i, i)] = std * std;
+        }
+        Self { mean: [0.0; STATES], covariance, odd_rows: 0 }
+    }
+
+    /// A state with its standard deviation.
+    pub fn state(&self, state: usize) -> ScalarGaussian {
+        ScalarGaussian { mean: self.mean[state], variance: self.covariance[pair(state, state)] }
+    }
+
+    pub(super) fn mean(&self) -> &[f64; STATES] {
+        &self.mean
+    }
+
+    /// Time and charge pass: days, and the change of the mean cell's SOC.
+    pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
+        // charge += -capacity * soc_change - leak * days
+        let (by_capacity, by_leak) = (-soc_change, -days);
+        self.mean[SOC] += by_capacity * self.mean[CAPACITY] + by_leak * self.mean[LEAK];
+        let get = |cov: &[f64; PAIRS], i, j| cov[pair(i, j)];
+        let old = self.covariance;
+        for j in 1..STATES {
+            self.covariance[pair(SOC, j)] += by_capacity * get(&old, CAPACITY, j) + by_leak * get(&old, LEAK, j);
+        }
+        self.covariance[pair(SOC, SOC)] += 2.0
+            * (by_capacity * get(&old, SOC, CAPACITY) + by_leak * get(&old, SOC, LEAK))
+            + by_capacity * by_capacity * get(&old, CAPACITY, CAPACITY)
+            + 2.0 * by_capacity * by_leak * get(&old, CAPACITY, LEAK)
+            + by_leak * by_leak * get(&old, LEAK, LEAK);
+        for (i, std) in DAILY_STD.iter().enumerate() {
+            self.covariance[pair(i, i)] += std * std * days;
+        }
+        let moved = MOVED_STD * soc_change;
+        self.covariance[pair(SOC, SOC)] += moved * moved;
+    }
+
+    /// The charge is not known any more.
+    pub(super) fn forget_charge(&mut self) {
+        for j in 0..STATES {
+            self.covariance[pair(SOC, j)] = 0.0;
+        }
+        self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
+    }
+
+    /// Innovation in its own standard deviations.
+    pub(super) fn deviations(&self, observed: &Observation) -> f64 {
+        observed.innovation / self.by_slope(observed).1.sqrt()
+    }
+
+    /// Covariance with the states, and variance of the innovation.
+    fn by_slope(&self, observed: &Observation) -> ([f64; STATES], f64) {
+        let Observation { slope, variance, .. } = observed;
+        let with: [f64; STATES] =
+            std::array::from_fn(|i| (0..STATES).map(|j| self.covariance[pair(i, j)] * slope[j]).sum());
+        let total = variance + with.iter().zip(slope).map(|(with, slope)| with * slope).sum::<f64>();
+        (with, total.max(f64::MIN_POSITIVE))
+    }
+
+    /// Takes a row's mean; whether the cell has changed at once: some rows in a row contradict what is known.
+    pub(super) fn observe(&mut self, observed: &Observation) -> bool {
+        let off = self.deviations(observed);
+        let side = if off.abs() < JUMP { 0 } else { off.signum() as i8 };
+        self.odd_rows = if side == 0 || self.odd_rows.signum() * side < 0 { side } else { self.odd_rows + side };
+        if self.odd_rows.unsigned_abs() >= JUMP_ROWS {
+            self.odd_rows = 0;
+            self.open();
+            self.update(observed, 1.0);
+            return true;
+        }
+        self.update(observed, (off.abs() / HUBER).max(1.0));
+        false
+    }
+
+    /// Takes an observation whose variance is multiplied so that the innovation counts linearly beyond the limit.
+    pub(super) fn update(&mut self, observed: &Observation, beyond: f64) {
+        let (with, total) = self.by_slope(observed);
+        let total = total * beyond;
+        for (mean, with) in self.mean.iter_mut().zip(&with) {
+            *mean += with / total * observed.innovation;
+        }
+        for i in 0..STATES {
+            for j in i..STATES {
+                self.covariance[pair(i, j)] -= with[i] * with[j] / total;
+            }
+        }
+    }
+
+    /// Whether no row contradicts what is known.
+    pub(super) fn is_settled(&self) -> bool {
+        self.odd_rows == 0
+    }
+
+    /// Continues with these means.
+    pub(super) fn settle(&mut self, mean: &[f64; STATES]) {
+        (self.mean, self.odd_rows) = (*mean, 0);
+    }
+
+    /// The cell may be another one, or its contact or channel.
+    fn open(&mut self) {
+        for (i, std) in JUMP_STD.iter().enumerate() {
+            self.covariance[pair(i, i)] += std * std;
+        }
+    }
+
+    /// Checks the numbers of a stored filter.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless_numbers(
+            "a cell's difference from its pack",
+            self.mean.iter().chain(&self.covariance).copied(),
+        )?;
+        (0..STATES).try_for_each(|i| {
+            InvalidState::unless_natural("the variance of a cell's difference", self.covariance[pair(i, i)])
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Days of driving and rest of a cell with these differences, as an ideal channel sees it.
+    fn watched(truth: [f64; STATES], days: usize) -> Difference {
+        let (mut filter, mut charge, mut soc) = (Difference::new(), truth[SOC], 0.8);
+        for row in 0..days * 60 {
+            let change = match row % 60 {
+                0..30 => -0.02,
+                30..40 => 0.06,
+                _ => 0.0,
+            };
+            let (passed_days, current) = (if change == 0.0 { 1.0 / 30.0 } else { 1.0 / 120.0 }, -change);
+            soc += change;
+            charge += -truth[CAPACITY] * change - truth[LEAK] * passed_days;
+            filter.pass(passed_days, change);
+            // A curve that is not straight, a drop whose slow part comes late, a contact.
+            let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
+            let drop_v = 3.0 * current + if row % 2 == 0 { 0.02 } else { 0.0 };
+            let slope = [slope_v, 0.0, -drop_v, -1.5 * current, 1.0, 0.0];
+            let states = [charge, truth[CAPACITY], truth[RESISTANCE], truth[CONTACT], truth[CHANNEL], truth[LEAK]];
+            let differs: f64 = slope.iter().zip(&states).zip(filter.mean()).map(|((s, x), m)| s * (x - m)).sum();
+            filter.observe(&Observation { innovation: differs, slope, variance: 4e-6 });
+        }
+        filter
+    }
+
+    #[test]
+    fn each_state_is_found_and_none_is_taken_for_another() {
+        let faults = [(CAPACITY, -0.1), (RESISTANCE, 0.2), (CONTACT, 0.2), (CHANNEL, 0.03), (LEAK, 0.002)];
+        for (state, size) in faults {
+            let mut truth = [0.0; STATES];
+            truth[state] = size;
+            let filter = watched(truth, 14);
+            for (other, expected) in truth.iter().enumerate().skip(1) {
+                let found = filter.state(other);
+                let off = (found.mean - expected).abs();
+                assert!(off < 3.0 * found.std() + 1e-9, "{state}: state {other} is {found:?}, not {expected}");
+            }
+            assert!((filter.state(state).mean / size - 1.0).abs() < 0.15, "{state}: {:?}", filter.state(state));
+        }
+    }
+
+    #[test]
+    fn a_sudden_change_is_noted_once_and_followed() {
+        let mut filter = watched([0.0; STATES], 5);
+        let row = |filter: &Difference| Observation {
+            innovation: 0.03 - filter.mean()[SOC] - filter.mean()[CHANNEL],
+            slope: [1.0, 0.0, -0.05, -0.02, 1.0, 0.0],
+            variance: 4e-6,
+        };
+        let jumps: Vec<bool> = (0..20)
+            .map(|_| {
+                let observed = row(&filter);
+                filter.pass(0.003, 0.0);
+                filter.observe(&observed)
+            })
+            .collect();
+        assert_eq!(jumps.iter().filter(|jumped| **jumped).count(), 1);
+        assert!(jumps[2], "at the third row");
+        assert!(row(&filter).innovation.abs() < 0.003, "{:?}", row(&filter));
+    }
+}

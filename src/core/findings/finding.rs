@@ -1,0 +1,141 @@
+//! What is found, and from when on it is told.
+
+use serde::{Deserialize, Serialize};
+
+use crate::filter::ScalarGaussian;
+use crate::quantity::{CellIndex, Timestamp};
+
+/// What is wrong. The number is the one on the wire, never reused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum FindingKind {
+    /// The cell loses charge against the others; fraction of its capacity in a day.
+    Leak = 1,
+    /// The contact resistance of its connection is higher than that of the others; fraction of the cell's series resistance.
+    Contact = 2,
+    /// Its capacity is below that of the others; fraction.
+    WeakCell = 3,
+    /// Its resistance is above that of the others, as of an aged cell; fraction.
+    HighResistance = 4,
+    /// Its capacity is above that of the others: a cell of another age; fraction.
+    ForeignCell = 5,
+    /// Several cells side by side have changed at once: a replaced module; mean change of their capacity, fraction.
+    Module = 6,
+    /// Its voltage channel is off by a constant; V.
+    VoltageChannel = 7,
+    /// Its voltage channel stays at one value; the value is 1.
+    VoltageFrozen = 8,
+    /// Two voltage channels show the values of one cell; the value is 1.
+    DoubledChannels = 9,
+    /// Two voltage channels have been exchanged; the value is 1.
+    SwappedChannels = 10,
+}
+
+impl FindingKind {
+    /// Every kind, in the order of the wire.
+    pub const ALL: [Self; 10] = [
+        Self::Leak,
+        Self::Contact,
+        Self::WeakCell,
+        Self::HighResistance,
+        Self::ForeignCell,
+        Self::Module,
+        Self::VoltageChannel,
+        Self::VoltageFrozen,
+        Self::DoubledChannels,
+        Self::SwappedChannels,
+    ];
+
+    /// As written in events, status and reports.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Leak => "leak",
+            Self::Contact => "contact",
+            Self::WeakCell => "weak_cell",
+            Self::HighResistance => "high_resistance",
+            Self::ForeignCell => "foreign_cell",
+            Self::Module => "module",
+            Self::VoltageChannel => "voltage_channel",
+            Self::VoltageFrozen => "voltage_frozen",
+            Self::DoubledChannels => "doubled_channels",
+            Self::SwappedChannels => "swapped_channels",
+        }
+    }
+
+    /// In words.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Leak => "loses charge by itself",
+            Self::Contact => "high contact resistance",
+            Self::WeakCell => "less capacity than the others",
+            Self::HighResistance => "more resistance than the others",
+            Self::ForeignCell => "more capacity than the others",
+            Self::Module => "replaced together",
+            Self::VoltageChannel => "voltage channel off",
+            Self::VoltageFrozen => "voltage channel frozen",
+            Self::DoubledChannels => "two channels of one cell",
+            Self::SwappedChannels => "two channels exchanged",
+        }
+    }
+
+    /// What to do about it.
+    pub const fn advice(self) -> &'static str {
+        match self {
+            Self::Leak => {
+                "a soft internal short, moisture or a balancing resistor that stays on: measure the cell's rest voltage \
+                           over a week, and replace it when the leak grows"
+            }
+            Self::Contact => "tighten and clean the connections of the cell; a loose one heats under load",
+            Self::WeakCell => "the pack ends with this cell: plan its replacement",
+            Self::HighResistance => "the cell has aged more than the others: watch its temperature under load",
+            Self::ForeignCell => "the cell has been replaced: balance the pack",
+            Self::Module => "modules have been replaced: balance the pack; their history begins anew",
+            Self::VoltageChannel => "compare the channel with a voltmeter, and check its sense wire",
+            Self::VoltageFrozen => "the channel shows no cell: check monitor chip and sense wire",
+            Self::DoubledChannels => "check the wiring of the two channels and the layout of their frames",
+            Self::SwappedChannels => "the sense wires or the signals of the two channels are exchanged",
+        }
+    }
+
+    /// Whether it is the measurement that fails, so that nothing is known of the cell.
+    pub const fn is_of_channel(self) -> bool {
+        matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
+    }
+}
+
+/// A finding.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Finding {
+    /// What.
+    pub kind: FindingKind,
+    /// First and last cell of it; of two channels the lower and the upper one.
+    pub cells: (CellIndex, CellIndex),
+    /// When it was first likelier than not.
+    pub since: Timestamp,
+    /// When it was first told.
+    pub told: Timestamp,
+    /// Probability that it is beyond the limit of its kind.
+    pub probability: f64,
+    /// How large; the unit is that of the kind.
+    pub size: ScalarGaussian,
+}
+
+/// Leak beyond which it is one, fraction of the capacity in a day: healthy cells of one pack differ by less than 0.5 % a month.
+pub const LEAK_PER_DAY: f64 = 5e-4;
+/// The same of contact, capacity and resistance, fractions, and of the channel, V.
+pub const CONTACT: f64 = 0.1;
+/// See [`CONTACT`].
+pub const CAPACITY: f64 = 0.05;
+/// See [`CONTACT`].
+pub const RESISTANCE: f64 = 0.1;
+/// See [`CONTACT`].
+pub const CHANNEL_V: f64 = 0.015;
+
+/// Probability from which on a finding is told, and below which it is withdrawn.
+pub(super) const TOLD: f64 = 0.999;
+pub(super) const WITHDRAWN: f64 = 0.5;
+
+/// Least distance from the middle of the pack in robust standard deviations of its cells: cells of one kind differ.
+pub(super) const OUTLIER: f64 = 3.5;

@@ -1,0 +1,23 @@
+//! Which cell is failing, and how: each cell against the others of its pack.
+//!
+//! In: samples of the cells of one pack in series, and what the estimators know of the mean cell. Out: [`Finding`]s. All cells
+//! carry the same current, so what is common to them (model, SOC, sensor of the current) cancels in the differences, and a
+//! cell stands out by a few millivolts. A single cell has no others: nothing is found.
+//!
+//! | file | purpose |
+//! | --- | --- |
+//! | [`diagnosis`] | all cells: rows in, findings out |
+//! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
+//! | `row` | samples of some minutes, summed per cell |
+//! | `channels` | channels that are frozen or doubled |
+//! | [`finding`] | kinds of findings, and from when on one is told |
+pub mod diagnosis;
+pub mod difference;
+pub mod finding;
+
+mod channels;
+mod row;
+
+pub use diagnosis::{Diagnosis, MeanCell};
+pub use difference::Difference;
+pub use finding::{Finding, FindingKind};

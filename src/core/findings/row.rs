@@ -1,0 +1,82 @@
+//! A row: the samples of some minutes, summed per cell.
+
+use serde::{Deserialize, Serialize};
+
+use crate::quantity::Timestamp;
+
+/// Longest time between two samples whose difference shows the resistance, s.
+const STEP_S: f64 = 3.0;
+
+/// Sums of one cell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct CellSums {
+    pub(super) count: u32,
+    /// Voltage without the mean cell's ohmic drop at the cell's own current: samples of the cells are of different moments.
+    voltage_v: f64,
+    /// Of the steps from sample to sample: squares of the current, products with the voltage.
+    steps_a2: f64,
+    steps_va: f64,
+    /// Time, voltage and current of the sample before.
+    last: Option<(Timestamp, f64, f64)>,
+    /// Bits of the voltages in their order, mixed, and how often the voltage has changed.
+    pub(super) digest: u64,
+    pub(super) changes: u32,
+}
+
+impl CellSums {
+    /// Adds a sample: V, A; `ohm` is the mean cell's series resistance.
+    #[inline]
+    pub(super) fn add(&mut self, time: Timestamp, voltage_v: f64, current_a: f64, ohm: f64) {
+        self.count += 1;
+        self.voltage_v += voltage_v + ohm * current_a;
+        if let Some((before, last_v, last_a)) = self.last.replace((time, voltage_v, current_a)) {
+            let (step_v, step_a) = (voltage_v - last_v, current_a - last_a);
+            if time.since(before) <= STEP_S {
+                self.steps_a2 += step_a * step_a;
+                self.steps_va += step_a * step_v;
+            }
+            self.changes += u32::from(step_v != 0.0);
+        }
+        self.digest = (self.digest.rotate_left(5) ^ voltage_v.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    }
+
+    /// Mean voltage, V; `None` = no sample.
+    pub(super) fn mean_v(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.voltage_v / f64::from(self.count))
+    }
+
+    /// Series resistance by the steps, ohm, when their squares are at least `least_a2`; and these.
+    pub(super) fn ohm(&self, least_a2: f64) -> Option<(f64, f64)> {
+        (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))
+    }
+
+    /// Begins the next row.
+    pub(super) fn begin(&mut self) {
+        *self = Self { last: self.last, ..Self::default() };
+    }
+
+    /// What follows does not hang together with the samples so far.
+    pub(super) fn interrupt(&mut self) {
+        *self = Self::default();
+    }
+
+    pub(super) fn numbers(&self) -> [f64; 5] {
+        let (_, voltage_v, current_a) = self.last.unwrap_or((Timestamp::ZERO, 0.0, 0.0));
+        [self.voltage_v, self.steps_a2, self.steps_va, voltage_v, current_a]
+    }
+}
+
+/// Sums of the pack.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct PackSums {
+    pub(super) begun: Option<Timestamp>,
+    pub(super) last: Option<Timestamp>,
+    pub(super) count: u32,
+    pub(super) current_a: f64,
+    pub(super) drop_v: f64,
+    pub(super) soc: f64,
+    pub(super) temperature_c: f64,
+    /// Charge beyond the first, and the first, Ah.
+    pub(super) charge_ah: f64,
+    pub(super) first_ah: f64,
+}

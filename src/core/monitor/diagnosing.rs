@@ -1,0 +1,89 @@
+//! Diagnosis stage: from cell samples to findings about single cells.
+//!
+//! In: the samples of all cells with their estimates. Out: an event for each finding that is new ([`EventKind::Finding`]).
+//! It only watches: no estimate and no capacity depends on it.
+
+use super::estimation::Estimation;
+use super::learning::Learning;
+use super::{Event, EventKind, Outputs};
+use crate::findings::{Diagnosis, MeanCell};
+use crate::quantity::Timestamp;
+use crate::sample::CellSample;
+
+/// The diagnosis stage.
+#[derive(Debug)]
+pub(super) struct Diagnosing {
+    pub(super) diagnosis: Diagnosis,
+}
+
+impl Diagnosing {
+    pub(super) fn new(cells: usize) -> Self {
+        Self { diagnosis: Diagnosis::new(cells) }
+    }
+
+    /// Forgets everything: another pack is connected.
+    pub(super) fn forget(&mut self, cells: usize) {
+        *self = Self::new(cells);
+    }
+
+    /// The state, to be stored; `None` = the pack is too small for a comparison.
+    pub(super) fn stored(&self) -> Option<Diagnosis> {
+        self.diagnosis.is_active().then(|| self.diagnosis.clone())
+    }
+
+    /// Continues from a checked state. `is_continued`: without a break.
+    pub(super) fn restore(&mut self, stored: Option<Diagnosis>, is_continued: bool) {
+        let Some(stored) = stored else { return };
+        self.diagnosis = stored;
+        if !is_continued {
+            self.diagnosis.interrupt();
+        }
+    }
+
+    /// Takes samples that have made their step.
+    #[inline]
+    pub(super) fn observe(
+        &mut self,
+        now: Timestamp,
+        samples: &[CellSample],
+        estimation: &Estimation,
+        learning: &Learning,
+        out: &mut Outputs,
+    ) {
+        if !self.diagnosis.is_active() {
+            return;
+        }
+        for sample in samples {
+            self.diagnosis.add(sample.cell.index(), sample.time, sample.voltage_v, sample.current_a);
+        }
+        self.observe_mean(now, samples, estimation, learning, out);
+    }
+
+    fn observe_mean(
+        &mut self,
+        now: Timestamp,
+        samples: &[CellSample],
+        estimation: &Estimation,
+        learning: &Learning,
+        out: &mut Outputs,
+    ) {
+        let middle = self.diagnosis.middle();
+        let Some(sample) = samples.iter().find(|sample| sample.cell.index() == middle) else { return };
+        let bank = &estimation.bank;
+        let (Some(soc), Some(current_a)) = (bank.filtered_soc(middle), sample.current_a) else {
+            return self.diagnosis.interrupt();
+        };
+        let (model, capacity_ah) = (bank.model(), learning.capacity(middle).mean);
+        let temperature_c = bank.temperature_c(middle).unwrap_or(estimation.ambient_c());
+        let position = model.grid_position(soc.mean.clamp(0.0, 1.0), temperature_c);
+        let ohm = model.r0_ohm(&position) * libm::exp(bank.log_resistance(middle).mean);
+        let drop_v = current_a * ohm + bank.branch_v(middle)[..model.branches.len()].iter().sum::<f64>();
+        let charge_ah = sample.charge_as / 3600.0;
+        let mean = MeanCell { soc: soc.mean, current_a, drop_v, temperature_c, charge_ah };
+        if self.diagnosis.note(sample.time, &mean, capacity_ah) {
+            let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
+            let told = self.diagnosis.close_row(model, capacity_ah, socs);
+            out.events.extend(told.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+        }
+    }
+}
