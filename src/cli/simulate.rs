@@ -19,7 +19,7 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
-use output::{LogWriter, TruthWriter};
+use output::{LogWriter, TruthColumns, TruthWriter};
 use player::Player;
 
 /// Time between frames sent together, ns: a classic frame of 8 bytes at 1 Mbit/s.
@@ -69,10 +69,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let settings = settings_for(args, &config)?;
     let monitor = &config.monitor;
-    let mut sim = Simulation::new(monitor.model.clone(), settings, wiring(&monitor.sample));
+    let wiring = wiring(&monitor.sample);
+    let sensors = u16::try_from(wiring.temperature_at.len()).unwrap_or(u16::MAX);
+    let sim = Simulation::new(monitor.model.clone(), settings, wiring);
+    let faults = &args.changes.faults;
+    let mut sim = faults.apply(sim, settings.pack.cells, sensors, settings.pack.capacity_ah)?;
     let mut sink = Sink::open(args, &config)?;
     let mut truth = match &args.truth {
-        Some(path) => Some(TruthWriter::create(path, monitor.model.branches.len(), args.truth_period)?),
+        Some(path) => {
+            let columns = TruthColumns { branches: monitor.model.branches.len(), faults: faults.changes_truth() };
+            Some(TruthWriter::create(path, columns, args.truth_period)?)
+        }
         None => None,
     };
     let start = Timestamp::from_nanos(i64::from(args.start) * 1_000_000_000);

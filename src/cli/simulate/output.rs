@@ -80,22 +80,33 @@ impl LogWriter {
     }
 }
 
+/// Columns of the truth that not every simulation has.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TruthColumns {
+    /// RC branches of the cell model.
+    pub(super) branches: usize,
+    /// Leak, balancing and contact resistance.
+    pub(super) faults: bool,
+}
+
 /// The true state as CSV.
 pub(super) struct TruthWriter {
     target: Target,
-    branches: usize,
+    columns: TruthColumns,
     period_ns: i64,
     next: Option<Timestamp>,
 }
 
 impl TruthWriter {
-    pub(super) fn create(path: &Path, branches: usize, period_s: f64) -> Result<Self, Failure> {
+    pub(super) fn create(path: &Path, columns: TruthColumns, period_s: f64) -> Result<Self, Failure> {
         let mut target = Target::create(path)?;
-        let columns: String = (1..=branches).map(|i| format!("u{i}_v,")).collect();
+        let branches: String = (1..=columns.branches).map(|i| format!("u{i}_v,")).collect();
+        let faults = if columns.faults { ",leak_a,bleeding,contact_ohm" } else { "" };
         target.write(|out| {
-            writeln!(out, "time_s,cell,soc,{columns}capacity_ah,resistance_ratio,current_a,voltage_v,temperature_c")
+            let rest = "capacity_ah,resistance_ratio,current_a,voltage_v,temperature_c";
+            writeln!(out, "time_s,cell,soc,{branches}{rest}{faults}")
         })?;
-        Ok(Self { target, branches, period_ns: Timestamp::from_secs(period_s).nanos(), next: None })
+        Ok(Self { target, columns, period_ns: Timestamp::from_secs(period_s).nanos(), next: None })
     }
 
     /// One row per cell when a row is due and the cells were sampled.
@@ -106,15 +117,20 @@ impl TruthWriter {
         self.next = Some(moment.time.plus_nanos(self.period_ns));
         let time_ns = start.plus_nanos(moment.time.nanos()).nanos();
         let (seconds, micros) = (time_ns / 1_000_000_000, time_ns % 1_000_000_000 / 1000);
-        let (branches, current_a) = (self.branches, moment.current_a);
+        let (columns, current_a, pack) = (self.columns, moment.current_a, sim.pack());
         self.target.write(|out| {
-            for (cell, (truth, voltage_v)) in sim.pack().cells().iter().zip(sim.voltages_v()).enumerate() {
+            let cells = pack.cells().iter().zip(sim.voltages_v()).zip(pack.leaks_a());
+            for (cell, ((truth, voltage_v), leak_a)) in cells.enumerate() {
                 write!(out, "{seconds}.{micros:06},{cell},{:.9}", truth.soc)?;
-                for u in &truth.branch_v[..branches] {
+                for u in &truth.branch_v[..columns.branches] {
                     write!(out, ",{u:.6}")?;
                 }
                 let (capacity, ratio, celsius) = (truth.capacity_ah, truth.resistance_ratio, truth.temperature_c);
-                writeln!(out, ",{capacity:.6},{ratio:.6},{current_a:.6},{voltage_v:.6},{celsius:.3}")?;
+                write!(out, ",{capacity:.6},{ratio:.6},{current_a:.6},{voltage_v:.6},{celsius:.3}")?;
+                if columns.faults {
+                    write!(out, ",{leak_a:.6},{},{:.6}", u8::from(truth.bleed_a > 0.0), truth.contact_ohm)?;
+                }
+                writeln!(out)?;
             }
             Ok(())
         })

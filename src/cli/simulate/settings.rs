@@ -1,8 +1,8 @@
 //! Changes of a scenario's settings by the command line.
 
 use crate::cli::Failure;
-use crate::cli::numbers::{NamedValue, between, finite, share, within};
-use crate::sim::{Hysteresis, PackSettings, Scenario, Sensors, Settings};
+use crate::cli::numbers::{NamedValue, between, finite, one_of, share, within};
+use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 
 /// Scenarios by name.
 pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
@@ -10,6 +10,13 @@ pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
     ("reference", Scenario::Reference, "The 30 Ah example: random discharge pulses, 1 Ah lost per cycle"),
     ("random-walk", Scenario::RandomWalk, "Random 5-minute loads with reference cycles in between"),
     ("ev-day", Scenario::EvDay, "A day of an electric car: drive, park asleep, fast charge"),
+];
+
+/// Qualities of sensors by name.
+const QUALITIES: [NamedValue<SensorQuality>; 3] = [
+    ("good", SensorQuality::Good, "Offset 1 mV in steps of 0.1 mV, current 0.1 % + 5 mA, 0.3 K"),
+    ("usual", SensorQuality::Usual, "Offset 5 mV in steps of 1 mV, current 0.5 % + 50 mA, 1 K"),
+    ("poor", SensorQuality::Poor, "Offset 15 mV in steps of 5 mV, current 2 % + 300 mA, 3 K"),
 ];
 
 /// All changes; without one the scenario's setting applies. Amounts of a scenario (currents, losses) are stated for its
@@ -29,6 +36,8 @@ pub(super) struct Changes {
     pub(super) pack: PackChanges,
     #[command(flatten)]
     sensors: SensorChanges,
+    #[command(flatten)]
+    pub(super) faults: FaultArgs,
     /// Time between current samples, ms (ev-day: 10, others: 1000)
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
     period: Option<u32>,
@@ -78,9 +87,53 @@ pub(super) struct PackChanges {
     leakage: Option<f64>,
 }
 
+/// Faults and the BMS that balances.
+#[derive(Debug, clap::Args)]
+pub(super) struct FaultArgs {
+    /// Inject a fault; may be repeated
+    ///
+    /// Cells and temperature sensors count from 1. @WHEN is the time from the start at which the fault begins: day3, 3d,
+    /// 12h or 900s; without it the fault is there from the start.
+    ///
+    /// Cells: leak:CELL:20mA, leak:CELL:1kohm, weak:CELL:-10% (capacity), resistance:CELL:+20% (all of the cell's),
+    /// contact:CELL:0.4mohm, contact:CELL:+20% (of the cell's ohmic resistance), module:FIRST-LAST:+15% (replaced).
+    ///
+    /// Sensors: current-offset:50mA, current-gain:+1%, current-stuck, voltage-offset:CELL:10mV, voltage-stuck:CELL,
+    /// swap:CELL:CELL, double:CELL:CELL (the second shows the first), temperature-stuck:SENSOR, temperature-off:SENSOR.
+    #[arg(long = "fault", value_name = "KIND:...[@WHEN]", value_parser = str::parse::<Fault>)]
+    faults: Vec<Fault>,
+    /// Balance the cells near the end of a charge and in the rest after it, by a thousandth of the capacity per hour
+    #[arg(long)]
+    balancing: bool,
+}
+
+impl FaultArgs {
+    /// Whether the truth has more columns.
+    pub(super) fn changes_truth(&self) -> bool {
+        self.balancing || !self.faults.is_empty()
+    }
+
+    /// Adds them to `sim`.
+    pub(super) fn apply(
+        &self,
+        sim: Simulation,
+        cells: u16,
+        sensors: u16,
+        capacity_ah: f64,
+    ) -> Result<Simulation, Failure> {
+        let check = |fault: &Fault| fault.kind.check(cells, sensors);
+        self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
+        let sim = sim.with_faults(&self.faults);
+        Ok(if self.balancing { sim.with_balancing(Balancing::usual(capacity_ah)) } else { sim })
+    }
+}
+
 /// Changes of the sensors.
 #[derive(Debug, clap::Args)]
 struct SensorChanges {
+    /// Quality of the sensors: errors that are constant per channel, and noise of one step; other options change them
+    #[arg(long, value_name = "QUALITY", value_parser = one_of(&QUALITIES))]
+    sensors: Option<SensorQuality>,
     /// White noise of cell voltages, V (paper: 0.005)
     #[arg(long, value_name = "V", value_parser = non_negative)]
     noise_voltage: Option<f64>,
@@ -157,6 +210,7 @@ impl PackChanges {
 
 impl SensorChanges {
     fn apply(&self, sensors: &mut Sensors) {
+        *sensors = self.sensors.map_or(*sensors, Sensors::of_quality);
         set(&mut sensors.voltage.noise_std, self.noise_voltage);
         set(&mut sensors.voltage.offset, self.offset_voltage);
         set(&mut sensors.voltage.resolution, self.resolution_voltage);

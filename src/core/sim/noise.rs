@@ -25,6 +25,9 @@ pub(crate) enum Stream {
     CellVoltage(u16),
 }
 
+/// Number of the first stream of constant errors of sensors; the streams of noise are all below.
+const CHANNEL: u64 = 0x10_0000;
+
 impl Stream {
     fn number(self) -> u64 {
         match self {
@@ -48,8 +51,17 @@ pub(crate) struct Noise {
 impl Noise {
     /// The numbers of one stream of `seed`.
     pub(crate) fn new(seed: u64, stream: Stream) -> Self {
+        Self::of_number(seed, stream.number())
+    }
+
+    /// The numbers of the constant errors of a sensor whose noise is `stream`.
+    pub(crate) fn of_channel(seed: u64, stream: Stream) -> Self {
+        Self::of_number(seed, CHANNEL + stream.number())
+    }
+
+    fn of_number(seed: u64, number: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
-        generator.set_stream(stream.number());
+        generator.set_stream(number);
         Self { generator, spare_normal: None }
     }
 

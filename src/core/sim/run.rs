@@ -5,7 +5,10 @@
 //! the mean current over it: charge is exact, and a branch voltage differs from stepping at every current sample by
 //! less than half a period over its time constant, relative.
 
+use super::balancing::{Balancer, Balancing};
 use super::course::{Course, Demand};
+use super::fault::Fault;
+use super::fault::sensed::SensorFaults;
 use super::noise::Stream;
 use super::scenario::Settings;
 use super::sensor::{Sensor, SensorError};
@@ -56,7 +59,7 @@ impl PackSensors {
     fn new(settings: &Settings, temperatures: usize) -> Self {
         let (seed, errors, cells) = (settings.seed, settings.sensors, settings.pack.cells);
         let noise_std = errors.voltage.noise_std * f64::from(cells).sqrt();
-        let pack_voltage = SensorError { noise_std, offset: 0.0, ..errors.voltage };
+        let pack_voltage = SensorError { noise_std, offset: 0.0, offset_std: 0.0, ..errors.voltage };
         let temperature = |i| Sensor::new(errors.temperature, seed, Stream::Temperature(i));
         let voltage = |i| Sensor::new(errors.voltage, seed, Stream::CellVoltage(i));
         Self {
@@ -83,6 +86,12 @@ pub struct Simulation {
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
+    /// Faults that have not begun, the next one last.
+    coming: Vec<Fault>,
+    sensor_faults: SensorFaults,
+    balancer: Option<Balancer>,
+    /// Voltages at the taps, then at the channels, V.
+    sensed_v: Vec<f64>,
 }
 
 impl Simulation {
@@ -98,9 +107,28 @@ impl Simulation {
             pending: (0.0, 0),
             cells_due: true,
             started: false,
+            coming: Vec::new(),
+            sensor_faults: SensorFaults::default(),
+            balancer: None,
+            sensed_v: Vec::new(),
             settings,
             wiring,
         }
+    }
+
+    /// Injects faults. Their cells and sensors must be the pack's ([`FaultKind::check`](super::FaultKind::check)).
+    #[must_use]
+    pub fn with_faults(mut self, faults: &[Fault]) -> Self {
+        self.coming.extend(faults.iter().rev());
+        self.coming.sort_by(|a, b| b.from_s.total_cmp(&a.from_s));
+        self
+    }
+
+    /// Lets the BMS balance the cells.
+    #[must_use]
+    pub fn with_balancing(mut self, balancing: Balancing) -> Self {
+        self.balancer = Some(Balancer::new(balancing));
+        self
     }
 
     /// Advances to the next sampling moment; `None` = the scenario is over.
@@ -110,6 +138,7 @@ impl Simulation {
         }
         self.started = true;
         let dt_s = self.settings.current_period_ns as f64 * 1e-9;
+        self.begin_faults(self.time);
         loop {
             if self.settings.duration_s.is_some_and(|end_s| self.time.secs() + 0.5 * dt_s >= end_s) {
                 return None;
@@ -157,7 +186,7 @@ impl Simulation {
         let (charge_as, ns) = std::mem::take(&mut self.pending);
         let dt_s = ns as f64 * 1e-9;
         if dt_s > 0.0 {
-            self.pack.step(charge_as / dt_s, dt_s);
+            self.step_cells(charge_as / dt_s, dt_s);
         }
         self.cells_due = true;
     }
@@ -165,29 +194,60 @@ impl Simulation {
     fn sleep(&mut self, duration_s: f64) {
         self.step_pending();
         let steps = (duration_s / ASLEEP_STEP_S).ceil().max(1.0);
-        for _ in 0..steps as u32 {
-            self.pack.step(0.0, duration_s / steps);
+        for step in 0..steps as u32 {
+            self.begin_faults(self.time.plus_secs(f64::from(step) * duration_s / steps));
+            self.step_cells(0.0, duration_s / steps);
         }
         self.time = self.time.plus_secs(duration_s);
+        self.begin_faults(self.time);
+    }
+
+    /// `current_a` flows for `dt_s` seconds; then the BMS switches its resistors.
+    fn step_cells(&mut self, current_a: f64, dt_s: f64) {
+        self.pack.step(current_a, dt_s);
+        if let Some(balancer) = &mut self.balancer {
+            let voltages = &self.sensors.voltages;
+            balancer.update(&mut self.pack, current_a, dt_s, |i| voltages[i].offset());
+        }
+    }
+
+    fn begin_faults(&mut self, now: Timestamp) {
+        while let Some(fault) = self.coming.pop_if(|fault| Timestamp::from_secs(fault.from_s) <= now) {
+            self.pack.begin_fault(fault.kind);
+            self.sensor_faults.begin(fault.kind);
+        }
     }
 
     fn measure(&mut self, cells: bool) {
         self.readings.clear();
-        let pack_current_a = self.current_a * f64::from(self.wiring.strings);
+        let pack_current_a = self.sensor_faults.current_a(self.current_a * f64::from(self.wiring.strings));
         self.readings.push((Channel::Current, self.sensors.current.read(pack_current_a)));
-        if !cells {
-            return;
+        if cells {
+            self.measure_temperatures();
+            self.measure_voltages();
         }
+        self.sensor_faults.distort_readings(&mut self.readings);
+    }
+
+    fn measure_temperatures(&mut self) {
+        let ambient_c = self.settings.pack.ambient_c;
         for (i, sensor) in (0..).zip(&mut self.sensors.temperatures) {
             let cell = self.wiring.temperature_at[usize::from(i)].and_then(|c| self.pack.cells().get(c.index()));
-            let truth = cell.map_or(self.settings.pack.ambient_c, |cell| cell.temperature_c);
+            let truth = cell.map_or(ambient_c, |cell| cell.temperature_c);
+            let truth = self.sensor_faults.temperature_c(SensorIndex(i), truth, ambient_c);
             self.readings.push((Channel::Temperature(SensorIndex(i)), sensor.read(truth)));
         }
-        let mut total_v = 0.0;
-        let voltages = self.pack.voltages_v(self.current_a);
-        for (i, (sensor, voltage_v)) in (0..).zip(self.sensors.voltages.iter_mut().zip(voltages)) {
-            total_v += voltage_v;
-            self.readings.push((Channel::CellVoltage(CellIndex(i)), sensor.read(voltage_v)));
+    }
+
+    /// A contact's resistance is between the taps: its drop is in the cell's channel and in the pack voltage.
+    fn measure_voltages(&mut self) {
+        self.sensed_v.clear();
+        let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());
+        self.sensed_v.extend(taps.map(|(voltage_v, cell)| voltage_v - self.current_a * cell.contact_ohm));
+        let total_v = self.sensed_v.iter().fold(0.0, |total_v, voltage_v| total_v + voltage_v);
+        self.sensor_faults.distort_voltages(&mut self.sensed_v);
+        for (i, (sensor, voltage_v)) in (0..).zip(self.sensors.voltages.iter_mut().zip(&self.sensed_v)) {
+            self.readings.push((Channel::CellVoltage(CellIndex(i)), sensor.read(*voltage_v)));
         }
         self.readings.push((Channel::PackVoltage, self.sensors.pack_voltage.read(total_v)));
     }

@@ -68,9 +68,9 @@ impl Scenario {
 
 /// Sensor errors of the paper's scenario in the accuracy requirement.
 const PAPER_SENSORS: Sensors = Sensors {
-    current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, resolution: 0.0, dropout: 0.0 },
-    voltage: SensorError { noise_std: 0.005, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0 },
-    temperature: SensorError { noise_std: 0.1, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0 },
+    current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::NONE },
+    voltage: SensorError { noise_std: 0.005, ..SensorError::NONE },
+    temperature: SensorError { noise_std: 0.1, ..SensorError::NONE },
 };
 
 const SECOND_NS: i64 = 1_000_000_000;

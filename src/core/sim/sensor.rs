@@ -2,7 +2,7 @@
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`, n normal and independent from sample to
 //! sample; or no reading at all with probability `dropout`. Resolution 0 leaves quantisation to the signal's own
-//! encoding in the DBC.
+//! encoding in the DBC. Each channel adds its own constant error, drawn once from the seed.
 
 use super::noise::{Noise, Stream};
 
@@ -19,7 +19,20 @@ pub struct SensorError {
     pub resolution: f64,
     /// Probability that a sample is missing.
     pub dropout: f64,
+    /// Standard deviation of the offset from channel to channel.
+    pub offset_std: f64,
+    /// Standard deviation of the relative error of the slope from channel to channel.
+    pub gain_std: f64,
 }
+
+impl SensorError {
+    /// A sensor without errors.
+    pub const NONE: Self =
+        Self { noise_std: 0.0, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0, offset_std: 0.0, gain_std: 0.0 };
+}
+
+/// Constant errors beyond this many standard deviations are cut off.
+const CHANNEL_LIMIT: f64 = 2.0;
 
 /// Errors of all sensors of a pack.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -32,6 +45,51 @@ pub struct Sensors {
     pub temperature: SensorError,
 }
 
+/// Quality of all sensors of a pack.
+///
+/// | quality | voltage | steps | current | steps | temperature |
+/// | --- | --- | --- | --- | --- | --- |
+/// | `Good` | 1 mV | 0.1 mV | 0.1 % + 5 mA | 1 mA | 0.3 K |
+/// | `Usual` | 5 mV | 1 mV | 0.5 % + 50 mA | 10 mA | 1 K |
+/// | `Poor` | 15 mV | 5 mV | 2 % + 300 mA | 60 mA | 3 K |
+///
+/// The errors are standard deviations over channels, cut off at two of them, and constant in time. The noise per sample is one step.
+/// Temperatures have steps of 0.1 K and noise of 0.02 K.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SensorQuality {
+    /// A laboratory's, or the best of a vehicle's.
+    Good,
+    /// Those of most vehicles.
+    Usual,
+    /// Cheap or old ones.
+    Poor,
+}
+
+impl Sensors {
+    /// The sensors of a quality.
+    pub fn of_quality(quality: SensorQuality) -> Self {
+        let (voltage, current, temperature_c) = match quality {
+            SensorQuality::Good => ((0.001, 0.0001), (0.001, 0.005, 0.001), 0.3),
+            SensorQuality::Usual => ((0.005, 0.001), (0.005, 0.05, 0.01), 1.0),
+            SensorQuality::Poor => ((0.015, 0.005), (0.02, 0.3, 0.06), 3.0),
+        };
+        let (offset_v, step_v) = voltage;
+        let (gain, offset_a, step_a) = current;
+        let none = SensorError::NONE;
+        Self {
+            current: SensorError {
+                noise_std: step_a,
+                resolution: step_a,
+                offset_std: offset_a,
+                gain_std: gain,
+                ..none
+            },
+            voltage: SensorError { noise_std: step_v, resolution: step_v, offset_std: offset_v, ..none },
+            temperature: SensorError { noise_std: 0.02, resolution: 0.1, offset_std: temperature_c, ..none },
+        }
+    }
+}
+
 /// One sensor with its own stream of noise.
 #[derive(Debug, Clone)]
 pub(crate) struct Sensor {
@@ -40,8 +98,17 @@ pub(crate) struct Sensor {
 }
 
 impl Sensor {
-    pub(crate) fn new(error: SensorError, seed: u64, stream: Stream) -> Self {
+    pub(crate) fn new(mut error: SensorError, seed: u64, stream: Stream) -> Self {
+        let mut channel = Noise::of_channel(seed, stream);
+        let mut draw = |std: f64| std * channel.normal().clamp(-CHANNEL_LIMIT, CHANNEL_LIMIT);
+        error.offset += draw(error.offset_std);
+        error.gain += draw(error.gain_std);
         Self { error, noise: Noise::new(seed, stream) }
+    }
+
+    /// The constant error of the channel.
+    pub(crate) fn offset(&self) -> f64 {
+        self.error.offset
     }
 
     /// The reading of `truth`; `None` = dropped out. Draws the same random numbers either way.

@@ -11,8 +11,10 @@
 //! Terminal voltage `V = OCV(SOC, T) + M h - sum U_i - I R0`.
 //! Ageing changes capacity and resistance; the SOC fraction stays (the reference example's plant does so too).
 
+use super::fault::{ContactResistance, FaultKind, Leak};
 use super::noise::{Noise, Stream};
 use crate::cell::{CellModel, MAX_BRANCHES};
+use crate::quantity::CellIndex;
 
 /// Open-circuit hysteresis the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,6 +81,10 @@ const CAPACITY_FLOOR: f64 = 0.01;
 /// Spread beyond this many standard deviations is cut off, so that no cell gets a negative capacity.
 const SPREAD_LIMIT: f64 = 3.0;
 
+/// Where the resistance of a contact is compared with the cell's: SOC, and temperature in degrees C.
+const REFERENCE_SOC: f64 = 0.5;
+const REFERENCE_C: f64 = 25.0;
+
 /// True state of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TruthCell {
@@ -96,6 +102,12 @@ pub struct TruthCell {
     pub resistance_ratio: f64,
     /// Charge moved so far in either direction, Ah.
     pub throughput_ah: f64,
+    /// Leak of an injected fault.
+    pub leak: Option<Leak>,
+    /// Current of the balancing resistor, A; 0 = off.
+    pub bleed_a: f64,
+    /// Resistance of an injected fault between the cell and its voltage taps, ohm; not part of the cell's own voltage.
+    pub contact_ohm: f64,
     floor_ah: f64,
 }
 
@@ -111,6 +123,9 @@ impl TruthCell {
             hysteresis: 0.0,
             temperature_c: settings.ambient_c,
             throughput_ah: 0.0,
+            leak: None,
+            bleed_a: 0.0,
+            contact_ohm: 0.0,
             floor_ah,
         }
     }
@@ -125,6 +140,16 @@ impl TruthCell {
     pub fn current_at_a(&self, model: &CellModel, hysteresis: &Hysteresis, voltage_v: f64) -> f64 {
         let place = model.grid_position(self.soc, self.temperature_c);
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
+    }
+
+    /// Current of the injected leak, A. It ends in an empty cell, and is too small for a drop in the terminal voltage.
+    pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
+        match self.leak {
+            None => 0.0,
+            Some(_) if self.soc <= 0.0 => 0.0,
+            Some(Leak::Current(current_a)) => current_a,
+            Some(Leak::Resistance(ohm)) => self.unloaded_v(model, hysteresis) / ohm,
+        }
     }
 
     fn unloaded_v(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
@@ -147,7 +172,8 @@ impl TruthCell {
             let e = libm::exp(-charge_ah.abs() * settings.hysteresis.rate / self.capacity_ah);
             self.hysteresis = self.hysteresis * e - (1.0 - e) * current_a.signum();
         }
-        self.soc -= (charge_ah + settings.leakage_a * dt_s / 3600.0) / self.capacity_ah;
+        let drain_a = settings.leakage_a + self.leak_a(model, &settings.hysteresis) + self.bleed_a;
+        self.soc -= (charge_ah + drain_a * dt_s / 3600.0) / self.capacity_ah;
         if let Some(thermal) = &model.thermal {
             let end_c = settings.ambient_c + thermal.resistance_k_per_w * heat_w;
             let tau_s = thermal.resistance_k_per_w * thermal.heat_capacity_j_per_k;
@@ -158,6 +184,10 @@ impl TruthCell {
             settings.ageing.capacity_loss_ah_per_ah * charge_ah.abs(),
             settings.ageing.resistance_growth_per_ah * charge_ah.abs(),
         );
+    }
+
+    fn change_capacity(&mut self, change: f64) {
+        self.capacity_ah = (self.capacity_ah * (1.0 + change)).max(self.floor_ah);
     }
 
     fn age(&mut self, capacity_loss_ah: f64, resistance_growth: f64) {
@@ -208,6 +238,58 @@ impl Pack {
     /// Changes the temperature of the surroundings, degrees C; the cells follow where their model has heat.
     pub fn set_ambient(&mut self, ambient_c: f64) {
         self.settings.ambient_c = ambient_c;
+    }
+
+    /// Begins a fault of a cell, a contact or a module; one of a sensor changes no truth.
+    pub(crate) fn begin_fault(&mut self, fault: FaultKind) {
+        match fault {
+            FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
+            FaultKind::Contact { cell, resistance } => {
+                let place = self.model.grid_position(REFERENCE_SOC, REFERENCE_C);
+                let cell = &mut self.cells[cell.index()];
+                cell.contact_ohm += match resistance {
+                    ContactResistance::Ohm(ohm) => ohm,
+                    ContactResistance::OfCell(share) => share * self.model.r0_ohm(&place) * cell.resistance_ratio,
+                };
+            }
+            FaultKind::Weak { cell, change } => self.cells[cell.index()].change_capacity(change),
+            FaultKind::Resistance { cell, change } => self.cells[cell.index()].resistance_ratio *= 1.0 + change,
+            FaultKind::Module { first, last, change } => {
+                let cells = &mut self.cells[first.index()..=last.index()];
+                let soc = cells.iter().map(|cell| cell.soc).sum::<f64>() / cells.len() as f64;
+                for cell in cells {
+                    cell.change_capacity(change);
+                    (cell.resistance_ratio, cell.soc) = (1.0, soc);
+                    (cell.leak, cell.throughput_ah) = (None, 0.0);
+                }
+            }
+            FaultKind::CurrentOffset(_)
+            | FaultKind::CurrentGain(_)
+            | FaultKind::CurrentStuck
+            | FaultKind::VoltageOffset { .. }
+            | FaultKind::VoltageStuck { .. }
+            | FaultKind::Swap(..)
+            | FaultKind::Double { .. }
+            | FaultKind::TemperatureStuck(_)
+            | FaultKind::TemperatureOff(_) => {}
+        }
+    }
+
+    /// Sets the current of each cell's balancing resistor, A.
+    pub(crate) fn set_bleeds(&mut self, mut bleed_a: impl FnMut(usize, &TruthCell) -> f64) {
+        for (i, cell) in self.cells.iter_mut().enumerate() {
+            cell.bleed_a = bleed_a(i, cell);
+        }
+    }
+
+    /// Whether the balancing resistor of `cell` is on.
+    pub fn bleeding(&self, cell: CellIndex) -> bool {
+        self.cells[cell.index()].bleed_a > 0.0
+    }
+
+    /// Current of each cell's injected leak, A.
+    pub fn leaks_a(&self) -> impl Iterator<Item = f64> + '_ {
+        self.cells.iter().map(|cell| cell.leak_a(&self.model, &self.settings.hysteresis))
     }
 
     /// Cycles completed.

@@ -1,0 +1,73 @@
+//! Passive balancing: a BMS that bleeds the cells whose voltage is above the lowest one's.
+//!
+//! It bleeds near the end of a charge and in the first rest after one, also while the buses sleep. A drive in between stops
+//! it for as long as it lasts. It compares voltages as its own channels see them, with their constant offsets and without
+//! their noise: a BMS averages.
+
+use super::truth::Pack;
+
+/// How a BMS balances.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Balancing {
+    /// Current of a balancing resistor, A.
+    pub bleed_a: f64,
+    /// A cell is bled from this far above the lowest, V.
+    pub start_v: f64,
+    /// A cell is bled until it is this far above the lowest, V.
+    pub stop_v: f64,
+    /// A charge is near its end when the fullest cell has this SOC.
+    pub from_soc: f64,
+}
+
+impl Balancing {
+    /// A usual BMS of a pack of `capacity_ah`: a thousandth of an hour's current (60 mA at 60 Ah), 10 mV, hysteresis 5 mV.
+    pub fn usual(capacity_ah: f64) -> Self {
+        Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
+    }
+}
+
+/// Shortest charge, s: regeneration is none.
+const MIN_CHARGE_S: f64 = 60.0;
+/// Largest current at rest, capacities per hour.
+const REST_C: f64 = 0.002;
+
+/// The BMS while it runs.
+#[derive(Debug, Clone)]
+pub(crate) struct Balancer {
+    settings: Balancing,
+    charging_s: f64,
+    /// A charge came near its end and no rest has followed yet, or it lasts.
+    is_armed: bool,
+    has_rested: bool,
+}
+
+impl Balancer {
+    pub(crate) fn new(settings: Balancing) -> Self {
+        Self { settings, charging_s: 0.0, is_armed: false, has_rested: false }
+    }
+
+    /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` gives a channel's offset.
+    pub(crate) fn update(&mut self, pack: &mut Pack, current_a: f64, dt_s: f64, offset_v: impl Fn(usize) -> f64) {
+        let is_rest = current_a.abs() <= REST_C * pack.lowest_capacity_ah();
+        self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
+        let ends_charge = self.charging_s >= MIN_CHARGE_S && pack.highest_soc() >= self.settings.from_soc;
+        if ends_charge {
+            (self.is_armed, self.has_rested) = (true, false);
+        } else if is_rest {
+            self.has_rested |= self.is_armed;
+        } else if self.has_rested {
+            (self.is_armed, self.has_rested) = (false, false);
+        }
+        if !ends_charge && !(is_rest && self.is_armed) {
+            pack.set_bleeds(|_, _| 0.0);
+            return;
+        }
+        let seen_v: Vec<f64> = pack.voltages_v(current_a).enumerate().map(|(i, v)| v + offset_v(i)).collect();
+        let lowest_v = seen_v.iter().copied().fold(f64::INFINITY, f64::min);
+        let Balancing { bleed_a, start_v, stop_v, .. } = self.settings;
+        pack.set_bleeds(|i, cell| {
+            let limit_v = if cell.bleed_a > 0.0 { stop_v } else { start_v };
+            if seen_v[i] - lowest_v > limit_v { bleed_a } else { 0.0 }
+        });
+    }
+}
