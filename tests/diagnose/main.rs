@@ -1,0 +1,192 @@
+//! Measures the diagnosis on simulated packs: healthy ones, and ones with one fault each.
+//!
+//! `cargo run --release --example diagnose -- [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--write]`
+//!
+//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); cells have spread. Every kind of fault is
+//! injected in packs with good, usual and poor sensors, with and without balancing, at a random cell on a random day of the first
+//! third. `--packs` are distributed over the rows, each at least one. `--write` writes `tests/diagnose.md`.
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
+
+mod finding;
+mod pack;
+mod score;
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
+
+use pack::{Case, PackSize};
+use packwatch::monitor::MonitorConfig;
+use packwatch::sim::{Fault, SensorQuality};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use score::Score;
+
+const SIZES: [PackSize; 2] = [PackSize { cells: 12, capacity_ah: 60.0 }, PackSize { cells: 10, capacity_ah: 5.0 }];
+const QUALITIES: [(&str, SensorQuality); 3] =
+    [("good", SensorQuality::Good), ("usual", SensorQuality::Usual), ("poor", SensorQuality::Poor)];
+
+/// Kinds of faults: name, pack size, text of the fault with places for two cells (A, B) and a sensor (S).
+const FAULTS: [(&str, usize, &str); 20] = [
+    ("healthy", 0, ""),
+    ("healthy", 1, ""),
+    ("leak 1 kohm", 0, "leak:A:1kohm"),
+    ("leak 20 mA", 0, "leak:A:20mA"),
+    ("leak 20 mA", 1, "leak:A:20mA"),
+    ("contact +20 %", 0, "contact:A:+20%"),
+    ("contact +20 %", 1, "contact:A:+20%"),
+    ("weak -10 %", 0, "weak:A:-10%"),
+    ("resistance +20 %", 0, "resistance:A:+20%"),
+    ("module +15 %", 0, "module:5-8:+15%"),
+    ("current offset 2 %", 0, "current-offset:1.2A"),
+    ("current gain +5 %", 0, "current-gain:+5%"),
+    ("current stuck", 0, "current-stuck"),
+    ("voltage offset 30 mV", 0, "voltage-offset:A:30mV"),
+    ("voltage stuck", 0, "voltage-stuck:A"),
+    ("swap", 0, "swap:A:B"),
+    ("double", 0, "double:A:B"),
+    ("temperature stuck", 0, "temperature-stuck:S"),
+    ("temperature off", 0, "temperature-off:S"),
+    ("temperature off", 1, "temperature-off:S"),
+];
+
+struct Options {
+    packs: usize,
+    days: u32,
+    period_ms: u32,
+    jobs: usize,
+    seed: u64,
+    only: String,
+    writes: bool,
+}
+
+impl Options {
+    fn parse() -> Result<Self, String> {
+        let mut options =
+            Self { packs: 120, days: 30, period_ms: 1000, jobs: 2, seed: 1, only: String::new(), writes: false };
+        let mut arguments = std::env::args().skip(1);
+        while let Some(name) = arguments.next() {
+            let mut number = || arguments.next().and_then(|text| text.parse::<u32>().ok()).filter(|n| *n > 0);
+            let missing = || format!("{name}: a number above 0 must follow");
+            match name.as_str() {
+                "--packs" => options.packs = number().ok_or_else(missing)? as usize,
+                "--days" => options.days = number().ok_or_else(missing)?,
+                "--period" => options.period_ms = number().ok_or_else(missing)?,
+                "--jobs" => options.jobs = number().ok_or_else(missing)? as usize,
+                "--seed" => options.seed = u64::from(number().ok_or_else(missing)?),
+                "--only" => options.only = arguments.next().ok_or("--only: a word must follow")?,
+                "--write" => options.writes = true,
+                _ => {
+                    return Err(format!("{name}, must be --packs, --days, --period, --jobs, --seed, --only or --write"));
+                }
+            }
+        }
+        Ok(options)
+    }
+}
+
+fn main() -> Result<(), String> {
+    let options = Options::parse()?;
+    let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
+    let mut configs = Vec::new();
+    for size in SIZES {
+        configs.push(pack::configuration(folder.path(), size)?);
+    }
+    let cases = cases(&options)?;
+    let started = Instant::now();
+    let scores = run_all(&cases, &configs, options.jobs);
+    let wall_s = started.elapsed().as_secs_f64();
+    let text = table(&scores, &options);
+    print!("{text}");
+    let months = cases.len() as f64 * f64::from(options.days) / 30.0;
+    let per_month_s = wall_s * options.jobs as f64 / months;
+    eprintln!(
+        "{} packs, {wall_s:.0} s on {} threads, {per_month_s:.2} s per pack-month and thread",
+        cases.len(),
+        options.jobs
+    );
+    if options.writes {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/diagnose.md");
+        std::fs::write(&path, text).map_err(|e| format!("{}: {e}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// A row of the table, in its order.
+type Row = (usize, usize, bool);
+
+fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
+    let mut rows = Vec::new();
+    for (f, (name, ..)) in FAULTS.iter().enumerate().filter(|(_, (name, ..))| name.contains(&options.only)) {
+        let _ = name;
+        rows.extend((0..QUALITIES.len()).flat_map(|q| [(f, q, false), (f, q, true)]));
+    }
+    let each = options.packs.div_ceil(rows.len().max(1)).max(1);
+    let mut cases = Vec::new();
+    for i in 0..each {
+        for row @ (f, q, is_balancing) in rows.iter().copied() {
+            let (_, size, text) = FAULTS[f];
+            // The same pack in every row: rows differ by their fault and sensors alone.
+            let seed = options.seed + i as u64;
+            let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
+            let fault = fault_of(text, size, seed, days)?;
+            cases.push((row, Case { size, quality, is_balancing, fault, seed, days, period_ms: options.period_ms }));
+        }
+    }
+    Ok(cases)
+}
+
+fn fault_of(text: &str, size: PackSize, seed: u64, days: u32) -> Result<Option<Fault>, String> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let mut dice = ChaCha8Rng::seed_from_u64(seed);
+    let mut below = |n: u32| dice.next_u32() % n;
+    let cells = u32::from(size.cells);
+    let (a, step, sensor) =
+        (below(cells), 1 + below(cells - 1), below(u32::from(size.cells.div_ceil(pack::CELLS_PER_SENSOR))));
+    let hours = 24 * days / 10 + below((24 * days).div_ceil(4)); // in the first third
+    let places = [("A", a), ("B", (a + step) % cells), ("S", sensor)];
+    let text = places
+        .iter()
+        .fold(text.to_owned(), |text, (place, n)| text.replace(&format!(":{place}"), &format!(":{}", n + 1)));
+    format!("{text}@{hours}h").parse().map(Some).map_err(|error| format!("{text}: {error}"))
+}
+
+fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], jobs: usize) -> BTreeMap<Row, Score> {
+    let (next, scores) = (AtomicUsize::new(0), Mutex::new(BTreeMap::<Row, Score>::new()));
+    std::thread::scope(|scope| {
+        for _ in 0..jobs {
+            scope.spawn(|| {
+                while let Some((row, case)) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    let seen = case.run(&configs[FAULTS[row.0].1]);
+                    if let Ok(mut scores) = scores.lock() {
+                        scores.entry(*row).or_default().add(case, &seen);
+                    }
+                }
+            });
+        }
+    });
+    scores.into_inner().unwrap_or_default()
+}
+
+fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {
+    let days = options.days;
+    let mut text = format!(
+        "# Diagnosis of simulated packs\n\nWritten by `cargo run --release --example diagnose -- --write`. {days} days each. Found: right kind and right \
+         cell. Delays in days from the beginning of the fault. Wrong cell: right kind, on other cells only. Wrong kind: in addition or instead. False: \
+         findings per pack-month without a fault.\n\n\
+         | fault | pack | sensors | balancing | packs | found | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
+         | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
+    );
+    for ((f, q, is_balancing), score) in scores {
+        let (name, size, _) = FAULTS[*f];
+        let PackSize { cells, capacity_ah } = SIZES[size];
+        let (quality, balancing) = (QUALITIES[*q].0, if *is_balancing { "on" } else { "off" });
+        let _ = writeln!(text, "| {name} | {cells} x {capacity_ah} Ah | {quality} | {balancing} | {} |", score.row());
+    }
+    text
+}

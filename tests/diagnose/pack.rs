@@ -1,0 +1,207 @@
+//! One simulated pack through the whole core: truth, sensors, frames of a DBC, `Monitor`.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use packwatch::can::encode::InputEncoder;
+use packwatch::config;
+use packwatch::io::ticks::Ticks;
+use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::quantity::{CellIndex, Timestamp};
+use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
+
+use crate::finding::{Finding, FindingKind, findings};
+
+/// A hole in the record longer than this is sleep, s.
+const SLEEP_GAP_S: f64 = 30.0;
+/// Time between two looks at the findings while the buses are awake, s.
+const LOOK_S: f64 = 300.0;
+/// Cells per temperature sensor.
+pub(crate) const CELLS_PER_SENSOR: u16 = 4;
+/// Capacity of the cells of the model file, Ah.
+const MODEL_AH: f64 = 2.6;
+
+/// Size of a pack.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct PackSize {
+    pub(crate) cells: u16,
+    pub(crate) capacity_ah: f64,
+}
+
+/// One pack to simulate.
+#[derive(Debug, Clone)]
+pub(crate) struct Case {
+    pub(crate) size: PackSize,
+    pub(crate) quality: SensorQuality,
+    pub(crate) is_balancing: bool,
+    pub(crate) fault: Option<Fault>,
+    pub(crate) seed: u64,
+    pub(crate) days: u32,
+    pub(crate) period_ms: u32,
+}
+
+/// When each finding was there for the first time, s from the start.
+pub(crate) type Seen = Vec<(f64, Finding)>;
+
+/// The configuration of a pack, written into `folder`.
+pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
+    let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
+    let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
+    write("pack.dbc", dbc(size.cells, sensors))?;
+    write("cell.toml", cell_model(size.capacity_ah)?)?;
+    write("pack.toml", pack(size, sensors))?;
+    let config = config::load(&folder.join("pack.toml")).map_err(|faults| faults.0.join("\n"))?;
+    Ok(config.monitor)
+}
+
+fn dbc(cells: u16, sensors: u16) -> String {
+    let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_: BMS\n\nBO_ 256 Pack: 8 BMS\n");
+    text += " SG_ Current : 0|24@1- (0.001,0) [-8000|8000] \"A\" BMS\n\nBO_ 272 Cells: 8 BMS\n";
+    text += " SG_ Page M : 0|8@1+ (1,0) [0|255] \"\" BMS\n";
+    for i in 0..cells {
+        let (page, bit) = (i / 3, 16 + 16 * (i % 3));
+        let _ = writeln!(text, " SG_ Voltage{} m{page} : {bit}|16@1+ (0.0001,0) [0|6.5] \"V\" BMS", i + 1);
+    }
+    text += "\nBO_ 288 Temperatures: 8 BMS\n";
+    for i in 0..sensors {
+        let _ = writeln!(text, " SG_ Temperature{} : {}|16@1- (0.1,0) [-100|200] \"degC\" BMS", i + 1, 16 * i);
+    }
+    text
+}
+
+/// The model of the repository's example cell, scaled.
+fn cell_model(capacity_ah: f64) -> Result<String, String> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells/example_nmc_2600.toml");
+    let text = std::fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let mut model: toml::Table = text.parse().map_err(|e| format!("{}: {e}", path.display()))?;
+    let k = capacity_ah / MODEL_AH;
+    for key in ["rated_capacity_ah", "capacity_ah"] {
+        model.insert(key.to_owned(), toml::Value::Float(capacity_ah));
+    }
+    scale(&mut model, k);
+    let thermal = [("heat_capacity_j_per_k", 45.0 * k), ("resistance_k_per_w", 8.0 / k)];
+    let thermal = thermal.into_iter().map(|(key, value)| (key.to_owned(), toml::Value::Float(value))).collect();
+    model.insert("thermal".to_owned(), toml::Value::Table(thermal));
+    toml::to_string(&model).map_err(|e| e.to_string())
+}
+
+/// Resistances by 1/k, capacitances by k, in all tables.
+fn scale(table: &mut toml::Table, k: f64) {
+    for (key, value) in table.iter_mut() {
+        match (key.as_str(), value) {
+            ("r0_ohm" | "r_ohm", value) => multiply(value, 1.0 / k),
+            ("c_farad", value) => multiply(value, k),
+            (_, toml::Value::Table(inner)) => scale(inner, k),
+            (_, toml::Value::Array(items)) => {
+                items.iter_mut().filter_map(toml::Value::as_table_mut).for_each(|inner| scale(inner, k));
+            }
+            _ => {}
+        }
+    }
+}
+
+fn multiply(value: &mut toml::Value, factor: f64) {
+    match value {
+        toml::Value::Array(items) => items.iter_mut().for_each(|item| multiply(item, factor)),
+        toml::Value::Float(x) => *x *= factor,
+        toml::Value::Integer(n) => *value = toml::Value::Float(*n as f64 * factor),
+        _ => {}
+    }
+}
+
+fn pack(size: PackSize, sensors: u16) -> String {
+    let PackSize { cells, capacity_ah } = size;
+    let (discharge_a, dead_band_a) = (5.0 * capacity_ah, 0.02 * capacity_ah);
+    let mut text = format!(
+        "[pack]\ncells = {cells}\ncell_model = \"cell.toml\"\nambient_c = 25.0\n\n[[interface]]\nname = \"can0\"\n\n\
+         [input]\ndbc = [\"pack.dbc\"]\n\n[input.current]\nsignal = \"Pack.Current\"\npositive = \"discharge\"\n\n\
+         [input.cell_voltage]\nsignal = \"Cells.Voltage{{n}}\"\n\n"
+    );
+    for i in 0..sensors {
+        let (first, last) = (i * CELLS_PER_SENSOR + 1, ((i + 1) * CELLS_PER_SENSOR).min(cells));
+        let name = i + 1;
+        let _ = writeln!(
+            text,
+            "[[input.temperature]]\nsignal = \"Temperatures.Temperature{name}\"\ncells = \"{first}-{last}\"\n"
+        );
+    }
+    text + &format!(
+        "[limits.current]\nmax_discharge_a = {discharge_a:?}\nmax_charge_a = {discharge_a:?}\nmax_age_s = 15.0\n\n\
+         [limits.voltage]\nmax_age_s = 15.0\n\n[limits.temperature]\nmax_age_s = 15.0\n\n\
+         [transition]\ndead_band_a = {dead_band_a:?}\nhysteresis_a = {:?}\nmin_duration_s = 30.0\n\n\
+         [[alarm]]\nrule = \"cell_imbalance\"\nwarning = \"3 %\"\nwhen = {{ probability = 0.95 }}\ndebounce_s = 60.0\n\n\
+         [[alarm]]\nrule = \"input_implausible\"\nwarning = \"20 %\"\ndebounce_s = 5.0\n\n\
+         [[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4.0\ndebounce_s = 600.0\n",
+        0.5 * dead_band_a
+    )
+}
+
+impl Case {
+    fn simulation(&self, config: &MonitorConfig) -> Simulation {
+        let mut settings = Settings::of(Scenario::EvDay, self.size.capacity_ah);
+        settings.seed = self.seed;
+        settings.pack.cells = self.size.cells;
+        settings.pack.spread = Spread { capacity: 0.01, resistance: 0.03, soc: 0.005 };
+        settings.sensors = Sensors::of_quality(self.quality);
+        settings.cycles = Some(self.days);
+        settings.duration_s = Some(86_400.0 * f64::from(self.days));
+        let period_ns = i64::from(self.period_ms) * 1_000_000;
+        (settings.current_period_ns, settings.cell_period_ns) = (period_ns, period_ns);
+        let sensors = self.size.cells.div_ceil(CELLS_PER_SENSOR);
+        let temperature_at = (0..sensors).map(|i| Some(CellIndex(i * CELLS_PER_SENSOR))).collect();
+        let sim = Simulation::new(config.model.clone(), settings, Wiring { strings: 1, temperature_at });
+        let sim = sim.with_faults(self.fault.as_slice());
+        if self.is_balancing { sim.with_balancing(Balancing::usual(self.size.capacity_ah)) } else { sim }
+    }
+
+    /// Runs the pack; the findings in the order in which they were there first.
+    pub(crate) fn run(&self, config: &MonitorConfig) -> Seen {
+        let mut sim = self.simulation(config);
+        let encoder = InputEncoder::new(&config.input);
+        let mut monitor = Monitor::new(config.clone());
+        let (mut ticks, mut out, mut frames) =
+            (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
+        let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);
+        while let Some(moment) = sim.advance() {
+            frames.clear();
+            encoder.encode(sim.readings(), &mut frames);
+            frames.sort_by_key(|(_, frame)| frame.id().raw());
+            ticks.advance(moment.time);
+            while let Some(time) = ticks.pop(monitor.next_due()) {
+                monitor.handle(Input::Tick { time }, &mut out);
+            }
+            for (bus, frame) in &frames {
+                monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+            }
+            out.clear();
+            if moment.time >= next_look {
+                next_look = moment.time.plus_secs(LOOK_S);
+                monitor.settle(&mut out);
+                seen.note(moment.time.secs(), &findings(&monitor));
+            }
+        }
+        seen.first
+    }
+}
+
+/// Collects the first time of each finding.
+#[derive(Debug, Default)]
+struct Looks {
+    first: Seen,
+    known: BTreeMap<(u8, Option<(CellIndex, CellIndex)>), ()>,
+}
+
+impl Looks {
+    fn note(&mut self, now_s: f64, found: &[Finding]) {
+        for finding in found {
+            if self.known.insert((code(finding.kind), finding.cells), ()).is_none() {
+                self.first.push((now_s, *finding));
+            }
+        }
+    }
+}
+
+fn code(kind: FindingKind) -> u8 {
+    kind as u8
+}

@@ -1,0 +1,102 @@
+//! Counts what was found against what was injected.
+
+use packwatch::quantity::CellIndex;
+use packwatch::sim::FaultKind;
+
+use crate::finding::FindingKind;
+use crate::pack::{CELLS_PER_SENSOR, Case, Seen};
+
+const DAY_S: f64 = 86_400.0;
+/// Days of a month.
+const MONTH_DAYS: f64 = 30.0;
+
+/// Counts of one row of the table.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Score {
+    packs: u32,
+    days: f64,
+    /// Days from the beginning of the fault to the right finding.
+    delays_days: Vec<f64>,
+    /// Packs whose fault was found on another cell only.
+    wrong_cell: u32,
+    /// Packs with a finding of another kind after the beginning.
+    wrong_kind: u32,
+    /// Packs with any finding after the beginning.
+    any: u32,
+    /// Findings before the beginning, or in a healthy pack.
+    false_findings: u32,
+    /// Days without a fault.
+    healthy_days: f64,
+}
+
+impl Score {
+    pub(crate) fn add(&mut self, case: &Case, seen: &Seen) {
+        self.packs += 1;
+        self.days += f64::from(case.days);
+        let from_s = case.fault.map_or(f64::INFINITY, |fault| fault.from_s);
+        self.healthy_days += f64::from(case.days).min(from_s / DAY_S);
+        self.false_findings +=
+            u32::try_from(seen.iter().filter(|(at_s, _)| *at_s < from_s).count()).unwrap_or(u32::MAX);
+        let Some(fault) = case.fault else { return };
+        let after = || seen.iter().filter(|(at_s, _)| *at_s >= from_s);
+        let (kind, cells) = (FindingKind::of(&fault.kind), places(&fault.kind));
+        let right = after().find(|(_, found)| found.kind == kind && is_right_place(&cells, found.cells));
+        self.delays_days.extend(right.map(|(at_s, _)| (at_s - from_s) / DAY_S));
+        let elsewhere = after().any(|(_, found)| found.kind == kind && !is_right_place(&cells, found.cells));
+        self.wrong_cell += u32::from(right.is_none() && elsewhere);
+        self.wrong_kind += u32::from(after().any(|(_, found)| found.kind != kind));
+        self.any += u32::from(after().next().is_some());
+    }
+
+    /// As cells of a Markdown row.
+    pub(crate) fn row(&self) -> String {
+        let share = |count: usize| format!("{:.0} %", 100.0 * count as f64 / f64::from(self.packs.max(1)));
+        let months = self.healthy_days / MONTH_DAYS;
+        let rate =
+            if months > 0.0 { format!("{:.2}", f64::from(self.false_findings) / months) } else { "-".to_owned() };
+        format!(
+            "{} | {} | {} | {} | {} | {} | {} | {rate}",
+            self.packs,
+            share(self.delays_days.len()),
+            self.delay(0.5),
+            self.delay(0.9),
+            share(self.wrong_cell as usize),
+            share(self.wrong_kind as usize),
+            share(self.any as usize),
+        )
+    }
+
+    fn delay(&self, quantile: f64) -> String {
+        let mut delays = self.delays_days.clone();
+        delays.sort_by(f64::total_cmp);
+        let at = (quantile * delays.len() as f64).ceil().max(1.0) as usize - 1;
+        delays.get(at).map_or_else(|| "-".to_owned(), |days| format!("{days:.1}"))
+    }
+}
+
+/// Cells that a right finding may name, first and last; none = the pack.
+fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
+    let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
+    match *fault {
+        FaultKind::Leak { cell, .. }
+        | FaultKind::Contact { cell, .. }
+        | FaultKind::Weak { cell, .. }
+        | FaultKind::Resistance { cell, .. }
+        | FaultKind::VoltageOffset { cell, .. }
+        | FaultKind::VoltageStuck { cell } => vec![(cell, cell)],
+        FaultKind::Module { first, last, .. } => vec![(first, last)],
+        FaultKind::Swap(a, b) | FaultKind::Double { shown: a, hidden: b } => {
+            vec![(a.min(b), a.max(b)), (a, a), (b, b)]
+        }
+        FaultKind::TemperatureStuck(at) | FaultKind::TemperatureOff(at) => vec![sensor(at.0)],
+        FaultKind::CurrentOffset(_) | FaultKind::CurrentGain(_) | FaultKind::CurrentStuck => Vec::new(),
+    }
+}
+
+fn is_right_place(places: &[(CellIndex, CellIndex)], found: Option<(CellIndex, CellIndex)>) -> bool {
+    match found {
+        None => places.is_empty(),
+        // A sensor of the last cells may have fewer of them.
+        Some((first, last)) => places.iter().any(|place| place.0 == first && last <= place.1 && last >= place.0),
+    }
+}
