@@ -80,7 +80,9 @@ impl Options {
                 "--only" => options.only = arguments.next().ok_or("--only: a word must follow")?,
                 "--write" => options.writes = true,
                 _ => {
-                    return Err(format!("{name}, must be --packs, --days, --period, --jobs, --seed, --only or --write"));
+                    return Err(format!(
+                        "{name}, must be --packs, --days, --period, --jobs, --seed, --only or --write"
+                    ));
                 }
             }
         }
@@ -120,8 +122,7 @@ type Row = (usize, usize, bool);
 
 fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     let mut rows = Vec::new();
-    for (f, (name, ..)) in FAULTS.iter().enumerate().filter(|(_, (name, ..))| name.contains(&options.only)) {
-        let _ = name;
+    for f in (0..FAULTS.len()).filter(|f| FAULTS[*f].0.contains(&options.only)) {
         rows.extend((0..QUALITIES.len()).flat_map(|q| [(f, q, false), (f, q, true)]));
     }
     let each = options.packs.div_ceil(rows.len().max(1)).max(1);

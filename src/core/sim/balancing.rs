@@ -58,7 +58,7 @@ impl Balancer {
         } else if self.has_rested {
             (self.is_armed, self.has_rested) = (false, false);
         }
-        if !ends_charge && !(is_rest && self.is_armed) {
+        if !(ends_charge || is_rest && self.is_armed) {
             pack.set_bleeds(|_, _| 0.0);
             return;
         }
