@@ -6,12 +6,11 @@ use std::path::Path;
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
+use packwatch::findings::{Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};
 use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
-
-use crate::finding::{Finding, FindingKind, findings};
 
 /// A hole in the record longer than this is sleep, s.
 const SLEEP_GAP_S: f64 = 30.0;
@@ -178,7 +177,7 @@ impl Case {
             if moment.time >= next_look {
                 next_look = moment.time.plus_secs(LOOK_S);
                 monitor.settle(&mut out);
-                seen.note(moment.time.secs(), &findings(&monitor));
+                seen.note(moment.time.secs(), monitor.findings());
             }
         }
         seen.first

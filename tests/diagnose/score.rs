@@ -3,7 +3,7 @@
 use packwatch::quantity::CellIndex;
 use packwatch::sim::FaultKind;
 
-use crate::finding::FindingKind;
+use crate::finding::kind_of;
 use crate::pack::{CELLS_PER_SENSOR, Case, Seen};
 
 const DAY_S: f64 = 86_400.0;
@@ -39,12 +39,12 @@ impl Score {
             u32::try_from(seen.iter().filter(|(at_s, _)| *at_s < from_s).count()).unwrap_or(u32::MAX);
         let Some(fault) = case.fault else { return };
         let after = || seen.iter().filter(|(at_s, _)| *at_s >= from_s);
-        let (kind, cells) = (FindingKind::of(&fault.kind), places(&fault.kind));
-        let right = after().find(|(_, found)| found.kind == kind && is_right_place(&cells, found.cells));
+        let (kind, cells) = (kind_of(&fault.kind), places(&fault.kind));
+        let right = after().find(|(_, found)| Some(found.kind) == kind && is_right_place(&cells, found.cells));
         self.delays_days.extend(right.map(|(at_s, _)| (at_s - from_s) / DAY_S));
-        let elsewhere = after().any(|(_, found)| found.kind == kind && !is_right_place(&cells, found.cells));
+        let elsewhere = after().any(|(_, found)| Some(found.kind) == kind && !is_right_place(&cells, found.cells));
         self.wrong_cell += u32::from(right.is_none() && elsewhere);
-        self.wrong_kind += u32::from(after().any(|(_, found)| found.kind != kind));
+        self.wrong_kind += u32::from(after().any(|(_, found)| Some(found.kind) != kind));
         self.any += u32::from(after().next().is_some());
     }
 

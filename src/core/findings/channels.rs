@@ -75,7 +75,7 @@ mod tests {
 
     fn row(voltages_v: &[f64]) -> CellSums {
         let mut sums = CellSums::default();
-        voltages_v.iter().enumerate().for_each(|(i, v)| sums.add(Timestamp::from_secs(i as f64), *v, 0.0, 0.0));
+        voltages_v.iter().enumerate().for_each(|(i, v)| sums.add(Timestamp::from_secs(i as f64), *v, 0.0, None, 0.0));
         sums
     }
 

@@ -6,6 +6,7 @@ use super::channels::{Channel, compare};
 use super::difference::{self, CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{self, Finding, FindingKind, OUTLIER, TOLD, WITHDRAWN};
 use super::row::{CellSums, PackSums};
+use super::temperature::Following;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
@@ -69,6 +70,7 @@ struct Watched {
     settled: [f64; STATES],
     sums: CellSums,
     channel: Channel,
+    temperature: Following,
     /// Since when each kind is likelier than not.
     suspected: [Option<Timestamp>; FindingKind::ALL.len()],
     /// When it last changed at once.
@@ -100,6 +102,7 @@ impl Diagnosis {
             settled: [0.0; STATES],
             sums: CellSums::default(),
             channel: Channel::default(),
+            temperature: Following::default(),
             suspected: [None; FindingKind::ALL.len()],
             jumped: None,
         };
@@ -138,9 +141,16 @@ impl Diagnosis {
 
     /// Takes a sample of a cell; `None` = no current is known, and the row ends.
     #[inline]
-    pub fn add(&mut self, cell: usize, time: Timestamp, voltage_v: f64, current_a: Option<f64>) {
+    pub fn add(
+        &mut self,
+        cell: usize,
+        time: Timestamp,
+        voltage_v: f64,
+        current_a: Option<f64>,
+        temperature_c: Option<f64>,
+    ) {
         match (self.cells.get_mut(cell), current_a) {
-            (Some(cell), Some(current_a)) => cell.sums.add(time, voltage_v, current_a, self.ohm),
+            (Some(cell), Some(current_a)) => cell.sums.add(time, voltage_v, current_a, temperature_c, self.ohm),
             (Some(cell), None) => cell.sums.interrupt(),
             (None, _) => {}
         }
@@ -174,12 +184,14 @@ impl Diagnosis {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. Returns the findings that are new.
+    /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `sensors`: how probable a fault is of the
+    /// sensors that all cells share, by those who know. Returns the findings that are new.
     pub fn close_row(
         &mut self,
         model: &CellModel,
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
+        sensors: &[(FindingKind, f64, ScalarGaussian)],
     ) -> Vec<Finding> {
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
@@ -196,12 +208,22 @@ impl Diagnosis {
             charge_ah,
         };
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
+        let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
-        let told = if self.observe(time, &row) { self.judge(time) } else { Vec::new() };
+        let before = self.findings.clone();
+        if self.observe(time, &row) {
+            self.observe_temperatures(time, seconds);
+            self.judge(time);
+        }
+        for &(kind, probability, size) in sensors {
+            self.put(Finding { kind, cells: None, since: time, told: time, probability, size });
+        }
+        self.findings.sort_by_key(|found| (found.cells, found.kind));
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
         self.ohm = model.r0_ohm(&model.grid_position(soc, row.temperature_c));
         self.choose_middle(socs);
-        told
+        let is_new = |found: &&Finding| !before.iter().any(|old| (old.kind, old.cells) == (found.kind, found.cells));
+        self.findings.iter().filter(is_new).copied().collect()
     }
 
     /// Lets time and charge since the last row pass.
@@ -284,7 +306,7 @@ impl Diagnosis {
         std::mem::swap(&mut low[a].difference, &mut high[0].difference);
         low[a].difference.settle(&of_b);
         high[0].difference.settle(&of_a);
-        let cells = (CellIndex(a as u16), CellIndex(b as u16));
+        let cells = Some((CellIndex(a as u16), CellIndex(b as u16)));
         let is_same = |found: &Finding| found.kind == FindingKind::SwappedChannels && found.cells == cells;
         if self.findings.iter().any(is_same) {
             self.findings.retain(|found| !is_same(found));
@@ -303,12 +325,11 @@ impl Diagnosis {
         }
     }
 
-    /// Judges all cells; returns what is newly told.
-    fn judge(&mut self, time: Timestamp) -> Vec<Finding> {
+    /// Judges all cells.
+    fn judge(&mut self, time: Timestamp) {
         let populations: [Population; STATES] = std::array::from_fn(|state| {
             Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
         });
-        let before = self.findings.clone();
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= TOLD);
@@ -318,9 +339,6 @@ impl Diagnosis {
             }
         }
         self.find_modules(time, &populations);
-        self.findings.sort_by_key(|found| (found.cells, found.kind));
-        let is_new = |found: &&Finding| !before.iter().any(|old| (old.kind, old.cells) == (found.kind, found.cells));
-        self.findings.iter().filter(is_new).copied().collect()
     }
 
     /// What one cell may have.
@@ -374,20 +392,53 @@ impl Diagnosis {
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
         let since = suspected.unwrap_or(time);
         // The upper one of two doubled channels is in the finding of the lower one.
-        if cells.0 != own {
+        if cells.0 == own {
+            self.put(Finding { kind, cells: Some(cells), since, told: time, probability, size });
+        }
+    }
+
+    /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
+    fn put(&mut self, finding: Finding) {
+        let first = |found: &Finding| found.cells.map(|cells| cells.0);
+        let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
+        match self.findings.iter().position(is_same) {
+            Some(at) if finding.probability < WITHDRAWN => drop(self.findings.remove(at)),
+            Some(at) => {
+                let Finding { since, told, .. } = self.findings[at];
+                let since = if finding.cells.is_some() { finding.since } else { since };
+                self.findings[at] = Finding { since, told, ..finding };
+            }
+            None if finding.probability >= TOLD => self.findings.push(finding),
+            None => {}
+        }
+    }
+
+    /// Compares the temperatures at the cells with that in the middle of the pack.
+    fn observe_temperatures(&mut self, time: Timestamp, seconds: f64) {
+        let of_cells: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_c()).collect();
+        if of_cells.iter().flatten().count() < LEAST_CELLS {
             return;
         }
-        let place = self.findings.iter().position(|found| found.kind == kind && found.cells.0 == own);
-        match place {
-            Some(at) if probability < WITHDRAWN => drop(self.findings.remove(at)),
-            Some(at) => {
-                let told = self.findings[at].told;
-                self.findings[at] = Finding { kind, cells, since, told, probability, size };
+        let middle_c = Population::of(of_cells.iter().flatten().copied()).middle;
+        for (cell, here_c) in self.cells.iter_mut().zip(of_cells) {
+            if let Some(here_c) = here_c {
+                cell.temperature.observe(seconds, middle_c, here_c);
             }
-            None if probability >= TOLD => {
-                self.findings.push(Finding { kind, cells, since, told: time, probability, size });
+        }
+        let kind = FindingKind::TemperatureSensor;
+        let told: Vec<Finding> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
+        self.findings.retain(|found| found.kind != kind);
+        let mut first = 0;
+        for of_one in self.cells.chunk_by(|a, b| a.temperature == b.temperature) {
+            if of_one[0].temperature.is_detached {
+                let cells = Some((CellIndex(first as u16), CellIndex((first + of_one.len() - 1) as u16)));
+                let before = told.iter().find(|found| found.cells == cells);
+                let since = before.map_or(time, |found| found.since);
+                let told = before.map_or(time, |found| found.told);
+                let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
+                self.findings.push(Finding { kind, cells, since, told, probability: 1.0, size });
             }
-            None => {}
+            first += of_one.len();
         }
     }
 
@@ -406,8 +457,7 @@ impl Diagnosis {
             let cells = (CellIndex(first as u16), CellIndex((first + count - 1) as u16));
             let overlaps = |found: &Finding| {
                 matches!(found.kind, FindingKind::Module | FindingKind::SwappedChannels)
-                    && found.cells.0 <= cells.1
-                    && cells.0 <= found.cells.1
+                    && found.cells.is_some_and(|(first, last)| first <= cells.1 && cells.0 <= last)
             };
             if count >= 2 && 2 * count <= jumped.len() && !self.findings.iter().any(overlaps) {
                 let states = (first..first + count).map(|cell| self.cells[cell].difference.state(difference::CAPACITY));
@@ -418,6 +468,7 @@ impl Diagnosis {
                     variance: variance / (count * count) as f64,
                 };
                 let kind = FindingKind::Module;
+                let cells = Some(cells);
                 self.findings.push(Finding { kind, cells, since, told: time, probability: TOLD, size });
             }
             first += count;
@@ -463,7 +514,13 @@ impl Diagnosis {
         InvalidState::unless(middle <= cells, "the middle cell of the diagnosis", middle as f64, "a cell of the pack")?;
         for cell in &self.cells {
             cell.difference.check()?;
-            let numbers = cell.sums.numbers().into_iter().chain(cell.channel.numbers()).chain(cell.settled);
+            let numbers = cell
+                .sums
+                .numbers()
+                .into_iter()
+                .chain(cell.channel.numbers())
+                .chain(cell.temperature.numbers())
+                .chain(cell.settled);
             InvalidState::unless_numbers("a number of the diagnosis", numbers)?;
         }
         let PackSums { current_a, drop_v, soc, temperature_c, charge_ah, first_ah, .. } = self.pack;
@@ -471,8 +528,9 @@ impl Diagnosis {
         let numbers = [current_a, drop_v, soc, temperature_c, charge_ah, first_ah, self.rest_s, self.ohm];
         InvalidState::unless_numbers("a number of the diagnosis", numbers.into_iter().chain(last))?;
         for found in &self.findings {
-            let is_there = found.cells.0 <= found.cells.1 && found.cells.1.index() < cells;
-            InvalidState::unless(is_there, "the cell of a finding", f64::from(found.cells.1.0), "a cell of the pack")?;
+            let (first, last) = found.cells.unwrap_or((CellIndex(0), CellIndex(0)));
+            let is_there = first <= last && last.index() < cells;
+            InvalidState::unless(is_there, "the cell of a finding", f64::from(last.0), "a cell of the pack")?;
             InvalidState::unless_numbers("a finding", [found.size.mean, found.size.variance, found.probability])?;
         }
         Ok(())

@@ -30,11 +30,17 @@ pub enum FindingKind {
     DoubledChannels = 9,
     /// Two voltage channels have been exchanged; the value is 1.
     SwappedChannels = 10,
+    /// The sensor of the current is off by a constant; part of the rated capacity per hour.
+    CurrentOffset = 11,
+    /// The reading of the current stays at one value; the value is 1.
+    CurrentFrozen = 12,
+    /// The temperature sensor of these cells does not follow the load; the value is 1.
+    TemperatureSensor = 13,
 }
 
 impl FindingKind {
     /// Every kind, in the order of the wire.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 13] = [
         Self::Leak,
         Self::Contact,
         Self::WeakCell,
@@ -45,6 +51,9 @@ impl FindingKind {
         Self::VoltageFrozen,
         Self::DoubledChannels,
         Self::SwappedChannels,
+        Self::CurrentOffset,
+        Self::CurrentFrozen,
+        Self::TemperatureSensor,
     ];
 
     /// As written in events, status and reports.
@@ -60,6 +69,9 @@ impl FindingKind {
             Self::VoltageFrozen => "voltage_frozen",
             Self::DoubledChannels => "doubled_channels",
             Self::SwappedChannels => "swapped_channels",
+            Self::CurrentOffset => "current_offset",
+            Self::CurrentFrozen => "current_frozen",
+            Self::TemperatureSensor => "temperature_sensor",
         }
     }
 
@@ -76,6 +88,9 @@ impl FindingKind {
             Self::VoltageFrozen => "voltage channel frozen",
             Self::DoubledChannels => "two channels of one cell",
             Self::SwappedChannels => "two channels exchanged",
+            Self::CurrentOffset => "current sensor off",
+            Self::CurrentFrozen => "current frozen",
+            Self::TemperatureSensor => "temperature sensor does not follow the load",
         }
     }
 
@@ -95,6 +110,9 @@ impl FindingKind {
             Self::VoltageFrozen => "the channel shows no cell: check monitor chip and sense wire",
             Self::DoubledChannels => "check the wiring of the two channels and the layout of their frames",
             Self::SwappedChannels => "the sense wires or the signals of the two channels are exchanged",
+            Self::CurrentOffset => "compare the sensor at rest with an ammeter, and zero it",
+            Self::CurrentFrozen => "the reading is no current: check sensor and sender",
+            Self::TemperatureSensor => "the sensor has fallen off or shows one value: check where it sits",
         }
     }
 
@@ -110,8 +128,8 @@ impl FindingKind {
 pub struct Finding {
     /// What.
     pub kind: FindingKind,
-    /// First and last cell of it; of two channels the lower and the upper one.
-    pub cells: (CellIndex, CellIndex),
+    /// First and last cell of it; of two channels the lower and the upper one; `None` = the pack as a whole.
+    pub cells: Option<(CellIndex, CellIndex)>,
     /// When it was first likelier than not.
     pub since: Timestamp,
     /// When it was first told.

@@ -10,6 +10,7 @@
 //! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
 //! | `row` | samples of some minutes, summed per cell |
 //! | `channels` | channels that are frozen or doubled |
+//! | `temperature` | temperature sensors that do not follow the load |
 //! | [`finding`] | kinds of findings, and from when on one is told |
 pub mod diagnosis;
 pub mod difference;
@@ -17,6 +18,7 @@ pub mod finding;
 
 mod channels;
 mod row;
+mod temperature;
 
 pub use diagnosis::{Diagnosis, MeanCell};
 pub use difference::Difference;

@@ -18,6 +18,8 @@ pub(super) struct CellSums {
     steps_va: f64,
     /// Time, voltage and current of the sample before.
     last: Option<(Timestamp, f64, f64)>,
+    temperature_c: f64,
+    temperatures: u32,
     /// Bits of the voltages in their order, mixed, and how often the voltage has changed.
     pub(super) digest: u64,
     pub(super) changes: u32,
@@ -26,8 +28,19 @@ pub(super) struct CellSums {
 impl CellSums {
     /// Adds a sample: V, A; `ohm` is the mean cell's series resistance.
     #[inline]
-    pub(super) fn add(&mut self, time: Timestamp, voltage_v: f64, current_a: f64, ohm: f64) {
+    pub(super) fn add(
+        &mut self,
+        time: Timestamp,
+        voltage_v: f64,
+        current_a: f64,
+        temperature_c: Option<f64>,
+        ohm: f64,
+    ) {
         self.count += 1;
+        if let Some(temperature_c) = temperature_c {
+            self.temperature_c += temperature_c;
+            self.temperatures += 1;
+        }
         self.voltage_v += voltage_v + ohm * current_a;
         if let Some((before, last_v, last_a)) = self.last.replace((time, voltage_v, current_a)) {
             let (step_v, step_a) = (voltage_v - last_v, current_a - last_a);
@@ -45,6 +58,11 @@ impl CellSums {
         (self.count > 0).then(|| self.voltage_v / f64::from(self.count))
     }
 
+    /// Mean temperature, degrees C; `None` = not measured.
+    pub(super) fn mean_c(&self) -> Option<f64> {
+        (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
+    }
+
     /// Series resistance by the steps, ohm, when their squares are at least `least_a2`; and these.
     pub(super) fn ohm(&self, least_a2: f64) -> Option<(f64, f64)> {
         (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))
@@ -60,9 +78,9 @@ impl CellSums {
         *self = Self::default();
     }
 
-    pub(super) fn numbers(&self) -> [f64; 5] {
+    pub(super) fn numbers(&self) -> [f64; 6] {
         let (_, voltage_v, current_a) = self.last.unwrap_or((Timestamp::ZERO, 0.0, 0.0));
-        [self.voltage_v, self.steps_a2, self.steps_va, voltage_v, current_a]
+        [self.voltage_v, self.steps_a2, self.steps_va, voltage_v, current_a, self.temperature_c]
     }
 }
 

@@ -6,9 +6,13 @@
 use super::estimation::Estimation;
 use super::learning::Learning;
 use super::{Event, EventKind, Outputs};
-use crate::findings::{Diagnosis, MeanCell};
+use crate::filter::ScalarGaussian;
+use crate::findings::{Diagnosis, FindingKind, MeanCell};
 use crate::quantity::Timestamp;
 use crate::sample::CellSample;
+
+/// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
+const OFFSET_PER_H: f64 = 0.01;
 
 /// The diagnosis stage.
 #[derive(Debug)]
@@ -48,15 +52,17 @@ impl Diagnosing {
         samples: &[CellSample],
         estimation: &Estimation,
         learning: &Learning,
+        is_current_frozen: bool,
         out: &mut Outputs,
     ) {
         if !self.diagnosis.is_active() {
             return;
         }
         for sample in samples {
-            self.diagnosis.add(sample.cell.index(), sample.time, sample.voltage_v, sample.current_a);
+            let CellSample { cell, time, voltage_v, current_a, temperature_c, .. } = *sample;
+            self.diagnosis.add(cell.index(), time, voltage_v, current_a, temperature_c);
         }
-        self.observe_mean(now, samples, estimation, learning, out);
+        self.observe_mean(now, samples, estimation, learning, is_current_frozen, out);
     }
 
     fn observe_mean(
@@ -65,6 +71,7 @@ impl Diagnosing {
         samples: &[CellSample],
         estimation: &Estimation,
         learning: &Learning,
+        is_current_frozen: bool,
         out: &mut Outputs,
     ) {
         let middle = self.diagnosis.middle();
@@ -82,8 +89,26 @@ impl Diagnosing {
         let mean = MeanCell { soc: soc.mean, current_a, drop_v, temperature_c, charge_ah };
         if self.diagnosis.note(sample.time, &mean, capacity_ah) {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
-            let told = self.diagnosis.close_row(model, capacity_ah, socs);
+            let sensors = shared_sensors(is_current_frozen, learning, model.rated_capacity_ah);
+            let told = self.diagnosis.close_row(model, capacity_ah, socs, &sensors);
             out.events.extend(told.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
     }
+}
+
+/// How probable a fault is of the sensors that all cells share: what the other stages know of them.
+fn shared_sensors(
+    is_current_frozen: bool,
+    learning: &Learning,
+    rated_ah: f64,
+) -> [(FindingKind, f64, ScalarGaussian); 2] {
+    let frozen = ScalarGaussian { mean: 1.0, variance: 0.0 };
+    let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
+    let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });
+    let size = ScalarGaussian { mean: offset.mean / rated_ah, variance: offset.variance / (rated_ah * rated_ah) };
+    let beyond = (size.mean.abs() - OFFSET_PER_H) / (size.std() * std::f64::consts::SQRT_2).max(1e-12);
+    [
+        (FindingKind::CurrentFrozen, f64::from(u8::from(is_current_frozen)), frozen),
+        (FindingKind::CurrentOffset, 0.5 * libm::erfc(-beyond), size),
+    ]
 }

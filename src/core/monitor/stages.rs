@@ -194,7 +194,8 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
-        self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, out);
+        let is_frozen = self.sampling.sampler.is_current_frozen();
+        self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, is_frozen, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
     }
 

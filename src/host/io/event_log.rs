@@ -133,7 +133,7 @@ impl EventLog {
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::Model { .. } => log_model(&event.kind),
             EventKind::Finding(Finding { kind, cells, size, probability, .. }) => {
-                let (first, last) = (number(cells.0), number(cells.1));
+                let (first, last) = cells.map(|(first, last)| (number(first), number(last))).unzip();
                 let (size, size_std) = (rounded(size.mean), rounded(size.std()));
                 tracing::warn!(first, last, size, size_std, probability, "{}: {}", kind.words(), kind.advice());
             }

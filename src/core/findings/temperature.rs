@@ -1,0 +1,81 @@
+//! Temperature sensors that do not follow the load: frozen ones, and ones that have fallen off.
+//!
+//! In: the temperature at each cell and that in the middle of the pack, row by row. Cells of one sensor show the same, so a faulty
+//! sensor appears as its cells. With one sensor for all cells, or two, nothing can be told: none stands out.
+
+use serde::{Deserialize, Serialize};
+
+/// Time over which a warming counts as one of the load, s.
+const SLOW_S: f64 = 7200.0;
+/// Time after which what was seen counts half, s.
+const HALF_S: f64 = 5.0 * 86_400.0;
+/// Sum of squared warmings from which on a sensor is judged, K^2.
+const LEAST_K2: f64 = 30.0;
+/// Part of the pack's warming below which a sensor does not follow, and above which it does again.
+const DETACHED: f64 = 0.35;
+const ATTACHED: f64 = 0.6;
+
+/// How one cell's temperature follows the pack's.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct Following {
+    /// Slow means, of the pack and here, degrees C.
+    slow_c: Option<[f64; 2]>,
+    /// Sums of squares of the pack's warming and of products, K^2.
+    squares_k2: f64,
+    products_k2: f64,
+    pub(super) is_detached: bool,
+}
+
+impl Following {
+    /// Takes a row `seconds` after the one before.
+    pub(super) fn observe(&mut self, seconds: f64, middle_c: f64, here_c: f64) {
+        let Some([middle_slow_c, here_slow_c]) = &mut self.slow_c else {
+            self.slow_c = Some([middle_c, here_c]);
+            return;
+        };
+        let keep = libm::exp(-seconds.max(0.0) / SLOW_S);
+        *middle_slow_c = middle_c + keep * (*middle_slow_c - middle_c);
+        *here_slow_c = here_c + keep * (*here_slow_c - here_c);
+        let (middle_k, here_k) = (middle_c - *middle_slow_c, here_c - *here_slow_c);
+        let older = libm::exp2(-seconds.max(0.0) / HALF_S);
+        self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
+        self.products_k2 = older * self.products_k2 + middle_k * here_k;
+        if self.squares_k2 >= LEAST_K2 {
+            let part = self.products_k2 / self.squares_k2;
+            self.is_detached = part < if self.is_detached { ATTACHED } else { DETACHED };
+        }
+    }
+
+    pub(super) fn numbers(&self) -> [f64; 4] {
+        let [middle_c, here_c] = self.slow_c.unwrap_or_default();
+        [middle_c, here_c, self.squares_k2, self.products_k2]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two days: the pack warms by 8 K each time; the sensor shows this part of it.
+    fn after_days(part: f64) -> Following {
+        let mut following = Following::default();
+        for row in 0..2 * 288 {
+            let warming_k = if row % 72 < 24 { 8.0 * f64::from(row % 72) / 24.0 } else { 0.0 };
+            following.observe(300.0, 20.0 + warming_k, 21.0 + part * warming_k);
+        }
+        following
+    }
+
+    #[test]
+    fn a_sensor_that_shows_little_of_the_warming_is_detached() {
+        assert!(after_days(0.0).is_detached && after_days(0.2).is_detached);
+        assert!(!after_days(0.7).is_detached && !after_days(1.2).is_detached);
+    }
+
+    #[test]
+    fn a_pack_that_does_not_warm_says_nothing() {
+        let mut following = Following::default();
+        (0..1000).for_each(|row| following.observe(300.0, 20.0 + 0.1 * f64::from(row % 2), 20.0));
+        assert!(!following.is_detached, "{following:?}");
+    }
+}
