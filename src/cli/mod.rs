@@ -9,6 +9,7 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+mod diagnose;
 #[cfg(feature = "lab")]
 mod discover;
 mod doctor;
@@ -95,6 +96,8 @@ enum Command {
     Check(check::Args),
     /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
     Doctor(Box<doctor::Args>),
+    /// Tell which cell of a pack is failing, and how: leaks, contacts, weak cells, sensors
+    Diagnose(Box<diagnose::Args>),
     /// List the cell models that are there, and the chemistries that a label may name
     Cells(cells::Args),
     /// Show, plot, export or compare cell models: curve, resistances, and how well they are known
@@ -179,6 +182,7 @@ pub fn main() -> ExitCode {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Diagnose(args) => diagnose::run(&args),
         Command::Cells(args) => cells::run(&args),
         Command::Model(args) => model::run(&args),
         Command::Dbc(args) => dbc::run(&args),

@@ -158,7 +158,7 @@ impl Case {
     pub(crate) fn run(&self, config: &MonitorConfig) -> Seen {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
-        let mut monitor = Monitor::new(config.clone());
+        let mut monitor = Monitor::new(MonitorConfig { is_balanced: self.is_balancing, ..config.clone() });
         let (mut ticks, mut out, mut frames) =
             (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
         let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);

@@ -44,6 +44,11 @@ const SOC_JUMP: f64 = 0.02;
 const SAME_EVENT_S: f64 = 1800.0;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
+/// SOC from which on a BMS balances during a charge; how much a cell is bled in a day, fraction of its capacity (usual resistors
+/// take 1 mA per Ah), and over how long without a break, days.
+const BLED_SOC: f64 = 0.6;
+const BLED_PER_DAY: f64 = 0.024;
+const BLED_DAYS: f64 = 0.33;
 const DAY_S: f64 = 86_400.0;
 
 /// The cell in the middle of the pack, as the estimators know it at one moment.
@@ -89,6 +94,8 @@ pub struct Diagnosis {
     rest_s: f64,
     /// Series resistance of the mean cell in this row, ohm.
     ohm: f64,
+    /// No drive since the end of a charge.
+    is_charged: bool,
     /// The cell with the middle SOC.
     middle: usize,
     findings: Vec<Finding>,
@@ -112,6 +119,7 @@ impl Diagnosis {
             last_row: None,
             rest_s: 0.0,
             ohm: 0.0,
+            is_charged: false,
             middle: 0,
             findings: Vec::new(),
         }
@@ -131,6 +139,20 @@ impl Diagnosis {
     /// What is known of a cell's difference; `None` = the pack is not compared.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
         self.cells.get(cell.index()).map(|cell| &cell.difference)
+    }
+
+    /// A cell's states less those of the middle of the pack; `None` = the pack is not compared, or has no such cell.
+    pub fn relative(&self, cell: CellIndex) -> Option<[ScalarGaussian; STATES]> {
+        let own = &self.cells.get(cell.index())?.difference;
+        Some(std::array::from_fn(|state| {
+            let middle = self.population(state).middle;
+            let ScalarGaussian { mean, variance } = own.state(state);
+            ScalarGaussian { mean: mean - middle, variance }
+        }))
+    }
+
+    fn population(&self, state: usize) -> Population {
+        Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
     }
 
     /// The cell whose estimate stands for the mean cell in the present row.
@@ -185,13 +207,14 @@ impl Diagnosis {
     }
 
     /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `sensors`: how probable a fault is of the
-    /// sensors that all cells share, by those who know. Returns the findings that are new.
+    /// sensors that all cells share, by those who know. `is_balanced`: fuller cells may be bled after a charge. Returns the findings that are new.
     pub fn close_row(
         &mut self,
         model: &CellModel,
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
         sensors: &[(FindingKind, f64, ScalarGaussian)],
+        is_balanced: bool,
     ) -> Vec<Finding> {
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
@@ -209,7 +232,7 @@ impl Diagnosis {
         };
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
-        self.pass(middle_time, &row);
+        self.pass(middle_time, &row, is_balanced);
         let before = self.findings.clone();
         if self.observe(time, &row) {
             self.observe_temperatures(time, seconds);
@@ -227,14 +250,25 @@ impl Diagnosis {
     }
 
     /// Lets time and charge since the last row pass.
-    fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
+    fn pass(&mut self, time: Timestamp, row: &Row<'_>, is_balanced: bool) {
+        let was_charged = self.note_charge(row);
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
         // A filter that finds its SOC moves no charge.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
-        self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
+        let bled = if is_balanced && was_charged { BLED_PER_DAY * (days * BLED_DAYS).sqrt() } else { 0.0 };
+        self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change, bled));
+    }
+
+    /// Whether the time before this row was near the end of a charge or after it.
+    fn note_charge(&mut self, row: &Row<'_>) -> bool {
+        let rest_a = REST_PER_H * row.capacity_ah;
+        let was_charged = self.is_charged;
+        self.is_charged =
+            if row.current_a < -rest_a { row.soc >= BLED_SOC } else { self.is_charged && row.current_a <= rest_a };
+        was_charged || self.is_charged
     }
 
     /// Compares every cell with the middle ones; whether there was something to compare.
@@ -327,9 +361,7 @@ impl Diagnosis {
 
     /// Judges all cells.
     fn judge(&mut self, time: Timestamp) {
-        let populations: [Population; STATES] = std::array::from_fn(|state| {
-            Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
-        });
+        let populations: [Population; STATES] = std::array::from_fn(|state| self.population(state));
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= TOLD);

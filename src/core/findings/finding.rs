@@ -116,6 +116,11 @@ impl FindingKind {
         }
     }
 
+    /// Whether its two cells are a pair, not the ends of a range.
+    pub const fn is_of_pair(self) -> bool {
+        matches!(self, Self::DoubledChannels | Self::SwappedChannels)
+    }
+
     /// Whether it is the measurement that fails, so that nothing is known of the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)

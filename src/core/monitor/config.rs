@@ -47,6 +47,8 @@ pub struct MonitorConfig {
     pub model: CellModel,
     /// What is on the label of the cells, where their own model is learned; `None` = the model holds.
     pub label: Option<Label>,
+    /// Whether the BMS lets fuller cells lose charge after a charge.
+    pub is_balanced: bool,
     /// Estimator.
     pub estimator: EstimatorConfig,
     /// Learning at transitions.
@@ -189,7 +191,12 @@ impl MonitorConfig {
         };
         let capacity = |config: &Self| (config.health.capacity, config.health.end_of_life_ah);
         let same = [
-            ("[pack]", self.model == new.model && old_sample.ambient_c == new_sample.ambient_c),
+            (
+                "[pack]",
+                self.model == new.model
+                    && self.is_balanced == new.is_balanced
+                    && old_sample.ambient_c == new_sample.ambient_c,
+            ),
             (
                 "[input]",
                 self.flood == new.flood

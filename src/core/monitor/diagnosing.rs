@@ -5,7 +5,7 @@
 
 use super::estimation::Estimation;
 use super::learning::Learning;
-use super::{Event, EventKind, Outputs};
+use super::{Event, EventKind, MonitorConfig, Outputs};
 use crate::filter::ScalarGaussian;
 use crate::findings::{Diagnosis, FindingKind, MeanCell};
 use crate::quantity::Timestamp;
@@ -18,16 +18,25 @@ const OFFSET_PER_H: f64 = 0.01;
 #[derive(Debug)]
 pub(super) struct Diagnosing {
     pub(super) diagnosis: Diagnosis,
+    cells: usize,
+    /// The BMS lets fuller cells lose charge.
+    is_balanced: bool,
 }
 
 impl Diagnosing {
-    pub(super) fn new(cells: usize) -> Self {
-        Self { diagnosis: Diagnosis::new(cells) }
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        let cells = usize::from(config.sample.cells);
+        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced: config.is_balanced }
+    }
+
+    /// Other settings for the same cells.
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
+        self.is_balanced = config.is_balanced;
     }
 
     /// Forgets everything: another pack is connected.
-    pub(super) fn forget(&mut self, cells: usize) {
-        *self = Self::new(cells);
+    pub(super) fn forget(&mut self) {
+        self.diagnosis = Diagnosis::new(self.cells);
     }
 
     /// The state, to be stored; `None` = the pack is too small for a comparison.
@@ -90,7 +99,7 @@ impl Diagnosing {
         if self.diagnosis.note(sample.time, &mean, capacity_ah) {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
             let sensors = shared_sensors(is_current_frozen, learning, model.rated_capacity_ah);
-            let told = self.diagnosis.close_row(model, capacity_ah, socs, &sensors);
+            let told = self.diagnosis.close_row(model, capacity_ah, socs, &sensors, self.is_balanced);
             out.events.extend(told.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
     }

@@ -60,6 +60,7 @@ impl Monitor {
         let stages = &mut self.stages;
         stages.modelling.reconfigure(&config);
         stages.estimation.reconfigure(&config, &stages.modelling, &stages.learning.state.learner);
+        stages.diagnosing.reconfigure(&config);
         stages.sampling.reconfigure(&config);
         stages.sleep.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);

@@ -388,6 +388,11 @@ impl Snapshot {
         Self { continuation: None, ..self }
     }
 
+    /// What is known of single cells; `None` = the pack is too small for a comparison, or the state is of an earlier program.
+    pub fn diagnosis(&self) -> Option<&Diagnosis> {
+        self.diagnosis.as_ref()
+    }
+
     /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
     /// model file, or the label is not known.
     ///

@@ -45,7 +45,7 @@ impl Stages {
             estimation: Estimation::new(config),
             modelling: Modelling::new(config),
             learning: Learning::new(config),
-            diagnosing: Diagnosing::new(usize::from(config.sample.cells)),
+            diagnosing: Diagnosing::new(config),
             alarming: Alarming::new(config),
             sender: Sender::new(config),
             statistics: Statistics::default(),
@@ -305,7 +305,7 @@ impl Stages {
         self.estimation.forget(&self.modelling);
         self.estimation.bank.set_current_offset_std(self.learning.config.capacity.current_offset_std_a);
         self.learning.forget(&self.estimation.bank);
-        self.diagnosing.forget(self.estimation.cells());
+        self.diagnosing.forget();
         self.forget_pack_state();
         self.alarming.knows_all_valid = false;
         self.publisher(now, out).apply(AlarmInput::ForgetLearned);

@@ -74,6 +74,7 @@ pub(super) fn monitor(
         rules,
         model,
         label: super::label::label(pack).filter(|_| pack.learn_model),
+        is_balanced: pack.balancing,
     })
 }
 

@@ -1,0 +1,202 @@
+//! `packwatch diagnose`: which cell is failing, and how. Findings with what to do, and each cell's difference from its pack.
+//!
+//! In: logs, which are replayed, or the stored state of a vehicle. Every "±" is one standard deviation.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::Failure;
+use super::output::{self, print_json, table};
+use super::replay::{Bar, InputArgs, log_options};
+use crate::config;
+use crate::findings::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
+use crate::findings::{Diagnosis, Finding, FindingKind};
+use crate::io::log::LogSource;
+use crate::io::stamp::format_utc;
+use crate::monitor::{Monitor, Snapshot};
+use crate::quantity::CellIndex;
+use crate::replay::{self, ReplaySettings, Sinks};
+use crate::store::HistoryReader;
+
+/// Arguments of `diagnose`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Journals, candump logs or CSV files of one pack, also .gz or .zst, read one after another as one record
+    #[arg(required_unless_present = "state", value_name = "LOG")]
+    logs: Vec<PathBuf>,
+    /// Configuration, for logs
+    #[arg(short, long, value_name = "FILE", required_unless_present = "state")]
+    config: Option<PathBuf>,
+    /// What a vehicle has found: its state folder, or a copy of it
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["logs", "config"])]
+    state: Option<PathBuf>,
+    #[command(flatten)]
+    input: InputArgs,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// All that is printed.
+#[derive(Debug, Serialize)]
+struct Page {
+    version: u32,
+    findings: Vec<FindingRow>,
+    cells: Vec<CellRow>,
+}
+
+/// A finding, cells counted from 1.
+#[derive(Debug, Serialize)]
+struct FindingRow {
+    kind: FindingKind,
+    first_cell: Option<u16>,
+    last_cell: Option<u16>,
+    what: &'static str,
+    size: f64,
+    size_std: f64,
+    since: String,
+    told: String,
+    probability: f64,
+    advice: &'static str,
+}
+
+/// A cell's difference from the middle of the pack.
+#[derive(Debug, Serialize)]
+struct CellRow {
+    cell: u16,
+    soc: Value,
+    capacity: Value,
+    resistance: Value,
+    contact: Value,
+    channel_v: Value,
+    leak_per_day: Value,
+}
+
+/// A value with its standard deviation.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct Value {
+    mean: f64,
+    std: f64,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let snapshot = match (&args.state, &args.config) {
+        (Some(folder), _) => stored(folder)?,
+        (None, Some(path)) => replayed(args, path)?,
+        (None, None) => return Err(Failure::new("neither --state nor --config, one must be given")),
+    };
+    let Some(diagnosis) = snapshot.diagnosis() else {
+        return Err(Failure::new(
+            "no cell can be compared with others: the pack has fewer than three, or the state is of an \
+                                 earlier program",
+        ));
+    };
+    let page = page(diagnosis);
+    if args.json {
+        return output::unless_closed(print_json(&page));
+    }
+    output::print(&text(&page))
+}
+
+fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
+    let reader = HistoryReader::open(folder).map_err(Failure::new)?;
+    let snapshot = reader.snapshot();
+    snapshot.ok_or_else(|| Failure::new(format!("{}: no state is stored there", folder.display())))
+}
+
+fn replayed(args: &Args, path: &std::path::Path) -> Result<Snapshot, Failure> {
+    let config = config::load(path)?;
+    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, &config));
+    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
+    let settings = ReplaySettings { snapshot: true, ..plain };
+    let bar = Bar::new(&args.logs);
+    let monitor = Monitor::new(config.monitor);
+    let result = replay::run(&mut source, monitor, Sinks::default(), settings, &mut |progress| bar.show(progress));
+    bar.clear();
+    let (_, snapshot) = result.map_err(|error| Failure::new(error.to_string()))?;
+    snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
+}
+
+fn page(diagnosis: &Diagnosis) -> Page {
+    let number = |cell: CellIndex| cell.0 + 1;
+    let row = |found: &Finding| FindingRow {
+        kind: found.kind,
+        first_cell: found.cells.map(|(first, _)| number(first)),
+        last_cell: found.cells.map(|(_, last)| number(last)),
+        what: found.kind.words(),
+        size: found.size.mean,
+        size_std: found.size.std(),
+        since: format_utc(found.since),
+        told: format_utc(found.told),
+        probability: found.probability,
+        advice: found.kind.advice(),
+    };
+    let cells = (0..).map(CellIndex).map_while(|cell| {
+        let states = diagnosis.relative(cell)?;
+        let value = |state: usize| Value { mean: states[state].mean, std: states[state].std() };
+        Some(CellRow {
+            cell: number(cell),
+            soc: value(SOC),
+            capacity: value(CAPACITY),
+            resistance: value(RESISTANCE),
+            contact: value(CONTACT),
+            channel_v: value(CHANNEL),
+            leak_per_day: value(LEAK),
+        })
+    });
+    Page { version: 1, findings: diagnosis.findings().iter().map(row).collect(), cells: cells.collect() }
+}
+
+fn text(page: &Page) -> String {
+    let mut text = String::new();
+    if page.findings.is_empty() {
+        text += "nothing found\n";
+    }
+    for found in &page.findings {
+        let place = match (found.first_cell, found.last_cell) {
+            (Some(first), Some(last)) if first == last => format!("cell {first}"),
+            (Some(first), Some(last)) if found.kind.is_of_pair() => format!("cells {first} and {last}"),
+            (Some(first), Some(last)) => format!("cells {first} to {last}"),
+            _ => "pack".to_owned(),
+        };
+        let size = size_text(found.kind, found.size, found.size_std);
+        text += &format!("{place}: {}{size}, since {}\n    {}\n", found.what, found.since, found.advice);
+    }
+    text += "\ndifference from the middle of the pack\n";
+    let percent = |value: Value| both(100.0 * value.mean, 100.0 * value.std, 1);
+    let rows = page.cells.iter().map(|cell| {
+        vec![
+            cell.cell.to_string(),
+            percent(cell.soc),
+            percent(cell.capacity),
+            percent(cell.resistance),
+            percent(cell.contact),
+            both(1e3 * cell.channel_v.mean, 1e3 * cell.channel_v.std, 1),
+            both(100.0 * cell.leak_per_day.mean, 100.0 * cell.leak_per_day.std, 2),
+        ]
+    });
+    let heads = ["cell", "SOC, points", "capacity, %", "resistance, %", "contact, %", "channel, mV", "leak, %/day"];
+    text + &table(&heads, rows, 0)
+}
+
+/// Size of a finding with its unit; empty for one that has none.
+fn size_text(kind: FindingKind, size: f64, std: f64) -> String {
+    match kind {
+        FindingKind::Leak => format!(", {} % of its capacity a day", both(100.0 * size, 100.0 * std, 2)),
+        FindingKind::Contact => format!(", {} % of its series resistance", both(100.0 * size, 100.0 * std, 0)),
+        FindingKind::VoltageChannel => format!(", {} mV", both(1e3 * size, 1e3 * std, 0)),
+        FindingKind::CurrentOffset => {
+            format!(", {} % of the rated capacity per hour", both(100.0 * size, 100.0 * std, 2))
+        }
+        _ if std > 0.0 => format!(", {} %", both(100.0 * size, 100.0 * std, 1)),
+        _ => String::new(),
+    }
+}
+
+/// With a deviation; a zero is positive.
+fn both(mean: f64, std: f64, digits: usize) -> String {
+    let scale = 10f64.powi(i32::try_from(digits).unwrap_or(0));
+    format!("{:+.digits$} ± {std:.digits$}", (mean * scale).round() / scale + 0.0)
+}
