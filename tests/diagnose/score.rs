@@ -15,7 +15,7 @@ const MONTH_DAYS: f64 = 30.0;
 pub(crate) struct Score {
     packs: u32,
     days: f64,
-    /// Days from the beginning of the fault to the right finding.
+    /// Days from the beginning of the fault to the right finding, of the packs in which it was found.
     delays_days: Vec<f64>,
     /// Packs whose fault was found on another cell only.
     wrong_cell: u32,
@@ -51,9 +51,7 @@ impl Score {
     /// As cells of a Markdown row.
     pub(crate) fn row(&self) -> String {
         let share = |count: usize| format!("{:.0} %", 100.0 * count as f64 / f64::from(self.packs.max(1)));
-        let months = self.healthy_days / MONTH_DAYS;
-        let rate =
-            if months > 0.0 { format!("{:.2}", f64::from(self.false_findings) / months) } else { "-".to_owned() };
+        let rate = self.false_rate();
         format!(
             "{} | {} | {} | {} | {} | {} | {} | {rate}",
             self.packs,
@@ -66,12 +64,30 @@ impl Score {
         )
     }
 
+    /// Delay within which this share of all packs was found; one that was not found has no delay.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);
-        let at = (quantile * delays.len() as f64).ceil().max(1.0) as usize - 1;
+        let at = (quantile * f64::from(self.packs)).ceil().max(1.0) as usize - 1;
         delays.get(at).map_or_else(|| "-".to_owned(), |days| format!("{days:.1}"))
     }
+
+    /// False findings per pack-month, and the upper end of the one-sided 95 % interval of their rate.
+    fn false_rate(&self) -> String {
+        let months = self.healthy_days / MONTH_DAYS;
+        if months <= 0.0 {
+            return "-".to_owned();
+        }
+        let count = f64::from(self.false_findings);
+        format!("{:.2} (< {:.2})", count / months, poisson_upper(count) / months)
+    }
+}
+
+/// The mean of a Poisson distribution that gives `count` or fewer in 5 % of cases (Wilson and Hilferty; 1 % too low at 0).
+fn poisson_upper(count: f64) -> f64 {
+    const NORMAL_95: f64 = 1.645;
+    let n = count + 1.0;
+    n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
 /// Cells that a right finding may name, first and last; none = the pack.

@@ -322,6 +322,12 @@ impl Pack {
         self.voltages_v(current_a).fold(f64::NEG_INFINITY, f64::max)
     }
 
+    /// Lowest and highest cell voltage while `current_a` flows, V.
+    pub fn extremes_v(&self, current_a: f64) -> (f64, f64) {
+        let widen = |(low_v, high_v): (f64, f64), voltage_v| (low_v.min(voltage_v), high_v.max(voltage_v));
+        self.voltages_v(current_a).fold((f64::INFINITY, f64::NEG_INFINITY), widen)
+    }
+
     /// The current, A, at which the highest cell has `voltage_v`.
     pub fn current_at_highest_a(&self, voltage_v: f64) -> f64 {
         let at = |cell: &TruthCell| cell.current_at_a(&self.model, &self.settings.hysteresis, voltage_v);

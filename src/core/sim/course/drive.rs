@@ -134,10 +134,14 @@ impl DayCourse {
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / PACK_WH;
-        let cell_v = 0.5 * (pack.lowest_v(0.0) + pack.highest_v(0.0));
-        let current_c = capacities_per_hour * NOMINAL_V / cell_v;
+        let (lowest_v, highest_v) = pack.extremes_v(0.0);
+        let current_c = capacities_per_hour * NOMINAL_V / (0.5 * (lowest_v + highest_v));
+        let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
+        if current_a > 0.0 {
+            return current_a;
+        }
         let floor_a = pack.current_at_highest_a(pack.model().voltage_max_v); // regeneration never overcharges
-        (self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1)).max(floor_a.min(0.0))
+        current_a.max(floor_a.min(0.0))
     }
 
     fn charge_a(&self, pack: &Pack) -> f64 {
