@@ -56,7 +56,7 @@ struct FindingRow {
     size: f64,
     size_std: f64,
     since: String,
-    told: String,
+    reported: String,
     probability: f64,
     advice: &'static str,
 }
@@ -129,7 +129,7 @@ fn page(diagnosis: &Diagnosis) -> Page {
         size: found.size.mean,
         size_std: found.size.std(),
         since: format_utc(found.since),
-        told: format_utc(found.told),
+        reported: format_utc(found.reported),
         probability: found.probability,
         advice: found.kind.advice(),
     };

@@ -96,7 +96,7 @@ enum Command {
     Check(check::Args),
     /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
     Doctor(Box<doctor::Args>),
-    /// Tell which cell of a pack is failing, and how: leaks, contacts, weak cells, sensors
+    /// Name the cells of a pack that are failing, and how: leaks, contacts, weak cells, sensors
     Diagnose(Box<diagnose::Args>),
     /// List the cell models that are there, and the chemistries that a label may name
     Cells(cells::Args),

@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::channels::{Channel, compare};
-use super::difference::{self, CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
-use super::finding::{self, Finding, FindingKind, OUTLIER, TOLD, WITHDRAWN};
+use super::difference::{self, CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
+use super::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN};
 use super::row::{CellSums, PackSums};
 use super::temperature::Following;
 use crate::cell::CellModel;
@@ -73,6 +73,8 @@ struct Watched {
     difference: Difference,
     /// Its means before rows began to contradict them.
     settled: [f64; STATES],
+    /// The same when it last changed at once.
+    before_jump: [f64; STATES],
     sums: CellSums,
     channel: Channel,
     temperature: Following,
@@ -107,6 +109,7 @@ impl Diagnosis {
         let cell = Watched {
             difference: Difference::new(),
             settled: [0.0; STATES],
+            before_jump: [0.0; STATES],
             sums: CellSums::default(),
             channel: Channel::default(),
             temperature: Following::default(),
@@ -239,7 +242,7 @@ impl Diagnosis {
             self.judge(time);
         }
         for &(kind, probability, size) in sensors {
-            self.put(Finding { kind, cells: None, since: time, told: time, probability, size });
+            self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
         }
         self.findings.sort_by_key(|found| (found.cells, found.kind));
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
@@ -282,7 +285,7 @@ impl Diagnosis {
             self.cells.iter().map(|cell| (cell.channel, cell.sums)).unzip();
         compare(&mut channels, &sums);
         self.cells.iter_mut().zip(channels).for_each(|(cell, channel)| cell.channel = channel);
-        let mut jumped = Vec::new();
+        let mut jumped: Vec<(usize, Observation)> = Vec::new();
         for (index, voltage_v) in voltages_v.iter().enumerate() {
             let Some(voltage_v) = voltage_v else { continue };
             let cell = &mut self.cells[index];
@@ -291,20 +294,39 @@ impl Diagnosis {
                 cell.settled = *cell.difference.mean();
             }
             if cell.difference.observe(&observed) {
-                cell.jumped = Some(time);
-                jumped.push(index);
+                (cell.jumped, cell.before_jump) = (Some(time), cell.settled);
+                jumped.push((index, observed));
             }
         }
+        self.handle_jumps(time, row, &jumped, |cell| voltages_v[cell].map(|v| v - middle_v));
         self.observe_steps(row);
-        if let [a, b] = jumped[..] {
-            self.exchange_if_swapped(
-                time,
-                row,
-                [a, b],
-                [voltages_v[a], voltages_v[b]].map(|v| v.unwrap_or(middle_v) - middle_v),
-            );
-        }
         true
+    }
+
+    /// Cells have changed at once: two have been exchanged, some side by side replaced, or each by itself.
+    fn handle_jumps(
+        &mut self,
+        time: Timestamp,
+        row: &Row<'_>,
+        jumped: &[(usize, Observation)],
+        difference_v: impl Fn(usize) -> Option<f64>,
+    ) {
+        if jumped.is_empty() {
+            return;
+        }
+        let is_recent = |cell: &Watched| cell.jumped.is_some_and(|at| time.since(at) <= SAME_EVENT_S);
+        let recent: Vec<usize> = (0..self.cells.len()).filter(|&cell| is_recent(&self.cells[cell])).collect();
+        if let [a, b] = recent[..]
+            && let (Some(a_v), Some(b_v)) = (difference_v(a), difference_v(b))
+            && self.exchange_if_swapped(time, row, [a, b], [a_v, b_v])
+        {
+            return;
+        }
+        for (index, observed) in jumped {
+            let has_neighbour = recent.iter().any(|other| other.abs_diff(*index) == 1);
+            let jump = if has_neighbour && 2 * recent.len() <= self.cells.len() { Jump::Replaced } else { Jump::Alone };
+            self.cells[*index].difference.open(jump, observed);
+        }
     }
 
     /// Compares the series resistances that the steps of the current show.
@@ -322,19 +344,24 @@ impl Diagnosis {
             let (part, noise) = (STEP_PART * now_ohm, STEP_V / steps_a2.sqrt());
             let observed =
                 Observation { innovation: ohm - middle_ohm - expected, slope, variance: part * part + noise * noise };
-            let beyond = (cell.difference.deviations(&observed).abs() / 3.0).max(1.0);
-            cell.difference.update(&observed, beyond);
+            cell.difference.observe_steps(&observed);
         }
     }
 
-    /// Exchanges what is known of two cells whose voltages have become each other's.
-    fn exchange_if_swapped(&mut self, time: Timestamp, row: &Row<'_>, [a, b]: [usize; 2], differences_v: [f64; 2]) {
-        let [of_a, of_b] = [self.cells[a].settled, self.cells[b].settled];
+    /// Exchanges what is known of two cells whose voltages have become each other's; whether they are.
+    fn exchange_if_swapped(
+        &mut self,
+        time: Timestamp,
+        row: &Row<'_>,
+        [a, b]: [usize; 2],
+        differences_v: [f64; 2],
+    ) -> bool {
+        let [of_a, of_b] = [self.cells[a].before_jump, self.cells[b].before_jump];
         let off = |means: &[f64; STATES], difference_v: f64| row.observation(means, difference_v).innovation.abs();
         let as_before = off(&of_a, differences_v[0]).min(off(&of_b, differences_v[1]));
         let exchanged = off(&of_b, differences_v[0]).max(off(&of_a, differences_v[1]));
         if exchanged > SWAP_V || exchanged > 0.5 * as_before {
-            return;
+            return false;
         }
         let (low, high) = self.cells.split_at_mut(b);
         std::mem::swap(&mut low[a].difference, &mut high[0].difference);
@@ -347,8 +374,12 @@ impl Diagnosis {
         } else {
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
             let kind = FindingKind::SwappedChannels;
-            self.findings.push(Finding { kind, cells, since: time, told: time, probability: 1.0, size });
+            self.findings.push(Finding { kind, cells, since: time, reported: time, probability: 1.0, size });
         }
+        for cell in [a, b] {
+            self.cells[cell].jumped = None;
+        }
+        true
     }
 
     fn choose_middle(&mut self, socs: impl Fn(usize) -> Option<f64>) {
@@ -364,7 +395,7 @@ impl Diagnosis {
         let populations: [Population; STATES] = std::array::from_fn(|state| self.population(state));
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
-            let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= TOLD);
+            let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
             for it in judged {
                 let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
                 self.take(time, index, &Judged { probability, ..it });
@@ -425,7 +456,7 @@ impl Diagnosis {
         let since = suspected.unwrap_or(time);
         // The upper one of two doubled channels is in the finding of the lower one.
         if cells.0 == own {
-            self.put(Finding { kind, cells: Some(cells), since, told: time, probability, size });
+            self.put(Finding { kind, cells: Some(cells), since, reported: time, probability, size });
         }
     }
 
@@ -436,11 +467,11 @@ impl Diagnosis {
         match self.findings.iter().position(is_same) {
             Some(at) if finding.probability < WITHDRAWN => drop(self.findings.remove(at)),
             Some(at) => {
-                let Finding { since, told, .. } = self.findings[at];
+                let Finding { since, reported, .. } = self.findings[at];
                 let since = if finding.cells.is_some() { finding.since } else { since };
-                self.findings[at] = Finding { since, told, ..finding };
+                self.findings[at] = Finding { since, reported, ..finding };
             }
-            None if finding.probability >= TOLD => self.findings.push(finding),
+            None if finding.probability >= REPORTED => self.findings.push(finding),
             None => {}
         }
     }
@@ -458,17 +489,17 @@ impl Diagnosis {
             }
         }
         let kind = FindingKind::TemperatureSensor;
-        let told: Vec<Finding> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
+        let reported: Vec<Finding> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
         self.findings.retain(|found| found.kind != kind);
         let mut first = 0;
         for of_one in self.cells.chunk_by(|a, b| a.temperature == b.temperature) {
             if of_one[0].temperature.is_detached {
                 let cells = Some((CellIndex(first as u16), CellIndex((first + of_one.len() - 1) as u16)));
-                let before = told.iter().find(|found| found.cells == cells);
+                let before = reported.iter().find(|found| found.cells == cells);
                 let since = before.map_or(time, |found| found.since);
-                let told = before.map_or(time, |found| found.told);
+                let reported = before.map_or(time, |found| found.reported);
                 let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-                self.findings.push(Finding { kind, cells, since, told, probability: 1.0, size });
+                self.findings.push(Finding { kind, cells, since, reported, probability: 1.0, size });
             }
             first += of_one.len();
         }
@@ -501,7 +532,7 @@ impl Diagnosis {
                 };
                 let kind = FindingKind::Module;
                 let cells = Some(cells);
-                self.findings.push(Finding { kind, cells, since, told: time, probability: TOLD, size });
+                self.findings.push(Finding { kind, cells, since, reported: time, probability: REPORTED, size });
             }
             first += count;
         }
@@ -526,7 +557,7 @@ impl Diagnosis {
         let moved = |stamp: &mut Timestamp| *stamp = stamp.plus_nanos(by_nanos);
         self.findings.iter_mut().for_each(|found| {
             moved(&mut found.since);
-            moved(&mut found.told);
+            moved(&mut found.reported);
         });
         self.last_row.iter_mut().for_each(|(time, ..)| moved(time));
         for cell in &mut self.cells {
@@ -552,7 +583,8 @@ impl Diagnosis {
                 .into_iter()
                 .chain(cell.channel.numbers())
                 .chain(cell.temperature.numbers())
-                .chain(cell.settled);
+                .chain(cell.settled)
+                .chain(cell.before_jump);
             InvalidState::unless_numbers("a number of the diagnosis", numbers)?;
         }
         let PackSums { current_a, drop_v, soc, temperature_c, charge_ah, first_ah, .. } = self.pack;

@@ -1,7 +1,7 @@
 //! The difference of one cell from the middle of its pack, filtered.
 //!
 //! In: its voltage less that of the middle cells, row by row. Out: what explains it. A linear Kalman filter whose observation is
-//! taken at the cell's own SOC. The states differ in what they follow, which is how they are told apart:
+//! taken at the cell's own SOC. The states differ in what they follow, which is how one is not taken for another:
 //!
 //! | state | the voltage's difference follows |
 //! | --- | --- |
@@ -42,11 +42,18 @@ const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
 /// Growth of the deviations in a day, and of the charge's per unit of moved SOC.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
-/// Deviations that are added when the cell has changed at once. The capacity may be another cell's.
-const JUMP_STD: [f64; STATES] = [0.05, 0.05, 0.2, 0.5, 0.03, 0.01];
-/// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it tells of a jump; and how many of these do.
+/// Deviations that are added when a cell has changed at once, alone: its contact, its channel, or itself; but charge goes nowhere
+/// without a current.
+const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
+/// The same of a cell that is another one: its module has been replaced.
+const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
+/// The same when only its resistance has changed.
+const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.2, 0.5, 0.0, 0.0];
+/// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
+/// in a row are a jump.
 const HUBER: f64 = 3.0;
 const JUMP: f64 = 4.0;
+const STEPS_JUMP: f64 = 3.0;
 const JUMP_ROWS: u8 = 3;
 
 /// The filter of one cell.
@@ -56,8 +63,29 @@ pub struct Difference {
     mean: [f64; STATES],
     /// Upper triangle, row by row.
     covariance: [f64; PAIRS],
-    /// Rows in a row that deviate to one side.
+    /// Rows in a row that deviate to one side, by their means and by their steps.
     odd_rows: i8,
+    odd_steps: i8,
+}
+
+/// How a cell has changed at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Jump {
+    /// Alone.
+    Alone,
+    /// With its neighbours.
+    Replaced,
+}
+
+/// Counts deviations to one side; whether enough have come in a row, with which the count begins again.
+fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
+    let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
+    *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
+    let is_jump = odd.unsigned_abs() >= JUMP_ROWS;
+    if is_jump {
+        *odd = 0;
+    }
+    is_jump
 }
 
 /// An observation: its value less what is expected of it, its slopes by the states, and the variance of its error.
@@ -81,7 +109,7 @@ impl Difference {
         for (i, std) in FIRST_STD.iter().enumerate() {
             covariance[pair(i, i)] = std * std;
         }
-        Self { mean: [0.0; STATES], covariance, odd_rows: 0 }
+        Self { mean: [0.0; STATES], covariance, odd_rows: 0, odd_steps: 0 }
     }
 
     /// A state with its standard deviation.
@@ -138,23 +166,39 @@ impl Difference {
         (with, total.max(f64::MIN_POSITIVE))
     }
 
-    /// Takes a row's mean; whether the cell has changed at once: some rows in a row contradict what is known.
+    /// Takes a row's mean; whether the cell has changed at once: some rows in a row contradict what is known. The row then waits
+    /// for [`Self::open`].
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
-        let side = if off.abs() < JUMP { 0 } else { off.signum() as i8 };
-        self.odd_rows = if side == 0 || self.odd_rows.signum() * side < 0 { side } else { self.odd_rows + side };
-        if self.odd_rows.unsigned_abs() >= JUMP_ROWS {
-            self.odd_rows = 0;
-            self.open();
-            self.update(observed, 1.0);
-            return true;
+        let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
+        if !is_jump {
+            self.update(observed, (off.abs() / HUBER).max(1.0));
         }
-        self.update(observed, (off.abs() / HUBER).max(1.0));
-        false
+        is_jump
+    }
+
+    /// Takes a row's series resistance.
+    pub(super) fn observe_steps(&mut self, observed: &Observation) {
+        let off = self.deviations(observed);
+        if count_odd(&mut self.odd_steps, off, STEPS_JUMP) {
+            self.widen(&RESISTANCE_STD);
+            self.update(observed, 1.0);
+        } else {
+            self.update(observed, (off.abs() / HUBER).max(1.0));
+        }
+    }
+
+    /// The cell has changed at once; takes the row that said so.
+    pub(super) fn open(&mut self, jump: Jump, observed: &Observation) {
+        self.widen(match jump {
+            Jump::Alone => &ALONE_STD,
+            Jump::Replaced => &REPLACED_STD,
+        });
+        self.update(observed, 1.0);
     }
 
     /// Takes an observation whose variance is multiplied so that the innovation counts linearly beyond the limit.
-    pub(super) fn update(&mut self, observed: &Observation, beyond: f64) {
+    fn update(&mut self, observed: &Observation, beyond: f64) {
         let (with, total) = self.by_slope(observed);
         let total = total * beyond;
         for (mean, with) in self.mean.iter_mut().zip(&with) {
@@ -177,9 +221,8 @@ impl Difference {
         (self.mean, self.odd_rows) = (*mean, 0);
     }
 
-    /// The cell may be another one, or its contact or channel.
-    fn open(&mut self) {
-        for (i, std) in JUMP_STD.iter().enumerate() {
+    fn widen(&mut self, added: &[f64; STATES]) {
+        for (i, std) in added.iter().enumerate() {
             self.covariance[pair(i, i)] += std * std;
         }
     }

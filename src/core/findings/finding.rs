@@ -1,4 +1,4 @@
-//! What is found, and from when on it is told.
+//! What is found, and from when on it is reported.
 
 use serde::{Deserialize, Serialize};
 
@@ -105,7 +105,7 @@ impl FindingKind {
             Self::WeakCell => "the pack ends with this cell: plan its replacement",
             Self::HighResistance => "the cell has aged more than the others: watch its temperature under load",
             Self::ForeignCell => "the cell has been replaced: balance the pack",
-            Self::Module => "modules have been replaced: balance the pack; their history begins anew",
+            Self::Module => "modules have been replaced: balance the pack; their history begins again",
             Self::VoltageChannel => "compare the channel with a voltmeter, and check its sense wire",
             Self::VoltageFrozen => "the channel shows no cell: check monitor chip and sense wire",
             Self::DoubledChannels => "check the wiring of the two channels and the layout of their frames",
@@ -137,8 +137,8 @@ pub struct Finding {
     pub cells: Option<(CellIndex, CellIndex)>,
     /// When it was first likelier than not.
     pub since: Timestamp,
-    /// When it was first told.
-    pub told: Timestamp,
+    /// When it was first reported.
+    pub reported: Timestamp,
     /// Probability that it is beyond the limit of its kind.
     pub probability: f64,
     /// How large; the unit is that of the kind.
@@ -156,8 +156,8 @@ pub const RESISTANCE: f64 = 0.1;
 /// See [`CONTACT`].
 pub const CHANNEL_V: f64 = 0.015;
 
-/// Probability from which on a finding is told, and below which it is withdrawn.
-pub(super) const TOLD: f64 = 0.999;
+/// Probability from which on a finding is reported, and below which it is withdrawn.
+pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
 /// Least distance from the middle of the pack in robust standard deviations of its cells: cells of one kind differ.

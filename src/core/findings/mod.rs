@@ -11,7 +11,7 @@
 //! | `row` | samples of some minutes, summed per cell |
 //! | `channels` | channels that are frozen or doubled |
 //! | `temperature` | temperature sensors that do not follow the load |
-//! | [`finding`] | kinds of findings, and from when on one is told |
+//! | [`finding`] | kinds of findings, and from when on one is reported |
 pub mod diagnosis;
 pub mod difference;
 pub mod finding;

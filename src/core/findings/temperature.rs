@@ -1,7 +1,7 @@
 //! Temperature sensors that do not follow the load: frozen ones, and ones that have fallen off.
 //!
 //! In: the temperature at each cell and that in the middle of the pack, row by row. Cells of one sensor show the same, so a faulty
-//! sensor appears as its cells. With one sensor for all cells, or two, nothing can be told: none stands out.
+//! sensor appears as its cells. With one sensor for all cells, or two, nothing is known: none stands out.
 
 use serde::{Deserialize, Serialize};
 

@@ -99,8 +99,9 @@ impl Diagnosing {
         if self.diagnosis.note(sample.time, &mean, capacity_ah) {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
             let sensors = shared_sensors(is_current_frozen, learning, model.rated_capacity_ah);
-            let told = self.diagnosis.close_row(model, capacity_ah, socs, &sensors, self.is_balanced);
-            out.events.extend(told.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+            let reported = self.diagnosis.close_row(model, capacity_ah, socs, &sensors, self.is_balanced);
+            out.events
+                .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
     }
 }

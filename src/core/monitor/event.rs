@@ -283,7 +283,7 @@ pub enum EventKind {
         /// The model before was the better one and holds again.
         is_taken_back: bool,
     },
-    /// A cell stands out from its pack in a way that tells what is wrong with it.
+    /// A cell stands out from its pack in a way that shows what is wrong with it.
     Finding(Finding),
     /// A cell's filter failed and started again from its voltage.
     FilterReset {
