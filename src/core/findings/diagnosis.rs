@@ -42,13 +42,10 @@ const LEAST_STEPS: f64 = 0.02;
 const SOC_JUMP: f64 = 0.02;
 /// Rows of which the jumps of several cells are one event.
 const SAME_EVENT_S: f64 = 1800.0;
+/// The same of the cells of a module with more capacity than the others.
+const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
-/// SOC from which on a BMS balances during a charge; how much a cell is bled in a day, fraction of its capacity (usual resistors
-/// take 1 mA per Ah), and over how long without a break, days.
-const BLED_SOC: f64 = 0.6;
-const BLED_PER_DAY: f64 = 0.024;
-const BLED_DAYS: f64 = 0.33;
 const DAY_S: f64 = 86_400.0;
 
 /// The cell in the middle of the pack, as the estimators know it at one moment.
@@ -96,8 +93,6 @@ pub struct Diagnosis {
     rest_s: f64,
     /// Series resistance of the mean cell in this row, ohm.
     ohm: f64,
-    /// No drive since the end of a charge.
-    is_charged: bool,
     /// The cell with the middle SOC.
     middle: usize,
     findings: Vec<Finding>,
@@ -122,7 +117,6 @@ impl Diagnosis {
             last_row: None,
             rest_s: 0.0,
             ohm: 0.0,
-            is_charged: false,
             middle: 0,
             findings: Vec::new(),
         }
@@ -235,11 +229,11 @@ impl Diagnosis {
         };
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
-        self.pass(middle_time, &row, is_balanced);
+        self.pass(middle_time, &row);
         let before = self.findings.clone();
         if self.observe(time, &row) {
             self.observe_temperatures(time, seconds);
-            self.judge(time);
+            self.judge(time, is_balanced);
         }
         for &(kind, probability, size) in sensors {
             self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
@@ -253,25 +247,14 @@ impl Diagnosis {
     }
 
     /// Lets time and charge since the last row pass.
-    fn pass(&mut self, time: Timestamp, row: &Row<'_>, is_balanced: bool) {
-        let was_charged = self.note_charge(row);
+    fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
         // A filter that finds its SOC moves no charge.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
-        let bled = if is_balanced && was_charged { BLED_PER_DAY * (days * BLED_DAYS).sqrt() } else { 0.0 };
-        self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change, bled));
-    }
-
-    /// Whether the time before this row was near the end of a charge or after it.
-    fn note_charge(&mut self, row: &Row<'_>) -> bool {
-        let rest_a = REST_PER_H * row.capacity_ah;
-        let was_charged = self.is_charged;
-        self.is_charged =
-            if row.current_a < -rest_a { row.soc >= BLED_SOC } else { self.is_charged && row.current_a <= rest_a };
-        was_charged || self.is_charged
+        self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
     /// Compares every cell with the middle ones; whether there was something to compare.
@@ -391,21 +374,23 @@ impl Diagnosis {
     }
 
     /// Judges all cells.
-    fn judge(&mut self, time: Timestamp) {
+    fn judge(&mut self, time: Timestamp, is_balanced: bool) {
         let populations: [Population; STATES] = std::array::from_fn(|state| self.population(state));
+        let charges = self.cells.iter().map(|cell| cell.difference.mean()[SOC]);
+        let lowest = charges.clone().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(cell, _)| cell);
         for index in 0..self.cells.len() {
-            let judged = self.judged(index, &populations);
+            let judged = self.judged(index, &populations, is_balanced.then_some(lowest));
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
             for it in judged {
                 let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
                 self.take(time, index, &Judged { probability, ..it });
             }
         }
-        self.find_modules(time, &populations);
+        self.find_modules(time);
     }
 
-    /// What one cell may have.
-    fn judged(&self, index: usize, populations: &[Population; STATES]) -> Vec<Judged> {
+    /// What one cell may have. `lowest`: the cell with the least charge, in a pack that is balanced.
+    fn judged(&self, index: usize, populations: &[Population; STATES], lowest: Option<usize>) -> Vec<Judged> {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64, is_outlier: bool| {
             let own = cell.difference.state(state);
@@ -421,9 +406,10 @@ impl Diagnosis {
         };
         let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign, true));
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
-        // A cell that is bled until it is like the others leaks as well, but it is above them.
+        // A BMS bleeds cells that are above the lowest one. Where one balances, only the lowest cell loses charge by itself.
         let leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
         let is_below = cell.difference.state(SOC).mean < populations[SOC].middle;
+        let is_below = is_below && lowest.is_none_or(|lowest| lowest == index);
         let is_near = |judged: (ScalarGaussian, f64)| {
             if cell.difference.mean()[SOC].abs() < TOO_FAR { judged } else { (judged.0, 0.0) }
         };
@@ -454,10 +440,16 @@ impl Diagnosis {
         let own = CellIndex(index as u16);
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
         let since = suspected.unwrap_or(time);
+        let is_in_module = kind == FindingKind::ForeignCell && self.is_in_module(index);
         // The upper one of two doubled channels is in the finding of the lower one.
-        if cells.0 == own {
+        if cells.0 == own && !is_in_module {
             self.put(Finding { kind, cells: Some(cells), since, reported: time, probability, size });
         }
+    }
+
+    fn is_in_module(&self, index: usize) -> bool {
+        let holds = |(first, last): (CellIndex, CellIndex)| (first.index()..=last.index()).contains(&index);
+        self.findings.iter().any(|found| found.kind == FindingKind::Module && found.cells.is_some_and(holds))
     }
 
     /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
@@ -465,7 +457,7 @@ impl Diagnosis {
         let first = |found: &Finding| found.cells.map(|cells| cells.0);
         let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
         match self.findings.iter().position(is_same) {
-            Some(at) if finding.probability < WITHDRAWN => drop(self.findings.remove(at)),
+            Some(at) if finding.probability < finding.kind.withdrawn_below() => drop(self.findings.remove(at)),
             Some(at) => {
                 let Finding { since, reported, .. } = self.findings[at];
                 let since = if finding.cells.is_some() { finding.since } else { since };
@@ -505,36 +497,57 @@ impl Diagnosis {
         }
     }
 
-    /// Finds cells side by side that changed at the same time.
-    fn find_modules(&mut self, time: Timestamp, populations: &[Population; STATES]) {
-        let recent = |cell: &Watched| cell.jumped.filter(|jumped| time.since(*jumped) < DAY_S);
-        let jumped: Vec<Option<Timestamp>> = self.cells.iter().map(recent).collect();
+    /// Joins cells side by side with more capacity than the others, found at about the same time, to a replaced module.
+    fn find_modules(&mut self, time: Timestamp) {
+        let kind = FindingKind::ForeignCell;
+        let of_cell = |found: &Finding| {
+            found.cells.filter(|(first, last)| found.kind == kind && first == last).map(|(first, _)| first.index())
+        };
+        let mut since: Vec<Option<(Timestamp, ScalarGaussian)>> = vec![None; self.cells.len()];
+        for found in &self.findings {
+            if let Some(cell) = of_cell(found) {
+                since[cell] = Some((found.since, found.size));
+            }
+        }
+        let in_module = |at: usize| {
+            let holds = |(first, last): (CellIndex, CellIndex)| (first.index()..=last.index()).contains(&at);
+            let module = |found: &&Finding| found.kind == FindingKind::Module && found.cells.is_some_and(holds);
+            self.findings.iter().find(module).map(|found| (found.since, found.size))
+        };
+        let known: Vec<Option<(Timestamp, ScalarGaussian)>> =
+            since.iter().enumerate().map(|(at, since)| since.or_else(|| in_module(at))).collect();
         let mut first = 0;
-        while first < jumped.len() {
-            let Some(since) = jumped[first] else {
+        while first < known.len() {
+            let Some((begun, _)) = known[first] else {
                 first += 1;
                 continue;
             };
-            let same = |other: &Option<Timestamp>| other.is_some_and(|it| it.since(since).abs() <= SAME_EVENT_S);
-            let count = jumped[first..].iter().take_while(|other| same(other)).count();
-            let cells = (CellIndex(first as u16), CellIndex((first + count - 1) as u16));
-            let overlaps = |found: &Finding| {
-                matches!(found.kind, FindingKind::Module | FindingKind::SwappedChannels)
-                    && found.cells.is_some_and(|(first, last)| first <= cells.1 && cells.0 <= last)
+            let same = |other: &&Option<(Timestamp, ScalarGaussian)>| {
+                other.is_some_and(|(it, _)| it.since(begun).abs() <= SAME_MODULE_S)
             };
-            if count >= 2 && 2 * count <= jumped.len() && !self.findings.iter().any(overlaps) {
-                let states = (first..first + count).map(|cell| self.cells[cell].difference.state(difference::CAPACITY));
-                let (sum, variance) =
-                    states.fold((0.0, 0.0), |(sum, variance), it| (sum + it.mean, variance + it.variance));
-                let size = ScalarGaussian {
-                    mean: sum / count as f64 - populations[difference::CAPACITY].middle,
-                    variance: variance / (count * count) as f64,
+            let group: Vec<ScalarGaussian> =
+                known[first..].iter().take_while(same).filter_map(|it| it.map(|(_, size)| size)).collect();
+            let count = group.len();
+            let cells = Some((CellIndex(first as u16), CellIndex((first + count - 1) as u16)));
+            if count >= 2 && 2 * count <= known.len() {
+                let within =
+                    |found: &Finding| of_cell(found).is_some_and(|cell| (first..first + count).contains(&cell));
+                let overlaps = |found: &Finding| {
+                    found.kind == FindingKind::Module
+                        && found.cells.is_some_and(|(a, b)| a.index() < first + count && first <= b.index())
                 };
+                let earlier = self.findings.iter().find(|found| overlaps(found)).copied();
+                let reported = earlier.filter(|it| it.cells == cells).map_or(time, |it| it.reported);
+                let n = count as f64;
+                let size = ScalarGaussian {
+                    mean: group.iter().map(|size| size.mean).sum::<f64>() / n,
+                    variance: group.iter().map(|size| size.variance).sum::<f64>() / (n * n),
+                };
+                self.findings.retain(|found| !within(found) && !overlaps(found));
                 let kind = FindingKind::Module;
-                let cells = Some(cells);
-                self.findings.push(Finding { kind, cells, since, reported: time, probability: REPORTED, size });
+                self.findings.push(Finding { kind, cells, since: begun, reported, probability: 1.0, size });
             }
-            first += count;
+            first += count.max(1);
         }
     }
 

@@ -121,9 +121,8 @@ impl Difference {
         &self.mean
     }
 
-    /// Time and charge pass: days, and the change of the mean cell's SOC. `bled`: standard deviation of the charge that a BMS may have
-    /// taken out, fraction.
-    pub(super) fn pass(&mut self, days: f64, soc_change: f64, bled: f64) {
+    /// Time and charge pass: days, and the change of the mean cell's SOC.
+    pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
         // charge += -capacity * soc_change - leak * days
         let (by_capacity, by_leak) = (-soc_change, -days);
         self.mean[SOC] += by_capacity * self.mean[CAPACITY] + by_leak * self.mean[LEAK];
@@ -141,7 +140,7 @@ impl Difference {
             self.covariance[pair(i, i)] += std * std * days;
         }
         let moved = MOVED_STD * soc_change;
-        self.covariance[pair(SOC, SOC)] += moved * moved + bled * bled;
+        self.covariance[pair(SOC, SOC)] += moved * moved;
     }
 
     /// The charge is not known any more.
@@ -255,7 +254,7 @@ mod tests {
             let (passed_days, current) = (if change == 0.0 { 1.0 / 30.0 } else { 1.0 / 120.0 }, -change);
             soc += change;
             charge += -truth[CAPACITY] * change - truth[LEAK] * passed_days;
-            filter.pass(passed_days, change, 0.0);
+            filter.pass(passed_days, change);
             // A curve that is not straight, a drop whose slow part comes late, a contact.
             let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
             let drop_v = 3.0 * current + if row % 2 == 0 { 0.02 } else { 0.0 };
@@ -294,7 +293,7 @@ mod tests {
         let jumps: Vec<bool> = (0..20)
             .map(|_| {
                 let observed = row(&filter);
-                filter.pass(0.003, 0.0, 0.0);
+                filter.pass(0.003, 0.0);
                 filter.observe(&observed)
             })
             .collect();

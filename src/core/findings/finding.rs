@@ -121,6 +121,14 @@ impl FindingKind {
         matches!(self, Self::DoubledChannels | Self::SwappedChannels)
     }
 
+    /// Probability below which it is withdrawn. A BMS that bleeds the other cells hides a leak that was seen before.
+    pub(super) const fn withdrawn_below(self) -> f64 {
+        match self {
+            Self::Leak => 0.01,
+            _ => WITHDRAWN,
+        }
+    }
+
     /// Whether it is the measurement that fails, so that nothing is known of the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
