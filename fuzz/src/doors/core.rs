@@ -16,6 +16,8 @@ use super::world;
 
 /// Most inputs of one execution: some 50 ms of work.
 const MAX_INPUTS: usize = 3000;
+/// Most cuts of one execution: each takes as long as some hundred inputs.
+const MAX_CUTS: usize = 100;
 /// Most outputs of one input: the largest pack of the configuration has two cells and eleven rules.
 const MAX_OUTPUTS: usize = 2000;
 /// Inputs and cuts of all executions of this process, for tests/fuzz.
@@ -71,7 +73,7 @@ pub fn cuts(data: &[u8]) {
         let time = record.input().time();
         let is_break = time.since(before).abs() > BREAK_S;
         before = time;
-        if until_cut == 0 && !is_break {
+        if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;
             until_cut = steps[cuts % steps.len()];
             cut = restored(&cut);
