@@ -44,6 +44,22 @@ fn every_shipped_configuration_is_good() {
     }
 }
 
+/// As the comment says it: packwatch once had 30 % there and 80 % in the key.
+#[test]
+fn the_measured_cell_s_end_of_life_is_one_in_comment_key_and_alarm() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let said = text.split_once("End of life as the publishers of the data state it: ").unwrap().1;
+    let (percent, said) = said.split_once(" % below the ").unwrap();
+    let rated_ah: f64 = said.split_once(" Ah").unwrap().0.parse().unwrap();
+    let end_ah = rated_ah * (1.0 - percent.parse::<f64>().unwrap() / 100.0);
+
+    let config = packwatch::config::load(&file).unwrap().monitor;
+    assert!((config.health.end_of_life_ah - end_ah).abs() < 1e-9, "key: {}", config.health.end_of_life_ah);
+    let alarm = config.rules.iter().find(|rule| rule.rule == packwatch::alarm::Rule::UsableCapacityLow).unwrap();
+    assert!((alarm.threshold - end_ah).abs() < 1e-9, "alarm: {}", alarm.threshold);
+}
+
 #[test]
 fn every_shipped_cell_model_is_good() {
     for file in shipped("config/cells") {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use crate::support::oracle::{ask, hex, python, values};
 use packwatch::alarm::Rule;
-use packwatch::can::dbc::Database;
+use packwatch::can::dbc::{Database, Repetition};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
     AlarmFields, Command, CommandPlan, E2eSetting, HealthFields, LayoutBase, LayoutSettings, MessageSettings,
@@ -350,6 +350,37 @@ fn every_rule_is_named_in_the_value_tables_by_its_number() {
         let table = &dbc.signal(signal).unwrap().1.values;
         assert_eq!(table[..rules.len()], rules, "{signal}");
         assert_eq!(table.len(), rules.len() + 1, "{signal}: and one code for none or all");
+    }
+}
+
+/// As the manual's contract page has it: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
+#[test]
+fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
+    let base = LayoutBase::BuiltIn { rated_capacity_ah: 2.6 };
+    // A reply is sent where commands are accepted.
+    let settings = LayoutSettings { command: Some(MessageSettings::default()), ..LayoutSettings::default() };
+    let database = Database::parse(&layout(base, &settings).unwrap().to_dbc()).unwrap();
+    let stated = |name: &str| {
+        let message = database.message(&format!("PACKWATCH_{name}")).unwrap();
+        let Repetition { count, period_ms, delay_ms } = message.repetition;
+        (message.cycle_time_ms, count, period_ms, delay_ms)
+    };
+    assert_eq!(stated("Status"), (Some(100), None, None, None));
+    assert_eq!(stated("Health"), (Some(1000), None, None, None));
+    assert_eq!(stated("Alarm"), (Some(1000), Some(3), Some(100), Some(10)), "3 times, 100 ms apart, 100 a second");
+    assert_eq!(stated("Digest"), (Some(1000), None, None, None));
+    assert_eq!(stated("Reply"), (None, None, None, Some(100)), "10 a second");
+    for (signal, words) in [
+        ("PACKWATCH_Health.Page", ["capacity", "recharge", "usable", "life", "losses"].as_slice()),
+        ("PACKWATCH_Digest.Page", &["alarms", "rules", "threshold"]),
+        (
+            "PACKWATCH_Alarm.State",
+            &["inactive", "active", "cleared", "pending", "latched", "suppressed", "unknown", "not available"],
+        ),
+    ] {
+        let table = &database.signal(signal).unwrap().1.values;
+        let named: Vec<_> = table.iter().map(|(_, word)| word.as_str()).take(words.len()).collect();
+        assert_eq!(named, words, "{signal}");
     }
 }
 

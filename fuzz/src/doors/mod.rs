@@ -3,9 +3,9 @@
 //! | door | entrance | invariants, besides "no panic" |
 //! | --- | --- | --- |
 //! | `core` | frames, ticks, gaps, commands, J1939, diagnostics into the monitor | only own identifiers are sent; estimates are numbers; an unknown value clears no alarm; a second run gives the same outputs |
-//! | `cuts` | the same, with snapshots taken and restored in between | own state is accepted |
-//! | `snapshot` | a stored state with damaged numbers | rejected, or runs on; strict: and is accepted again |
-//! | `configuration` | TOML; numbers of any size in any key | accepted: runs; strict: and accepts its own state |
+//! | `cuts` | the same, with snapshots taken and restored in between | own state is accepted; frames, events and estimates are those without a cut, bit for bit |
+//! | `snapshot` | a stored state with damaged numbers | rejected, or runs on with numbers, and its own state is accepted |
+//! | `configuration` | TOML; numbers of any size in any key | accepted: runs, and accepts its own state |
 //! | `cell_model` | a cell model file | as for `configuration` |
 //! | `dbc` | a DBC file | what is written reads back the same |
 //! | `log`, `journal` | candump logs, CSV, journals | one by one and in batches give the same records |
@@ -45,12 +45,6 @@ pub const DOORS: &[(&str, Door)] = &[
     #[cfg(feature = "lab")]
     ("bpx", texts::bpx),
 ];
-
-/// Whether the state that follows from damaged numbers or from a configuration of any size must be accepted again, too:
-/// `PACKWATCH_FUZZ_STRICT` is set. Without it only a panic counts there.
-pub(crate) fn is_strict() -> bool {
-    std::env::var_os("PACKWATCH_FUZZ_STRICT").is_some()
-}
 
 /// The door of a name.
 ///

@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
+use crate::can::id_table::IdTable;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
@@ -51,10 +52,15 @@ struct SentFrame {
     sum: u64,
 }
 
-/// FNV-1a of a payload and its length: a copy is to be recognised, not to be proven.
+/// A sum of a payload and its length, like FNV-1a with words of eight bytes in place of bytes: it is made for every sent frame, and
+/// a copy is to be recognised, not to be proven. Two of one length of up to eight bytes never have the same.
 fn sum(data: &[u8]) -> u64 {
-    let bytes = data.iter().copied().chain([data.len() as u8]);
-    bytes.fold(0xCBF2_9CE4_8422_2325, |sum, byte| (sum ^ u64::from(byte)).wrapping_mul(0x100_0000_01B3))
+    let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
+    data.chunks(8).fold(start, |sum, chunk| {
+        let mut word = [0; 8];
+        word[..chunk.len()].copy_from_slice(chunk);
+        (sum ^ u64::from_le_bytes(word)).wrapping_mul(0x100_0000_01B3)
+    })
 }
 
 /// State for a snapshot.
@@ -68,8 +74,9 @@ pub struct OwnFramesState {
 /// Our identifiers, and what came with them.
 #[derive(Debug, Clone, Default)]
 pub struct OwnFrames {
-    /// Sorted by interface and identifier.
-    own: Vec<(BusIndex, CanId)>,
+    numbers: IdTable,
+    /// Number of our identifiers.
+    count: usize,
     state: OwnFramesState,
     /// Changes that wait to be published, in their order.
     pub(crate) changes: Vec<OwnIdChange>,
@@ -78,10 +85,9 @@ pub struct OwnFrames {
 impl OwnFrames {
     /// For these identifiers.
     pub fn new(own: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
-        let mut own: Vec<_> = own.into_iter().collect();
-        own.sort_unstable();
-        own.dedup();
-        let mut own_frames = Self { own, ..Self::default() };
+        let own: Vec<_> = own.into_iter().collect();
+        let count = own.len();
+        let mut own_frames = Self { numbers: IdTable::new(own), count, ..Self::default() };
         own_frames.state.sent.reserve_exact(MAX_SENT);
         own_frames
     }
@@ -89,7 +95,7 @@ impl OwnFrames {
     /// Whether an identifier is ours.
     #[inline]
     pub fn has(&self, bus: BusIndex, id: CanId) -> bool {
-        self.own.binary_search(&(bus, id)).is_ok()
+        self.numbers.number(bus, id) < self.count
     }
 
     /// Takes a frame that we send.
@@ -105,7 +111,7 @@ impl OwnFrames {
     /// Takes a frame that came.
     #[inline]
     pub fn handle(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) {
-        if !self.own.is_empty() && self.has(bus, frame.id()) {
+        if self.has(bus, frame.id()) {
             self.handle_own(now, bus, frame);
         }
     }

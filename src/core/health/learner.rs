@@ -66,6 +66,11 @@ struct CellMark {
 }
 
 impl CellMark {
+    /// The SOC; `None` = beyond what a state can hold, as the variance may be when a damaged state is continued.
+    fn storable(soc: Option<ScalarGaussian>) -> Option<ScalarGaussian> {
+        soc.filter(|soc| bounds::STORED_SOC.has(soc.mean) && (0.0..=bounds::NUMBER.high).contains(&soc.variance))
+    }
+
     fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("a temperature at a half-cycle's end", self.temperature_integral)?;
         bounds::TIME_S.check("the time with a temperature", self.temperature_s)?;
@@ -182,7 +187,7 @@ impl Learner {
     /// Moves the candidate's mark of a cell to its present SOC.
     pub fn move_mark(&mut self, cell: usize, soc: Option<ScalarGaussian>) {
         if let Some(mark) = &mut self.candidate {
-            mark.cells[cell].soc = soc;
+            mark.cells[cell].soc = CellMark::storable(soc);
         }
     }
 
@@ -195,7 +200,7 @@ impl Learner {
     pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, soc: impl Fn(usize) -> Option<ScalarGaussian>) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
-        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.soc = soc(cell));
+        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.soc = CellMark::storable(soc(cell)));
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
@@ -306,6 +311,7 @@ impl Learner {
         self.prior[cell] = estimator.capacity();
         self.in_doubt.retain(|&other| other != cell);
         // What a joined half-cycle began with was estimated with the old model.
+        let soc = CellMark::storable(soc);
         let at_start = soc.filter(|_| !self.joining);
         for (mark, soc) in [(&mut self.start, at_start), (&mut self.candidate, soc)] {
             mark.iter_mut().for_each(|mark| mark.cells[cell].soc = soc);

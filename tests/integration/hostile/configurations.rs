@@ -17,6 +17,11 @@ const TABLES: [&str; 9] = [
     "limits.temperature",
 ];
 
+/// Rounds of readings after which most configurations have shown what they do, and those of one in [`LONG_ONE_IN`].
+const ROUNDS: usize = 16;
+const LONG_ROUNDS: usize = 80;
+const LONG_ONE_IN: usize = 8;
+
 /// A key with a number, and its range.
 struct NumberKey {
     table: &'static str,
@@ -171,7 +176,7 @@ fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
     let (mut monitor, mut out, encoder) =
         (Monitor::new(config.clone()), Outputs::default(), InputEncoder::new(&config.input));
     let (mut now, mut made, mut current_a) = (Timestamp::from_secs(1.7e9), Vec::new(), 0.0);
-    for _ in 0..80 {
+    for _ in 0..if dice.one_in(LONG_ONE_IN) { LONG_ROUNDS } else { ROUNDS } {
         if dice.one_in(5) {
             current_a = [0.0, 300.0, -300.0, dice.between(-300.0, 300.0), dice.between(-1.0, 1.0)][dice.below(5)];
         }

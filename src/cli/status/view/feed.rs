@@ -62,3 +62,19 @@ async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), S
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn without_a_daemon_the_hint_names_the_status_socket_and_not_the_stream() {
+        let (updates, _received) = mpsc::channel(1);
+        let said = listen(Path::new("/nonexistent/status.sock"), &updates).await.unwrap_err();
+        assert!(said.starts_with("/nonexistent/status.sock: no daemon listens there"), "{said}");
+        assert!(
+            said.contains("packwatch run -c FILE --status /nonexistent/status.sock"),
+            "an option that there is: {said}"
+        );
+    }
+}

@@ -102,8 +102,9 @@ impl DigestPlan {
         let name = LayoutMessage::Digest.message();
         database.message(name)?;
         let rules = RULES.map(|rule| format!("Rule_{rule}"));
-        let required: Vec<&str> = REQUIRED.into_iter().chain(rules.iter().map(String::as_str)).collect();
-        let message = OutputMessage::new(database, name, &required, faults)?;
+        let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
+        let required = [&REQUIRED[..], &rules].concat();
+        let message = OutputMessage::new(database, name, &required, faults)?.with_places(&rules);
         let factors = RULES.map(|rule| alarm.per_inside_unit(&format!("Threshold_{rule}")));
         Some(Self { pages: message.page_codes(), message, factors })
     }
@@ -111,7 +112,10 @@ impl DigestPlan {
     /// One page, counted from 0; `None` = there is no such page.
     pub(super) fn frame(&self, page: usize, fields: &DigestFields, counter: &mut u8) -> Option<Frame> {
         let code = *self.pages.get(page)?;
-        Some(self.message.frame(code, counter, |name| self.value(fields, name)))
+        Some(self.message.frame(code, counter, |name, rule| match rule {
+            Some(rule) => fields.rules.get(rule).map(|state| f64::from(*state as u8)),
+            None => self.value(fields, name),
+        }))
     }
 
     /// Pages of the digest.
@@ -129,10 +133,7 @@ impl DigestPlan {
             "ThresholdRule" => threshold.map(|threshold| threshold.rule.into()),
             "ThresholdSeverity" => threshold.map(|threshold| threshold.severity.into()),
             "Threshold" => threshold.map(|of| of.threshold * self.factor(of.rule)),
-            _ => {
-                let rule = RULES.iter().position(|rule| name.strip_prefix("Rule_") == Some(*rule))?;
-                Some(f64::from(fields.rules[rule] as u8))
-            }
+            _ => None,
         }
     }
 

@@ -9,6 +9,8 @@
 //! the bytes of the header instead. The user's own DBC is not moved: its signals must leave header and trailer free. All
 //! settings that do not fit are reported together.
 
+use std::sync::OnceLock;
+
 use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Repetition, Signal};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::frame::is_frame_length;
@@ -47,6 +49,13 @@ pub const DEFAULT_PERIOD_MS: u32 = 1000;
 /// Never for the file as shipped (a test reads it).
 pub fn default_database() -> Result<Database, DbcError> {
     Database::parse(include_str!("../../../../config/packwatch.dbc"))
+}
+
+/// The same, parsed once: its grammar takes longer than all the rest of reading a configuration.
+fn shipped() -> &'static Database {
+    static SHIPPED: OnceLock<Database> = OnceLock::new();
+    // Cannot fail: a test reads the shipped file.
+    SHIPPED.get_or_init(|| default_database().unwrap_or_default())
 }
 
 /// A message of the layout.
@@ -211,13 +220,8 @@ pub struct SettingFault {
 /// # Errors
 /// All settings that do not fit.
 pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
-    let shipped;
     let (database, rated_capacity_ah) = match base {
-        LayoutBase::BuiltIn { rated_capacity_ah } => {
-            // Cannot fail: a test reads the shipped file.
-            shipped = default_database().unwrap_or_default();
-            (&shipped, Some(rated_capacity_ah))
-        }
+        LayoutBase::BuiltIn { rated_capacity_ah } => (shipped(), Some(rated_capacity_ah)),
         LayoutBase::Own(database) => (database, None),
     };
     let mut faults = Vec::new();

@@ -26,6 +26,8 @@ pub(super) struct OutputMessage {
 #[derive(Debug, Clone, PartialEq)]
 struct OutputField {
     name: String,
+    /// Place of the name in the list of [`OutputMessage::with_places`].
+    place: Option<usize>,
     plan: SignalPlan,
     not_available: u64,
     /// 100 where the DBC's unit is %.
@@ -104,13 +106,29 @@ impl OutputMessage {
         self.len.saturating_sub(self.secoc.map_or(0, |secoc| secoc.profile.trailer_bytes()))
     }
 
-    /// A frame of the page with `value` of each signal's name. `counter` is the protection's next; it is advanced. The trailer of
-    /// an authenticated message is 0: it is written when the freshness is known.
-    pub(super) fn frame(&self, page: u64, counter: &mut u8, value: impl Fn(&str) -> Option<f64>) -> Frame {
+    /// Notes the place of each signal's name in a list, so that no frame has to look for it.
+    pub(super) fn with_places(mut self, names: &[&str]) -> Self {
+        for field in &mut self.fields {
+            field.place = names.iter().position(|name| *name == field.name);
+        }
+        self
+    }
+
+    /// A frame of the page with `value` of each signal, of which the name and its [place](Self::with_places) are given. `counter` is
+    /// the protection's next; it is advanced. The trailer of an authenticated message is 0: it is written when the freshness is known.
+    pub(super) fn frame(
+        &self,
+        page: u64,
+        counter: &mut u8,
+        value: impl Fn(&str, Option<usize>) -> Option<f64>,
+    ) -> Frame {
         let mut payload = [0; MAX_DATA];
         for field in self.fields.iter().filter(|field| field.is_on(page)) {
-            let code =
-                if field.is_multiplexor { page.min(field.plan.all_ones()) } else { field.code(value(&field.name)) };
+            let code = if field.is_multiplexor {
+                page.min(field.plan.all_ones())
+            } else {
+                field.code(value(&field.name, field.place))
+            };
             // Cannot fail: the message was checked against the message's length, and the code fits the signal.
             let _ = field.plan.encode_raw(&mut payload, code);
         }
@@ -184,6 +202,7 @@ impl OutputField {
         };
         Ok(Self {
             name: signal.name.clone(),
+            place: None,
             plan,
             not_available: signal.not_available_codes().first().copied().unwrap_or(customary),
             per_inside_unit: if signal.unit == "%" { 100.0 } else { 1.0 },

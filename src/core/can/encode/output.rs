@@ -226,8 +226,9 @@ impl OutputPlan {
         let mut message = |which: LayoutMessage, required: &[&str]| {
             OutputMessage::new(database, which.message(), required, &mut faults)
         };
-        let status = message(LayoutMessage::Status, &STATUS.map(|(name, _)| name));
-        let health = message(LayoutMessage::Health, &HEALTH.map(|(name, _)| name)[..HEALTH_REQUIRED]);
+        let (status_names, health_names) = (STATUS.map(|(name, _)| name), HEALTH.map(|(name, _)| name));
+        let status = message(LayoutMessage::Status, &status_names);
+        let health = message(LayoutMessage::Health, &health_names[..HEALTH_REQUIRED]);
         let alarm = message(LayoutMessage::Alarm, &ALARM);
         if let Some(alarm) = &alarm {
             alarm.check_rules(&RULES, &mut faults);
@@ -238,6 +239,7 @@ impl OutputPlan {
         match (status, health, alarm) {
             (Some(status), Some(health), Some(alarm)) if faults.is_empty() => {
                 let pages = health.page_codes();
+                let (status, health) = (status.with_places(&status_names), health.with_places(&health_names));
                 Ok(Self { status, health, alarm, pages, digest, reply, freshness })
             }
             _ => Err(PlanFaults(faults)),
@@ -318,19 +320,19 @@ impl OutputPlan {
 
     /// The status frame.
     pub fn status(&self, fields: &StatusFields, counters: &mut SendCounters) -> Frame {
-        self.status.frame(0, &mut counters.status, |name| value_of(&STATUS, fields, name))
+        self.status.frame(0, &mut counters.status, |_, place| value_of(&STATUS, fields, place))
     }
 
     /// One page of the health frame, counted from 0; beyond the last it starts again.
     pub fn health(&self, page: usize, fields: &HealthFields, counters: &mut SendCounters) -> Frame {
         let code = self.pages.get(page % self.pages.len().max(1)).copied().unwrap_or(0);
-        self.health.frame(code, &mut counters.health, |name| value_of(&HEALTH, fields, name))
+        self.health.frame(code, &mut counters.health, |_, place| value_of(&HEALTH, fields, place))
     }
 
     /// One alarm. Value and threshold go into the rule's own `Value_...` and `Threshold_...`.
     pub fn alarm(&self, fields: &AlarmFields, counters: &mut SendCounters) -> Frame {
         let bit = |set: bool| Some(if set { 1.0 } else { 0.0 });
-        self.alarm.frame(u64::from(fields.rule), &mut counters.alarm, |name| match name {
+        self.alarm.frame(u64::from(fields.rule), &mut counters.alarm, |name, _| match name {
             "State" => fields.state.map(f64::from),
             "Severity" => fields.severity.map(f64::from),
             "Test" => bit(fields.test),
@@ -351,7 +353,7 @@ impl OutputPlan {
 
     /// The announcement of a freshness, still without it; `None` = the layout has none.
     pub fn freshness(&self) -> Option<Frame> {
-        self.freshness.as_ref().map(|message| message.frame(0, &mut 0, |_| None))
+        self.freshness.as_ref().map(|message| message.frame(0, &mut 0, |_, _| None))
     }
 
     /// The reply to a command; `None` = the layout has none.
@@ -370,8 +372,9 @@ fn freshness_message(database: &Database, faults: &mut Vec<String>) -> Option<Ou
 /// Name of a signal and how its value is taken from the fields of a message.
 type SignalValue<T> = (&'static str, fn(&T) -> Option<f64>);
 
-fn value_of<T>(signals: &[SignalValue<T>], fields: &T, name: &str) -> Option<f64> {
-    signals.iter().find(|(signal, _)| *signal == name).and_then(|(_, value)| value(fields))
+/// Value of the signal at a place of the table.
+fn value_of<T>(signals: &[SignalValue<T>], fields: &T, place: Option<usize>) -> Option<f64> {
+    signals.get(place?).and_then(|(_, value)| value(fields))
 }
 
 /// Code of the wire.

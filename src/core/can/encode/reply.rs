@@ -133,7 +133,7 @@ pub(super) fn reply_message(database: &Database, faults: &mut Vec<String>) -> Op
 
 /// The reply.
 pub(super) fn reply_frame(message: &OutputMessage, fields: &ReplyFields, counter: &mut u8) -> Frame {
-    message.frame(0, counter, |name| fields.value(name))
+    message.frame(0, counter, |name, _| fields.value(name))
 }
 
 #[cfg(test)]
