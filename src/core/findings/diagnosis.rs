@@ -361,7 +361,7 @@ impl Diagnosis {
 
     /// Judges all cells.
     fn judge(&mut self, time: Timestamp) {
-        let populations: [Population; STATES] = std::array::from_fn(|state| self.population(state));
+        let populations = self.populations();
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= TOLD);
@@ -371,6 +371,31 @@ impl Diagnosis {
             }
         }
         self.find_modules(time, &populations);
+    }
+
+    /// Per cell, what a kind is of, against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
+    /// too far from the others, its channel is faulty, or the value is not known well enough yet.
+    pub fn sizes(&self, kind: FindingKind) -> Vec<Option<ScalarGaussian>> {
+        let populations = self.populations();
+        (0..self.cells.len()).map(|cell| self.size(cell, kind, &populations)).collect()
+    }
+
+    fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
+        let cell = CellIndex(index as u16);
+        let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
+        let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
+        let is_known = judged.size.std() <= kind.limit() || is_found();
+        (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
+    }
+
+    /// Whether what is read as a cell's voltage is not that; `None` = not compared yet.
+    pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
+        let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
+        if is_found { Some(true) } else { self.last_row.map(|_| false) }
+    }
+
+    fn populations(&self) -> [Population; STATES] {
+        std::array::from_fn(|state| self.population(state))
     }
 
     /// What one cell may have.
@@ -384,33 +409,44 @@ impl Diagnosis {
             let stands_out = !is_outlier || sign * size.mean >= OUTLIER * population.std;
             (size, if stands_out { probability } else { 0.0 })
         };
-        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged { kind, size, probability };
+        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            kind,
+            size,
+            probability,
+            is_comparable: true,
+        };
         let sure = |kind: FindingKind, is_so: bool| {
-            of(kind, (ScalarGaussian { mean: 1.0, variance: 0.0 }, if is_so { 1.0 } else { 0.0 }))
+            let so = if is_so { 1.0 } else { 0.0 };
+            of(kind, (ScalarGaussian { mean: so, variance: 0.0 }, so))
         };
         let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign, true));
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         // A cell that is bled until it is like the others leaks as well, but it is above them.
-        let leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
-        let is_below = cell.difference.state(SOC).mean < populations[SOC].middle;
-        let is_near = |judged: (ScalarGaussian, f64)| {
-            if cell.difference.mean()[SOC].abs() < TOO_FAR { judged } else { (judged.0, 0.0) }
+        let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
+        if cell.difference.state(SOC).mean >= populations[SOC].middle {
+            leak.0.mean = leak.0.mean.min(0.0);
+            leak.1 = 0.0;
+        }
+        let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
+        let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            is_comparable,
+            ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
         vec![
             sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
             sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
-            of(FindingKind::VoltageChannel, is_near(channel)),
-            of(FindingKind::Leak, (leak.0, if is_below { leak.1 } else { 0.0 })),
-            of(FindingKind::Contact, is_near(beyond(CONTACT, finding::CONTACT, 1.0, true))),
-            of(FindingKind::HighResistance, is_near(beyond(RESISTANCE, finding::RESISTANCE, 1.0, true))),
+            if_near(FindingKind::VoltageChannel, channel),
+            of(FindingKind::Leak, leak),
+            if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0, true)),
+            if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0, true)),
             of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0, true)),
-            of(FindingKind::ForeignCell, is_near(beyond(difference::CAPACITY, finding::CAPACITY, 1.0, true))),
+            if_near(FindingKind::ForeignCell, beyond(difference::CAPACITY, finding::CAPACITY, 1.0, true)),
         ]
     }
 
     /// Takes a judgement into the list.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) {
-        let Judged { kind, size, probability } = *judged;
+        let Judged { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
@@ -575,6 +611,8 @@ struct Judged {
     kind: FindingKind,
     size: ScalarGaussian,
     probability: f64,
+    /// Whether the cell is near enough to the others for it.
+    is_comparable: bool,
 }
 
 /// What all cells of a row share.
