@@ -37,7 +37,7 @@
 //!
 //! | change | file |
 //! | --- | --- |
-//! | a new alarm rule | `core/alarm/rule.rs` (its table row); values that follow from inputs come from `core/monitor/watch.rs`, learned ones from `core/monitor/learning.rs` |
+//! | a new alarm rule | `core/alarm/rule.rs` (its table row); values that follow from inputs come from `core/monitor/watch.rs`, learned ones from `core/monitor/learning.rs`, those of a cell against its pack from `core/monitor/diagnosing.rs` |
 //! | debounce, hysteresis, latch of an alarm | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
 //! | a new event | `core/monitor/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |

@@ -103,6 +103,7 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
     let unit = rule.spec().unit;
     match unit {
         Unit::Fraction => format!("{:.1} %", 100.0 * value),
+        Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
         Unit::Ratio => format!("{value:.2}"),
         Unit::AmpereHours => format!("{value:.3} {}", unit.symbol()),
         Unit::Seconds | Unit::Celsius | Unit::Cycles => format!("{value:.1} {}", unit.symbol()),

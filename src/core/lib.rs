@@ -11,7 +11,7 @@
 //! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
 //! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
 //! | modelling | steps of the cells, rests → the cells' own model | `monitor/modelling.rs` | [`cell`]: notebook, own model |
-//! | diagnosing | cell samples, estimates → findings | `monitor/diagnosing.rs` | [`findings`]: each cell against its pack |
+//! | diagnosing | cell samples, estimates → findings, values of the rules about a cell against its pack | `monitor/diagnosing.rs` | [`findings`]: each cell against its pack |
 //! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
 //! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |

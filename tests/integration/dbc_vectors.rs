@@ -221,5 +221,5 @@ fn the_alarm_rules_are_those_of_the_shipped_value_table() {
         let named = (i64::from(rule as u8), format!("{rule:?}"));
         assert!(table.contains(&named), "{named:?}");
     }
-    assert_eq!(table.len(), 14 + 1, "and not available");
+    assert_eq!(table.len(), Rule::ALL.len() + 1, "and not available");
 }

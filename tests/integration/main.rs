@@ -16,6 +16,7 @@ mod authentication;
 mod bus_sleep;
 mod can_data;
 mod capacity_peers;
+mod cell_rules;
 mod check_cli;
 mod contactor;
 mod contract;

@@ -21,7 +21,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 const FRAMES: usize = 40;
 
 /// Rules in the order of their numbers: inside unit to the wire's, largest value tried.
-const RULES: [(&str, f64, f64); 14] = [
+const RULES: [(&str, f64, f64); 17] = [
     ("CapacityLow", 1.0, 5.0),
     ("UsableCapacityLow", 1.0, 5.0),
     ("RechargePeriodLow", 1.0, 50_000.0),
@@ -36,6 +36,9 @@ const RULES: [(&str, f64, f64); 14] = [
     ("BmsDisagrees", 100.0, 1.0),
     ("StoreFailed", 1.0, 4094.0),
     ("BusFault", 1.0, 4094.0),
+    ("CellLeak", 100.0, 0.4),
+    ("ConnectionResistance", 100.0, 8.0),
+    ("ChannelFaulty", 1.0, 1.0),
 ];
 
 /// A configuration of the matrix.

@@ -60,11 +60,11 @@ class ContractListener:
         if page == "alarms":
             self.wanted = values["Raised"], values["TableChecksum"]
             self.pass_s = values["PassTime"]
-        elif page == "rules":
+        elif page in ("rules", "rules_2"):
             for number, name in self.alarm.get_signal_by_name("Rule").choices.items():
                 if f"Rule_{name}" in values:
                     self.rules[number] = str(self.choice(self.digest, f"Rule_{name}", values[f"Rule_{name}"]))
-            over = [key for key in self.entries if self.rules[key[0]] in ("none", "unknown", "not watched")]
+            over = [key for key in self.entries if self.rules.get(key[0]) in ("none", "unknown", "not watched")]
             for key in over:
                 del self.entries[key]
 

@@ -137,7 +137,8 @@ def last_alarm(args) -> None:
 
 RULES = (
     "capacity_low usable_capacity_low recharge_period_low input_missing input_implausible estimate_untrusted resistance_high soc_low "
-    "temperature_high cell_imbalance remaining_life_low bms_disagrees store_failed bus_fault"
+    "temperature_high cell_imbalance remaining_life_low bms_disagrees store_failed bus_fault cell_leak "
+    "connection_resistance channel_faulty"
 ).split()
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 UNTOLD = ("suppressed", "resumed")  # changes that say nothing new of an alarm: no rows

@@ -39,6 +39,13 @@ pub enum Rule {
     StoreFailed = 13,
     /// An interface is down, missing, bus-off or takes no frames; the value is for how long, s.
     BusFault = 14,
+    /// Self-discharge against the other cells of the pack above the threshold, fraction of the capacity in a day.
+    CellLeak = 15,
+    /// Contact resistance beyond that of the other cells above the threshold, fraction of a cell's series resistance in the middle
+    /// of the charge at 25 degrees C.
+    ConnectionResistance = 16,
+    /// The voltage channel shows no cell of its own; the value is 1 then, else 0. The cell's other rules are unknown meanwhile.
+    ChannelFaulty = 17,
 }
 
 /// Scope of a rule: the pack as a whole, its cells, or both.
@@ -70,6 +77,8 @@ pub enum Unit {
     Seconds,
     /// 0 to 1.
     Fraction,
+    /// 0 to 1, in a day.
+    FractionPerDay,
     /// Times something (as new, as expected).
     Ratio,
     /// Degrees C.
@@ -87,6 +96,7 @@ impl Unit {
             Self::Fraction | Self::Ratio => "",
             Self::Celsius => "degrees C",
             Self::Cycles => "cycles",
+            Self::FractionPerDay => "per day",
         }
     }
 }
@@ -113,7 +123,7 @@ pub struct RuleSpec {
 
 impl Rule {
     /// Every rule, in wire order.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 17] = [
         Self::CapacityLow,
         Self::UsableCapacityLow,
         Self::RechargePeriodLow,
@@ -128,6 +138,9 @@ impl Rule {
         Self::BmsDisagrees,
         Self::StoreFailed,
         Self::BusFault,
+        Self::CellLeak,
+        Self::ConnectionResistance,
+        Self::ChannelFaulty,
     ];
 
     /// The rule of a wire number.
@@ -152,14 +165,30 @@ impl Rule {
             Self::BmsDisagrees => "bms_disagrees",
             Self::StoreFailed => "store_failed",
             Self::BusFault => "bus_fault",
+            Self::CellLeak => "cell_leak",
+            Self::ConnectionResistance => "connection_resistance",
+            Self::ChannelFaulty => "channel_faulty",
         }
+    }
+
+    /// Whether the rule compares what the cell's voltages show: a faulty channel shows nothing of it.
+    pub const fn is_of_cell_voltage(self) -> bool {
+        matches!(
+            self,
+            Self::CapacityLow
+                | Self::UsableCapacityLow
+                | Self::EstimateUntrusted
+                | Self::ResistanceHigh
+                | Self::CellLeak
+                | Self::ConnectionResistance
+        )
     }
 
     /// Its specification.
     pub const fn spec(self) -> RuleSpec {
         use Direction::{Above, Below};
         use Scope::{Both, Cell, Pack};
-        use Unit::{AmpereHours, Celsius, Cycles, Fraction, Ratio, Seconds};
+        use Unit::{AmpereHours, Celsius, Cycles, Fraction, FractionPerDay, Ratio, Seconds};
         let (scope, direction, unit, has_deviation, is_learned, about) = match self {
             Self::CapacityLow => (Cell, Below, AmpereHours, true, true, "a cell's capacity"),
             Self::UsableCapacityLow => (Cell, Below, AmpereHours, true, true, "a cell's usable capacity"),
@@ -181,6 +210,11 @@ impl Rule {
             }
             Self::StoreFailed => (Pack, Above, Seconds, false, false, "the time a file could not be written"),
             Self::BusFault => (Pack, Above, Seconds, false, false, "the time an interface was out of order"),
+            Self::CellLeak => (Cell, Above, FractionPerDay, true, true, "a cell's self-discharge"),
+            Self::ConnectionResistance => {
+                (Cell, Above, Fraction, true, true, "a cell's contact resistance beyond the others'")
+            }
+            Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
         };
         RuleSpec { scope, direction, unit, has_deviation, is_learned, about }
     }
@@ -224,6 +258,6 @@ mod tests {
             assert_eq!(Rule::from_number(number), Some(rule));
             assert_eq!(serde_json::to_value(rule).expect("a word"), rule.name());
         }
-        assert_eq!((Rule::from_number(0), Rule::from_number(15)), (None, None));
+        assert_eq!((Rule::from_number(0), Rule::from_number(18)), (None, None));
     }
 }

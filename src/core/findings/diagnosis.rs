@@ -95,6 +95,8 @@ pub struct Diagnosis {
     ohm: f64,
     /// The cell with the middle SOC.
     middle: usize,
+    /// The cell with the least charge, in a pack that a BMS balances.
+    lowest: Option<usize>,
     findings: Vec<Finding>,
 }
 
@@ -118,6 +120,7 @@ impl Diagnosis {
             rest_s: 0.0,
             ohm: 0.0,
             middle: 0,
+            lowest: None,
             findings: Vec::new(),
         }
     }
@@ -375,11 +378,12 @@ impl Diagnosis {
 
     /// Judges all cells.
     fn judge(&mut self, time: Timestamp, is_balanced: bool) {
-        let populations: [Population; STATES] = std::array::from_fn(|state| self.population(state));
+        let populations = self.populations();
         let charges = self.cells.iter().map(|cell| cell.difference.mean()[SOC]);
-        let lowest = charges.clone().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(cell, _)| cell);
+        let lowest = charges.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell);
+        self.lowest = lowest.filter(|_| is_balanced);
         for index in 0..self.cells.len() {
-            let judged = self.judged(index, &populations, is_balanced.then_some(lowest));
+            let judged = self.judged(index, &populations);
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
             for it in judged {
                 let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
@@ -389,8 +393,42 @@ impl Diagnosis {
         self.find_modules(time);
     }
 
-    /// What one cell may have. `lowest`: the cell with the least charge, in a pack that is balanced.
-    fn judged(&self, index: usize, populations: &[Population; STATES], lowest: Option<usize>) -> Vec<Judged> {
+    /// Per cell, what a kind is of, against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
+    /// too far from the others, its channel is faulty, or the value is not known well enough yet.
+    pub fn sizes(&self, kind: FindingKind) -> Vec<Option<ScalarGaussian>> {
+        let populations = self.populations();
+        (0..self.cells.len()).map(|cell| self.size(cell, kind, &populations)).collect()
+    }
+
+    fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
+        let cell = CellIndex(index as u16);
+        let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
+        let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
+        let is_known = judged.size.std() <= kind.limit() || is_found();
+        (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
+    }
+
+    /// Whether what is read as a cell's voltage is not that; `None` = not compared yet.
+    pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
+        let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
+        if is_found { Some(true) } else { self.last_row.map(|_| false) }
+    }
+
+    fn populations(&self) -> [Population; STATES] {
+        std::array::from_fn(|state| self.population(state))
+    }
+
+    /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
+    /// above them; where a BMS balances, all but the lowest one are. A leak that was found is still there when the others are bled.
+    fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
+        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
+        let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
+        let is_lowest = self.lowest.is_none_or(|lowest| lowest == index);
+        is_below && (is_lowest || self.findings.iter().any(is_found))
+    }
+
+    /// What one cell may have.
+    fn judged(&self, index: usize, populations: &[Population; STATES]) -> Vec<Judged> {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64, is_outlier: bool| {
             let own = cell.difference.state(state);
@@ -400,34 +438,43 @@ impl Diagnosis {
             let stands_out = !is_outlier || sign * size.mean >= OUTLIER * population.std;
             (size, if stands_out { probability } else { 0.0 })
         };
-        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged { kind, size, probability };
+        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            kind,
+            size,
+            probability,
+            is_comparable: true,
+        };
         let sure = |kind: FindingKind, is_so: bool| {
-            of(kind, (ScalarGaussian { mean: 1.0, variance: 0.0 }, if is_so { 1.0 } else { 0.0 }))
+            let so = if is_so { 1.0 } else { 0.0 };
+            of(kind, (ScalarGaussian { mean: so, variance: 0.0 }, so))
         };
         let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign, true));
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
-        // A BMS bleeds cells that are above the lowest one. Where one balances, only the lowest cell loses charge by itself.
-        let leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
-        let is_below = cell.difference.state(SOC).mean < populations[SOC].middle;
-        let is_below = is_below && lowest.is_none_or(|lowest| lowest == index);
-        let is_near = |judged: (ScalarGaussian, f64)| {
-            if cell.difference.mean()[SOC].abs() < TOO_FAR { judged } else { (judged.0, 0.0) }
+        let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
+        if !self.can_leak(index, populations) {
+            leak.0.mean = leak.0.mean.min(0.0);
+            leak.1 = 0.0;
+        }
+        let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
+        let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            is_comparable,
+            ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
         vec![
             sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
             sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
-            of(FindingKind::VoltageChannel, is_near(channel)),
-            of(FindingKind::Leak, (leak.0, if is_below { leak.1 } else { 0.0 })),
-            of(FindingKind::Contact, is_near(beyond(CONTACT, finding::CONTACT, 1.0, true))),
-            of(FindingKind::HighResistance, is_near(beyond(RESISTANCE, finding::RESISTANCE, 1.0, true))),
+            if_near(FindingKind::VoltageChannel, channel),
+            of(FindingKind::Leak, leak),
+            if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0, true)),
+            if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0, true)),
             of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0, true)),
-            of(FindingKind::ForeignCell, is_near(beyond(difference::CAPACITY, finding::CAPACITY, 1.0, true))),
+            if_near(FindingKind::ForeignCell, beyond(difference::CAPACITY, finding::CAPACITY, 1.0, true)),
         ]
     }
 
     /// Takes a judgement into the list.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) {
-        let Judged { kind, size, probability } = *judged;
+        let Judged { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
@@ -620,6 +667,8 @@ struct Judged {
     kind: FindingKind,
     size: ScalarGaussian,
     probability: f64,
+    /// Whether the cell is near enough to the others for it.
+    is_comparable: bool,
 }
 
 /// What all cells of a row share.

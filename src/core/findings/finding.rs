@@ -133,6 +133,23 @@ impl FindingKind {
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
+
+    /// Whether the voltages that are read as a cell's are not those of that cell.
+    pub const fn is_channel_fault(self) -> bool {
+        self.is_of_channel() || matches!(self, Self::SwappedChannels)
+    }
+
+    /// Size beyond which it is one, in the unit of the kind; of those that are so or not, one half.
+    pub(super) const fn limit(self) -> f64 {
+        match self {
+            Self::Leak => LEAK_PER_DAY,
+            Self::Contact => CONTACT,
+            Self::WeakCell | Self::ForeignCell | Self::Module => CAPACITY,
+            Self::HighResistance => RESISTANCE,
+            Self::VoltageChannel => CHANNEL_V,
+            _ => 0.5,
+        }
+    }
 }
 
 /// A finding.
@@ -151,6 +168,14 @@ pub struct Finding {
     pub probability: f64,
     /// How large; the unit is that of the kind.
     pub size: ScalarGaussian,
+}
+
+impl Finding {
+    /// Whether it is about the cell.
+    pub fn is_of(&self, cell: CellIndex) -> bool {
+        let Some((first, last)) = self.cells else { return false };
+        if self.kind.is_of_pair() { first == cell || last == cell } else { (first..=last).contains(&cell) }
+    }
 }
 
 /// Leak beyond which it is one, fraction of the capacity in a day: healthy cells of one pack differ by less than 0.5 % a month.

@@ -19,7 +19,7 @@ use crate::quantity::{CellIndex, Timestamp};
 const BURST: i64 = 20;
 /// Frames in turn are at least this far apart, in units of [`ALARM_DELAY_MS`]: the other half is for changes.
 const TURN_DELAYS: u32 = 2;
-/// Alarms that are remembered as announced unknown; 14 rules of three severities are 42. Beyond it no more are announced;
+/// Alarms that are remembered as announced unknown; 17 rules of three severities are 51. Beyond it no more are announced;
 /// the digest shows their rules.
 const MAX_UNKNOWN: usize = 64;
 

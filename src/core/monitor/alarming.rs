@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::MonitorConfig;
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
-use crate::quantity::Timestamp;
+use crate::quantity::{CellIndex, Timestamp};
 
 /// Values that change no alarm are shown this often, s.
 const SHOW_S: f64 = 1.0;
@@ -25,6 +25,8 @@ pub(super) struct Alarming {
     pub(super) innovations_shown_at: Timestamp,
     /// The engine knows that every learned value has valid inputs.
     pub(super) knows_all_valid: bool,
+    /// Cells whose voltage channel is faulty: nothing is known of them. Follows from the diagnosis.
+    pub(super) faulty_channels: Vec<CellIndex>,
     pub(super) store: StoreHealth,
 }
 
@@ -37,8 +39,14 @@ impl Alarming {
             inputs_shown_at: Timestamp::from_nanos(i64::MIN),
             innovations_shown_at: Timestamp::from_nanos(i64::MIN),
             knows_all_valid: false,
+            faulty_channels: Vec::new(),
             store: StoreHealth::default(),
         }
+    }
+
+    /// Whether the value of a rule is that of a cell whose channel is faulty.
+    pub(super) fn is_of_faulty_channel(&self, rule: Rule, cell: Option<CellIndex>) -> bool {
+        rule.is_of_cell_voltage() && cell.is_some_and(|cell| self.faulty_channels.contains(&cell))
     }
 
     /// Other rules; returns how many alarms, raised or past, ended by it.

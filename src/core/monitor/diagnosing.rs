@@ -1,14 +1,18 @@
 //! Diagnosis stage: from cell samples to findings about single cells.
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each finding that is new ([`EventKind::Finding`]).
-//! It only watches: no estimate and no capacity depends on it.
+//! It only watches: no estimate and no capacity depends on it. What it finds goes to the rules about single cells when a row of
+//! the diagnosis ends.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
+use super::publisher::learned;
+use super::stages::Stages;
 use super::{Event, EventKind, MonitorConfig, Outputs};
+use crate::alarm::{Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::findings::{Diagnosis, FindingKind, MeanCell};
-use crate::quantity::Timestamp;
+use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
 /// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
@@ -53,7 +57,13 @@ impl Diagnosing {
         }
     }
 
-    /// Takes samples that have made their step.
+    /// The cells whose channel is faulty.
+    pub(super) fn faulty_channels(&self) -> Vec<CellIndex> {
+        let is_faulty = |cell: &CellIndex| self.diagnosis.has_channel_fault(*cell) == Some(true);
+        (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
+    }
+
+    /// Takes samples that have made their step; whether a row ended.
     #[inline]
     pub(super) fn observe(
         &mut self,
@@ -63,15 +73,15 @@ impl Diagnosing {
         learning: &Learning,
         is_current_frozen: bool,
         out: &mut Outputs,
-    ) {
+    ) -> bool {
         if !self.diagnosis.is_active() {
-            return;
+            return false;
         }
         for sample in samples {
             let CellSample { cell, time, voltage_v, current_a, temperature_c, .. } = *sample;
             self.diagnosis.add(cell.index(), time, voltage_v, current_a, temperature_c);
         }
-        self.observe_mean(now, samples, estimation, learning, is_current_frozen, out);
+        self.observe_mean(now, samples, estimation, learning, is_current_frozen, out)
     }
 
     fn observe_mean(
@@ -82,12 +92,13 @@ impl Diagnosing {
         learning: &Learning,
         is_current_frozen: bool,
         out: &mut Outputs,
-    ) {
+    ) -> bool {
         let middle = self.diagnosis.middle();
-        let Some(sample) = samples.iter().find(|sample| sample.cell.index() == middle) else { return };
+        let Some(sample) = samples.iter().find(|sample| sample.cell.index() == middle) else { return false };
         let bank = &estimation.bank;
         let (Some(soc), Some(current_a)) = (bank.filtered_soc(middle), sample.current_a) else {
-            return self.diagnosis.interrupt();
+            self.diagnosis.interrupt();
+            return false;
         };
         let (model, capacity_ah) = (bank.model(), learning.capacity(middle).mean);
         let temperature_c = bank.temperature_c(middle).unwrap_or(estimation.ambient_c());
@@ -96,12 +107,46 @@ impl Diagnosing {
         let drop_v = current_a * ohm + bank.branch_v(middle)[..model.branches.len()].iter().sum::<f64>();
         let charge_ah = sample.charge_as / 3600.0;
         let mean = MeanCell { soc: soc.mean, current_a, drop_v, temperature_c, charge_ah };
-        if self.diagnosis.note(sample.time, &mean, capacity_ah) {
+        let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
+        if is_complete {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
             let sensors = shared_sensors(is_current_frozen, learning, model.rated_capacity_ah);
             let reported = self.diagnosis.close_row(model, capacity_ah, socs, &sensors, self.is_balanced);
             out.events
                 .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+        }
+        is_complete
+    }
+}
+
+impl Stages {
+    /// Passes what a row has shown to the rules about single cells. `is_new`: the rules have not seen it; then the values of a
+    /// cell whose inputs are lost wait for the next row.
+    pub(super) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
+        self.note_faulty_channels();
+        let diagnosis = &self.diagnosing.diagnosis;
+        let [leaks, contacts] = [FindingKind::Leak, FindingKind::Contact].map(|kind| diagnosis.sizes(kind));
+        for (cell, (leak, contact)) in (0..).map(CellIndex).zip(leaks.into_iter().zip(contacts)) {
+            if is_new && !self.sampling.inputs_valid(cell, now) {
+                continue;
+            }
+            let fault = self.diagnosing.diagnosis.has_channel_fault(cell);
+            let fault = Observation::new(fault.map(|is_faulty| if is_faulty { 1.0 } else { 0.0 }));
+            let mut publisher = self.publisher(now, out);
+            publisher.observe(Rule::ChannelFaulty, Some(cell), Observation { is_new, ..fault });
+            for (rule, size) in [(Rule::CellLeak, leak), (Rule::ConnectionResistance, contact)] {
+                let value = Observation { is_new, ..size.map_or_else(Observation::default, learned) };
+                publisher.observe(rule, Some(cell), value);
+            }
+        }
+    }
+
+    /// Takes the cells whose channel is faulty: their other alarms are suppressed.
+    pub(super) fn note_faulty_channels(&mut self) {
+        let faulty = self.diagnosing.faulty_channels();
+        if faulty != self.alarming.faulty_channels {
+            self.alarming.faulty_channels = faulty;
+            self.alarming.knows_all_valid = false;
         }
     }
 }

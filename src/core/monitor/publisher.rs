@@ -25,8 +25,15 @@ impl Publisher<'_> {
         self.out.events.push(Event { time: self.now, kind });
     }
 
-    /// Passes a value to its rule, and publishes what it changes.
+    /// Passes a value to its rule, and publishes what it changes. What a faulty channel shows of its cell is no value.
     pub(super) fn observe(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
+        if !self.alarming.is_of_faulty_channel(rule, cell) {
+            self.restate(rule, cell, observation);
+        }
+    }
+
+    /// Passes a value of before to its rule, whatever the channel of its cell shows now.
+    pub(super) fn restate(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
         self.apply(AlarmInput::Observe { rule, cell, observation });
         self.publish_alarms();
     }

@@ -272,6 +272,7 @@ impl Stages {
         let batch = CellBatch::restore(has_reported, snapshot.waiting);
         self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
         self.diagnosing.restore(snapshot.diagnosis, is_continued);
+        self.note_faulty_channels();
         // Its shape is checked in `Monitor::restore`.
         self.sampling.sampler.restore(snapshot.sampler);
         self.sampling.identity = snapshot.identity;
@@ -338,6 +339,7 @@ impl Stages {
         self.estimation.handle_unknown_gap();
         self.diagnosing.restore(pack.diagnosis, false);
         self.diagnosing.diagnosis.forget_charge();
+        self.note_faulty_channels();
         let capacity = self.learning.weakest_capacity();
         let kind = EventKind::PackReturned {
             identity: pack.number,

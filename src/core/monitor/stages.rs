@@ -14,7 +14,7 @@ use super::sampling::Sampling;
 use super::sender::Sender;
 use super::sleep::{BusSleep, Silence};
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
-use crate::alarm::{AlarmInput, CommandOutcome, Observation};
+use crate::alarm::{AlarmInput, CommandOutcome, Observation, Rule};
 use crate::can::Frame;
 use crate::can::encode::{HealthFields, StatusFields};
 use crate::can::poll::CarState;
@@ -195,8 +195,11 @@ impl Stages {
             self.show_innovations(now, &samples);
         }
         let is_frozen = self.sampling.sampler.is_current_frozen();
-        self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, is_frozen, out);
+        let has_row_ended = self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, is_frozen, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
+        if has_row_ended {
+            self.publish_diagnosis(now, true, out);
+        }
     }
 
     /// Takes the outcome of a cell's step.
@@ -308,6 +311,10 @@ impl Stages {
         self.diagnosing.forget();
         self.forget_pack_state();
         self.alarming.knows_all_valid = false;
+        self.alarming.faulty_channels.clear();
+        for cell in self.estimation.cell_indices() {
+            self.publisher(now, out).observe(Rule::ChannelFaulty, Some(cell), Observation::default());
+        }
         self.publisher(now, out).apply(AlarmInput::ForgetLearned);
     }
 

@@ -15,6 +15,10 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::sample::CellSample;
 
+/// Rules of a cell whose value is learned.
+const CELL_LEARNED: [Rule; 5] =
+    [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh, Rule::CellLeak, Rule::ConnectionResistance];
+
 /// Values of the two rules about an input.
 #[derive(Debug, Clone, Copy)]
 struct InputObservation {
@@ -144,7 +148,7 @@ impl Stages {
         publisher.observe(Rule::InputImplausible, cell, input.bad_share);
     }
 
-    /// A learned value holds only while its inputs can renew it.
+    /// A learned value holds only while its inputs can renew it: they are not lost, and its channel is not faulty.
     fn watch_learned(&mut self, now: Timestamp, any_lost: bool, out: &mut Outputs) {
         if self.alarming.knows_all_valid && !out.want_alarm_inputs && !any_lost {
             return;
@@ -155,12 +159,16 @@ impl Stages {
             let is_started = self.estimation.bank.is_started(cell.index());
             all_valid &= valid;
             all_started &= is_started;
+            let is_faulty = self.alarming.faulty_channels.contains(&cell);
             let mut publisher = self.publisher(now, out);
-            for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
-                publisher.apply(AlarmInput::InputsValid { rule, cell: Some(cell), valid });
+            for rule in CELL_LEARNED {
+                publisher.apply(AlarmInput::InputsValid { rule, cell: Some(cell), valid: valid && !is_faulty });
             }
-            if !valid || !is_started {
-                publisher.observe(Rule::EstimateUntrusted, Some(cell), Observation::default());
+            if !valid || !is_started || is_faulty {
+                publisher.restate(Rule::EstimateUntrusted, Some(cell), Observation::default());
+            }
+            if !valid {
+                publisher.observe(Rule::ChannelFaulty, Some(cell), Observation::default());
             }
         }
         let mut publisher = self.publisher(now, out);
@@ -189,17 +197,21 @@ impl Stages {
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
-    /// SOC of the emptiest and the fullest of the cells with a fresh estimate; `None` = no cell has one.
+    /// SOC of the emptiest and the fullest of the cells with a fresh estimate and a channel of their own; `None` = no cell has one.
     fn soc_spread(&self, now: Timestamp, all_fresh: bool) -> Option<SocSpread> {
         let bank = &self.estimation.bank;
-        if all_fresh && let Some((lowest, highest)) = bank.extremes() {
+        if all_fresh
+            && self.alarming.faulty_channels.is_empty()
+            && let Some((lowest, highest)) = bank.extremes()
+        {
             return Some(SocSpread { lowest, highest, is_whole: true });
         }
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
             // A voltage that came before the first current says nothing yet.
-            let is_present = is_fresh && !bank.is_carried_over(cell.index());
+            let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
+            let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
             known += 1;
             spread = Some(match spread {
@@ -305,10 +317,11 @@ impl Stages {
             let mut publisher = self.publisher(now, out);
             for (rule, observation) in known {
                 if let Some(observation) = observation {
-                    publisher.observe(rule, cell, observation);
+                    publisher.restate(rule, cell, observation);
                 }
             }
         }
+        self.publish_diagnosis(now, is_new, out);
         let period = self.learning.known_recharge_period();
         let (learning, mut publisher) = self.learning_and_publisher(now, out);
         if let Some(period) = period {

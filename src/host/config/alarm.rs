@@ -33,7 +33,7 @@ impl RatedCell {
         match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
             (Rule::RechargePeriodLow, _) => Some(self.recharge_period_s),
-            (Rule::ResistanceHigh, _) | (_, Unit::Fraction) => Some(1.0),
+            (Rule::ResistanceHigh, _) | (_, Unit::Fraction | Unit::FractionPerDay) => Some(1.0),
             (_, Unit::Seconds | Unit::Ratio | Unit::Celsius | Unit::Cycles) => None,
         }
     }
@@ -133,6 +133,9 @@ fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
         Rule::UsableCapacityLow if !raw.is_written::<Usable>() => "must have a table [usable] that states the load",
         Rule::TemperatureHigh if raw.temperatures.is_empty() && !raw.broken => "must have an [[input.temperature]]",
         Rule::CellImbalance if cells < 2 => "must have the voltages of at least two cells",
+        Rule::CellLeak | Rule::ConnectionResistance | Rule::ChannelFaulty if cells < 3 => {
+            "must have the voltages of at least three cells"
+        }
         Rule::BmsDisagrees if !is_reported => "must have [input.reported_soc] or [input.reported_soh]",
         _ => "",
     };
@@ -190,7 +193,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     }
     let Some(clear) = alarm.clear(rated, set, threshold) else { return };
     let (low, high) = match alarm.rule.spec().unit {
-        Unit::Fraction => (0.0, 1.0),
+        Unit::Fraction | Unit::FractionPerDay => (0.0, 1.0),
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
@@ -207,7 +210,8 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
 
 /// Notes a percent written without its sign: such a threshold is always or never passed.
 fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
-    if alarm.rule.spec().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
+    let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
+    if is_fraction && !(0.0..=1.0).contains(&set) {
         alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
     }
 }

@@ -358,6 +358,7 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
 fn amount(value: f64, unit: Unit) -> String {
     match unit {
         Unit::Fraction => format!("{} %", round(100.0 * value)),
+        Unit::FractionPerDay => format!("{} %/d", round(100.0 * value)),
         Unit::Ratio => round(value).to_string(),
         Unit::AmpereHours | Unit::Seconds | Unit::Celsius | Unit::Cycles => {
             format!("{} {}", round(value), unit.symbol())

@@ -116,7 +116,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.
         Rule::InputMissing => 9,
         Rule::BusFault => 19,
-        Rule::InputImplausible | Rule::BmsDisagrees => 2,
+        Rule::InputImplausible | Rule::BmsDisagrees | Rule::ChannelFaulty => 2,
         Rule::EstimateUntrusted | Rule::StoreFailed => 31,
         Rule::CapacityLow
         | Rule::UsableCapacityLow
@@ -125,7 +125,9 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         | Rule::SocLow
         | Rule::TemperatureHigh
         | Rule::CellImbalance
-        | Rule::RemainingLifeLow => match (rule.spec().direction, severity) {
+        | Rule::RemainingLifeLow
+        | Rule::CellLeak
+        | Rule::ConnectionResistance => match (rule.spec().direction, severity) {
             // Data valid, but beyond normal: least, moderately, most severe.
             (Direction::Below, Severity::Info) => 17,
             (Direction::Below, Severity::Warning) => 18,

@@ -108,6 +108,9 @@ choice!(Rule {
     "bms_disagrees" => Self::BmsDisagrees,
     "store_failed" => Self::StoreFailed,
     "bus_fault" => Self::BusFault,
+    "cell_leak" => Self::CellLeak,
+    "connection_resistance" => Self::ConnectionResistance,
+    "channel_faulty" => Self::ChannelFaulty,
 });
 
 section! {
@@ -167,7 +170,8 @@ section! {
     /// `capacity_low`, `usable_capacity_low` Ah per cell; `recharge_period_low` s; `resistance_high` times that of a new cell;
     /// `soc_low` (of the emptiest cell), `cell_imbalance` (SOC of the fullest less that of the emptiest cell), `bms_disagrees` (SOC or SOH as the pack reports it less the estimate), `input_implausible` (share of bad readings) fractions;
     /// `temperature_high` (the hottest sensor) degrees C; `remaining_life_low` equivalent full cycles;
-    /// `input_missing`, `store_failed` and `bus_fault` (how long it has lasted) s; `estimate_untrusted` the mean normalised innovation squared, or the mismatch of the cell model in that scale.
+    /// `input_missing`, `store_failed` and `bus_fault` (how long it has lasted) s; `estimate_untrusted` the mean normalised innovation squared, or the mismatch of the cell model in that scale;
+    /// each cell against the others: `cell_leak` (its self-discharge in a day, of its capacity), `connection_resistance` (its contact resistance beyond theirs, of a cell's series resistance at half charge and 25 degrees C) fractions; `channel_faulty` 1 while its voltage channel is faulty (frozen, off, doubled or exchanged), else 0.
     Alarm at "alarm" {
         /// What the alarm compares.
         rule: Rule, "", Any, Required;
@@ -189,7 +193,7 @@ section! {
         latched: bool, "", Any, Default("false");
         /// J1939: suspect parameter number. Without it: 520192 (maker-assignable) plus the rule's number.
         spn: Option<u32>, "", Between(1.0, 524_287.0), Optional;
-        /// J1939: failure mode identifier. Without it: by rule and severity (17, 18, 1 for a value too low, 15, 16, 0 for one too high; 9 for a missing input, 2 for an implausible one and a pack that disagrees, 19 for a bus, 31 for an estimate not to be trusted and a store).
+        /// J1939: failure mode identifier. Without it: by rule and severity (17, 18, 1 for a value too low, 15, 16, 0 for one too high; 9 for a missing input, 2 for an implausible one, a pack that disagrees and a faulty channel, 19 for a bus, 31 for an estimate not to be trusted and a store).
         fmi: Option<u8>, "", Between(0.0, 31.0), Optional;
     }
 }

@@ -7,7 +7,7 @@ use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
 use super::raised::{ActiveAlarm, doubt, raised, value};
 use super::{forecast, series};
-use crate::alarm::{Rule, Severity};
+use crate::alarm::{Rule, Severity, Unit};
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
 
@@ -146,6 +146,7 @@ fn is_of_battery(name: &str) -> bool {
                 | Rule::BmsDisagrees
                 | Rule::StoreFailed
                 | Rule::BusFault
+                | Rule::ChannelFaulty
         )
     )
 }
@@ -176,9 +177,13 @@ pub(super) fn length(seconds: f64) -> String {
 
 /// Formats a rule's value with its unit, without trailing zeros.
 pub(super) fn amount(value: f64, rule: &str) -> String {
+    let (value, unit) = match self::rule(rule).map(|rule| rule.spec().unit) {
+        Some(Unit::FractionPerDay) => (100.0 * value, "%/d"),
+        _ => (value, unit(rule)),
+    };
     let digits = without_minus_zero(format!("{value:.3}"));
     let digits = digits.trim_end_matches('0').trim_end_matches('.');
-    format!("{digits} {}", unit(rule).replace("degrees C", "\u{b0}C")).trim_end().to_owned()
+    format!("{digits} {}", unit.replace("degrees C", "\u{b0}C")).trim_end().to_owned()
 }
 
 /// "a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)", with the verb in its tense.
@@ -245,12 +250,19 @@ fn what(
         Rule::CellImbalance => {
             "Have the cells balanced; if that does not hold, the weakest cell is the one to look at."
         }
+        Rule::CellLeak => {
+            "Measure the rest voltage of the named cell over a week; if it falls against the others', replace the cell."
+        }
+        Rule::ConnectionResistance => "Have the connections of the named cell tightened and cleaned.",
         _ if verdict == Condition::Act => "Replace the battery or the named cell, or take it out of service.",
         _ => "Order a replacement, and have its capacity measured at the next visit.",
     });
     let measure = measuring.first().map(|raised| match rule(&raised.row.rule) {
         Some(Rule::EstimateUntrusted) => {
             "Do not rely on these figures before the sensors and the cell model were checked."
+        }
+        Some(Rule::ChannelFaulty) => {
+            "Check the sense wire and the channel of the named cell: its figures are not its own."
         }
         Some(Rule::StoreFailed) => "Check the disk of the vehicle computer: what is learned may be lost.",
         _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",

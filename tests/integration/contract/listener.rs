@@ -30,6 +30,14 @@ impl Reader {
         self.signals[name].0.raw(frame.data()).unwrap()
     }
 
+    /// Whether the signal is on the page of a frame.
+    fn has(&self, frame: &Frame, name: &str) -> bool {
+        let page = self.raw(frame, "Page");
+        self.signals.get(name).is_some_and(|(_, signal)| {
+            signal.conditions.iter().flat_map(|of| &of.ranges).any(|(low, high)| (*low..=*high).contains(&page))
+        })
+    }
+
     /// Code of a word of the signal's value table.
     fn code(&self, name: &str, word: &str) -> u64 {
         let table = &self.signals[name].1.values;
@@ -91,14 +99,14 @@ impl Listener {
         if raw("Page") == self.digest.code("Page", "alarms") {
             self.wanted = Some((raw("Raised"), raw("TableChecksum")));
             self.pass_ms = i64::try_from(raw("PassTime")).unwrap() * 100;
-        } else if raw("Page") == self.digest.code("Page", "rules") {
+        } else if ["rules", "rules_2"].map(|page| self.digest.code("Page", page)).contains(&raw("Page")) {
             for (code, name) in &self.alarm.signals["Rule"].1.values {
-                if self.digest.signals.contains_key(&format!("Rule_{name}")) {
+                if self.digest.has(frame, &format!("Rule_{name}")) {
                     self.rules.insert(u64::try_from(*code).unwrap(), raw(&format!("Rule_{name}")));
                 }
             }
             let rules = &self.rules;
-            self.entries.retain(|(rule, _, _), _| matches!(rules[rule], 1..=3));
+            self.entries.retain(|(rule, _, _), _| rules.get(rule).is_none_or(|state| matches!(state, 1..=3)));
         }
     }
 

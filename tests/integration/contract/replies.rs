@@ -156,7 +156,7 @@ fn counters_after_a_kill_are_those_of_a_daemon_that_never_stopped() {
         rig.seconds(2);
         let first = digest.verified_counter(rig.frames_with(DIGEST)[0].data()).unwrap();
         let pages = (i64::from(first) - i64::from(before[1])).rem_euclid(15);
-        assert!(pages % 3 == 1, "{unstored_deci} {away_deci}: whole periods of three pages: {pages}");
+        assert!(pages % 4 == 1, "{unstored_deci} {away_deci}: whole periods of four pages: {pages}");
     }
 }
 

@@ -30,7 +30,7 @@ struct OutputField {
     place: Option<usize>,
     plan: SignalPlan,
     not_available: u64,
-    /// 100 where the DBC's unit is %.
+    /// 100 where the DBC's unit is % or %/d.
     per_inside_unit: f64,
     /// Codes of the message's multiplexor with which the signal is present; empty = always.
     pages: Vec<(u64, u64)>,
@@ -205,7 +205,7 @@ impl OutputField {
             place: None,
             plan,
             not_available: signal.not_available_codes().first().copied().unwrap_or(customary),
-            per_inside_unit: if signal.unit == "%" { 100.0 } else { 1.0 },
+            per_inside_unit: if matches!(signal.unit.as_str(), "%" | "%/d") { 100.0 } else { 1.0 },
             pages,
             is_multiplexor: signal.is_multiplexor,
         })

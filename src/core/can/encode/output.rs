@@ -68,7 +68,7 @@ const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowle
 
 /// The alarm rules in the order of their numbers, which start at 1: each has its `Value_...` and `Threshold_...`, for
 /// their units differ.
-pub(super) const RULES: [&str; 14] = [
+pub(super) const RULES: [&str; 17] = [
     "CapacityLow",
     "UsableCapacityLow",
     "RechargePeriodLow",
@@ -83,6 +83,9 @@ pub(super) const RULES: [&str; 14] = [
     "BmsDisagrees",
     "StoreFailed",
     "BusFault",
+    "CellLeak",
+    "ConnectionResistance",
+    "ChannelFaulty",
 ];
 
 /// Contents of the status frame; `None` = not available.

@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 /// Shortest time between two changes of one code on the bus, ns.
 const CHANGE_SPACING_NS: i64 = 1_000_000_000;
 
-/// Most codes followed at a time: more than a configuration has (14 rules of three severities are 42), few enough to search.
+/// Most codes followed at a time: more than a configuration has (17 rules of three severities are 51), few enough to search.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.

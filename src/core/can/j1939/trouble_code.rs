@@ -14,7 +14,7 @@ use super::name::OutOfRange;
 
 /// Most codes in one message: 27, so 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of 10 ms
 /// late, a transfer ends within 0.96 s, before the next DM1 is due. Of a rule's thresholds that share a
-/// parameter number only the most severe is sent: fourteen rules are 14.
+/// parameter number only the most severe is sent: seventeen rules are 17.
 pub const MAX_CODES: usize = 27;
 
 /// Bytes of a message with [`MAX_CODES`] codes.

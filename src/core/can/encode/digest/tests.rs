@@ -24,9 +24,10 @@ fn every_page_reads_back() {
     checksum.add(9, 2, None, 1, true);
     let mut rules = [RuleState::NotWatched; RULE_COUNT];
     (rules[0], rules[8], rules[13]) = (RuleState::Unknown, RuleState::Warning, RuleState::None);
+    (rules[14], rules[16]) = (RuleState::Info, RuleState::Severe);
     let threshold = Some(ThresholdFields { rule: 14, severity: 3, threshold: 1.0 });
     let made = frames(&DigestFields { raised: 97, worst: 2, checksum, pass_time_s: 1.94, rules, threshold });
-    assert_eq!(made.len(), 3);
+    assert_eq!(made.len(), 4);
     for (name, wanted) in [
         ("Raised", 97.0),
         ("Worst", 2.0),
@@ -36,6 +37,9 @@ fn every_page_reads_back() {
         ("Rule_UsableCapacityLow", 5.0),
         ("Rule_TemperatureHigh", 2.0),
         ("Rule_BusFault", 0.0),
+        ("Rule_CellLeak", 1.0),
+        ("Rule_ConnectionResistance", 5.0),
+        ("Rule_ChannelFaulty", 3.0),
         ("ThresholdRule", 14.0),
         ("ThresholdSeverity", 3.0),
         ("Threshold", 1.0),
@@ -52,6 +56,7 @@ fn a_threshold_has_the_unit_of_the_rule_s_own_signal() {
     };
     assert!((of(8, 0.155) - 15.5).abs() < 1e-5, "SOC in %");
     assert!((of(1, 1.82) - 1.82).abs() < 1e-6, "capacity in Ah");
+    assert!((of(15, 0.001) - 0.1).abs() < 1e-7, "leak in % per day");
 }
 
 #[test]

@@ -1,0 +1,235 @@
+//! The rules that compare each cell with its pack: simulated packs with one fault, whole core, the alarms of every cell.
+
+use std::fmt::Write as _;
+
+use crate::support::config_texts;
+use packwatch::alarm::{AlarmState, Change, Rule};
+use packwatch::can::encode::InputEncoder;
+use packwatch::io::ticks::Ticks;
+use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::quantity::{CellIndex, Timestamp};
+use packwatch::sim::{Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
+
+const CELLS: u16 = 12;
+/// A hole in the record longer than this is sleep, s.
+const SLEEP_GAP_S: f64 = 30.0;
+
+const PACK: &str = r#"
+[pack]
+cells = 12
+cell_model = "cells/example_nmc_2600.toml"
+[[interface]]
+name = "can0"
+[input]
+dbc = ["pack.dbc"]
+[input.current]
+signal = "Pack.Current"
+positive = "discharge"
+[input.cell_voltage]
+signal = "Cells.Voltage{n}"
+[[input.temperature]]
+signal = "Pack.Temperature"
+[usable]
+current_a = 2.6
+temperature_c = 25.0
+cutoff_v = 2.8
+[output]
+[[alarm]]
+rule = "cell_leak"
+warning = "0.1 %"
+when = { probability = 0.99 }
+[[alarm]]
+rule = "connection_resistance"
+warning = "20 %"
+severe = "100 %"
+when = { probability = 0.99 }
+[[alarm]]
+rule = "channel_faulty"
+warning = 0.5
+[[alarm]]
+rule = "capacity_low"
+warning = "80 %"
+[[alarm]]
+rule = "usable_capacity_low"
+warning = "60 %"
+[[alarm]]
+rule = "resistance_high"
+warning = 1.8
+[[alarm]]
+rule = "estimate_untrusted"
+warning = 4.0
+debounce_s = 600.0
+[[alarm]]
+rule = "soc_low"
+warning = "1 %"
+[[alarm]]
+rule = "cell_imbalance"
+warning = "8 %"
+"#;
+
+/// Rules about what a cell's voltages show.
+const OF_CELL: [Rule; 6] = [
+    Rule::CapacityLow,
+    Rule::UsableCapacityLow,
+    Rule::ResistanceHigh,
+    Rule::EstimateUntrusted,
+    Rule::CellLeak,
+    Rule::ConnectionResistance,
+];
+
+fn config() -> MonitorConfig {
+    let mut dbc = String::from("VERSION \"\"\nNS_ :\nBS_:\nBU_: A\nBO_ 256 Pack: 8 A\n");
+    dbc += " SG_ Current : 0|24@1- (0.001,0) [-8000|8000] \"A\" A\n SG_ Temperature : 24|16@1- (0.1,0) [-100|200] \"degC\" A\n";
+    dbc += "BO_ 272 Cells: 8 A\n SG_ Page M : 0|8@1+ (1,0) [0|255] \"\" A\n";
+    for cell in 0..CELLS {
+        let (page, bit) = (cell / 3, 16 + 16 * (cell % 3));
+        let _ = writeln!(dbc, " SG_ Voltage{} m{page} : {bit}|16@1+ (0.0001,0) [0|6.5] \"V\" A", cell + 1);
+    }
+    config_texts::load(PACK, &dbc).monitor
+}
+
+/// A pack with a fault, and all events of the core.
+struct FaultyPack {
+    sim: Simulation,
+    encoder: InputEncoder,
+    config: MonitorConfig,
+    monitor: Monitor,
+    ticks: Ticks,
+    events: Vec<Event>,
+}
+
+impl FaultyPack {
+    fn new(fault: &str) -> Self {
+        let config = config();
+        let mut settings = Settings::of(Scenario::EvDay, 2.6);
+        settings.pack.cells = CELLS;
+        settings.pack.spread.resistance = 0.01;
+        settings.sensors = Sensors::of_quality(SensorQuality::Good);
+        (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
+        settings.duration_s = None;
+        let faults: Vec<_> = fault.split_whitespace().map(|text| text.parse().unwrap()).collect();
+        Self {
+            sim: Simulation::new(config.model.clone(), settings, Wiring::single()).with_faults(&faults),
+            encoder: InputEncoder::new(&config.input),
+            monitor: Monitor::new(config.clone()),
+            config,
+            ticks: Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S),
+            events: Vec::new(),
+        }
+    }
+
+    /// Runs up to a day.
+    fn run_to(&mut self, day: f64) {
+        let (mut out, mut frames) = (Outputs::default(), Vec::new());
+        while self.monitor.now() < Timestamp::from_secs(day * 86_400.0) {
+            let moment = self.sim.advance().unwrap();
+            frames.clear();
+            self.encoder.encode(self.sim.readings(), &mut frames);
+            self.ticks.advance(moment.time);
+            while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+                self.monitor.handle(Input::Tick { time }, &mut out);
+            }
+            for (bus, frame) in &frames {
+                self.monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+            }
+            self.events.append(&mut out.events);
+            out.clear();
+        }
+    }
+
+    /// Stops and starts with the stored state, away for a second.
+    fn restart(&mut self) {
+        let stored = self.monitor.snapshot();
+        self.monitor = Monitor::new(self.config.clone());
+        self.monitor.restore(stored, Downtime::Seconds(1.0)).unwrap();
+    }
+
+    /// Cells for which an alarm of the rule was raised, each as often as it was.
+    fn raised(&self, rule: Rule) -> Vec<Option<u16>> {
+        let raised = self.events.iter().filter_map(|event| match event.kind {
+            EventKind::Alarm { rule: of, cell, change: Change::Raised, .. } if of == rule => {
+                Some(cell.map(|cell| cell.0))
+            }
+            _ => None,
+        });
+        let mut cells: Vec<_> = raised.collect();
+        cells.sort_unstable();
+        cells
+    }
+
+    fn state(&self, rule: Rule, cell: u16) -> AlarmState {
+        self.monitor.alarms().get(rule, Some(CellIndex(cell))).unwrap().state
+    }
+
+    fn value(&self, rule: Rule, cell: u16) -> Option<f64> {
+        self.monitor.alarms().get(rule, Some(CellIndex(cell))).unwrap().value
+    }
+}
+
+#[test]
+fn a_leak_raises_cell_leak_for_its_cell_alone_and_is_still_raised_after_a_restart() {
+    let mut pack = FaultyPack::new("leak:7:2mA@day1");
+    pack.run_to(6.0);
+    assert_eq!(pack.raised(Rule::CellLeak), [Some(6)]);
+    assert_eq!((pack.raised(Rule::ConnectionResistance), pack.raised(Rule::ChannelFaulty)), (vec![], vec![]));
+    let (leak, truth) = (pack.value(Rule::CellLeak, 6).unwrap(), 24.0 * 0.002 / 2.6);
+    assert!((leak / truth - 1.0).abs() < 0.3, "{leak} of {truth} a day");
+    let before = pack.monitor.alarms().get(Rule::CellLeak, Some(CellIndex(6))).unwrap();
+    pack.restart();
+    pack.events.clear();
+    pack.run_to(6.0 + 0.02);
+    let after = pack.monitor.alarms().get(Rule::CellLeak, Some(CellIndex(6))).unwrap();
+    assert_eq!((before.state, after.state, after.occurrences), (AlarmState::Active, AlarmState::Active, 1));
+    assert_eq!(pack.raised(Rule::CellLeak), []);
+}
+
+#[test]
+fn a_loose_contact_raises_connection_resistance_for_its_cell_alone() {
+    let mut pack = FaultyPack::new("contact:3:+50%@day1");
+    pack.run_to(4.0);
+    assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(2)]);
+    assert_eq!((pack.raised(Rule::CellLeak), pack.raised(Rule::ChannelFaulty)), (vec![], vec![]));
+    let contact = pack.value(Rule::ConnectionResistance, 2).unwrap();
+    assert!((contact - 0.5).abs() < 0.15, "{contact}");
+}
+
+#[test]
+fn healthy_cells_raise_nothing_and_are_all_judged() {
+    let mut pack = FaultyPack::new("");
+    pack.run_to(10.0);
+    for rule in [Rule::CellLeak, Rule::ConnectionResistance, Rule::ChannelFaulty] {
+        assert_eq!(pack.raised(rule), []);
+        let unknown: Vec<_> = (0..CELLS).filter(|cell| pack.state(rule, *cell) != AlarmState::Inactive).collect();
+        assert_eq!(unknown, [0_u16; 0], "{rule:?}");
+    }
+}
+
+#[test]
+fn a_stuck_channel_raises_channel_faulty_and_no_alarm_of_its_cell() {
+    let mut pack = FaultyPack::new("voltage-stuck:5@30h");
+    pack.run_to(4.0);
+    assert_eq!(pack.raised(Rule::ChannelFaulty), [Some(4)]);
+    for rule in OF_CELL {
+        assert_eq!(pack.raised(rule), [], "{rule:?}");
+        assert_eq!(pack.state(rule, 4), AlarmState::Unknown, "{rule:?}");
+    }
+    assert_ne!(pack.state(Rule::CapacityLow, 3), AlarmState::Unknown, "the others are judged");
+    assert_eq!(pack.raised(Rule::SocLow), []);
+}
+
+#[test]
+fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_next_pack_starts_anew() {
+    let mut pack = FaultyPack::new("contact:5:+50%@6h voltage-offset:5:60mV@day3");
+    pack.run_to(6.0);
+    assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(4)]);
+    assert_eq!(pack.raised(Rule::ChannelFaulty), [Some(4)]);
+    assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Suppressed);
+    pack.restart();
+    pack.run_to(6.05);
+    assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Suppressed);
+    assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Active);
+    let mut out = Outputs::default();
+    pack.monitor.handle(Input::Command { time: pack.monitor.now(), command: Command::PackReplaced }, &mut out);
+    assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Unknown);
+    assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Suppressed, "until the first row of the new pack");
+}
