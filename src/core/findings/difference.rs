@@ -294,7 +294,11 @@ mod tests {
             .map(|_| {
                 let observed = row(&filter);
                 filter.pass(0.003, 0.0);
-                filter.observe(&observed)
+                let is_jump = filter.observe(&observed);
+                if is_jump {
+                    filter.open(Jump::Alone, &observed);
+                }
+                is_jump
             })
             .collect();
         assert_eq!(jumps.iter().filter(|jumped| **jumped).count(), 1);
