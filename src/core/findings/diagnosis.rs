@@ -47,6 +47,8 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
 const DAY_S: f64 = 86_400.0;
+/// Deviation up to which a size is known, in limits of its kind.
+const KNOWN_LIMITS: f64 = 2.0;
 
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -404,7 +406,7 @@ impl Diagnosis {
         let cell = CellIndex(index as u16);
         let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
         let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
-        let is_known = judged.size.std() <= kind.limit() || is_found();
+        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() || is_found();
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
