@@ -20,7 +20,7 @@ use crate::health::{
     CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
     RechargeTimer, TransitionDetector, pack,
 };
-use crate::quantity::{CellIndex, Mode, Timestamp};
+use crate::quantity::{CellIndex, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
 /// Below the model's highest voltage by this, a charge is in its constant-voltage part, V.
@@ -72,6 +72,11 @@ impl Default for CellHealth {
     fn default() -> Self {
         Self { full_soc: 1.0, tapered: false, usable: None, discharge_resistance: None }
     }
+}
+
+/// Whether a period is one: a capacity of which nothing is known says nothing of it.
+fn is_period(period: &ScalarGaussian) -> bool {
+    bounds::TIME_S.has(period.mean) && bounds::TIME_S.has(period.std())
 }
 
 impl LearningState {
@@ -287,6 +292,7 @@ impl Learning {
             let capacity = ScalarGaussian::from_std(pack.capacity_ah, pack.capacity_std_ah);
             normalised_period(config, capacity)
         });
+        let normalised = normalised.filter(is_period);
         if charged.raw_s.is_none() && normalised.is_none() {
             return;
         }
@@ -323,7 +329,8 @@ impl Learning {
         self.state.normalised_recharge = self
             .state
             .normalised_recharge
-            .map(|period| ScalarGaussian { mean: ratio * period.mean, variance: ratio * ratio * period.variance });
+            .map(|period| ScalarGaussian { mean: ratio * period.mean, variance: ratio * ratio * period.variance })
+            .filter(is_period);
     }
 
     /// Capacity of the cell with the lowest; `None` until half-cycles have taught something about every cell.

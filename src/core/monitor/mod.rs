@@ -59,7 +59,7 @@ use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::can::secoc::MacCheck;
 use crate::cell::own_model::task::{FitFindings, FitTask};
-use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
+use crate::quantity::{BusIndex, Channel, Reading, Timestamp, bounds};
 
 pub use command_gate::CommandCounts;
 pub use config::{MonitorConfig, SupplyConfig};
@@ -87,6 +87,10 @@ pub struct Monitor {
     pending: Option<PendingRestore>,
 }
 
+/// The range of stamps.
+const EARLIEST: Timestamp = Timestamp::from_nanos(-LATEST.nanos());
+const LATEST: Timestamp = Timestamp::from_nanos(bounds::STAMP_NS.high as i64);
+
 impl Monitor {
     /// A monitor without any knowledge of its pack.
     pub fn new(config: MonitorConfig) -> Self {
@@ -112,7 +116,8 @@ impl Monitor {
     }
 
     fn dispatch(&mut self, input: Input<'_>, out: &mut Outputs) {
-        let time = input.time();
+        // A stamp beyond this is wrong, and differences of stamps would leave the clock's range.
+        let time = input.time().clamp(EARLIEST, LATEST);
         if !self.clock.has_started {
             self.start(time, out);
         }
