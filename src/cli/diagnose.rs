@@ -183,6 +183,7 @@ fn text(page: &Page) -> String {
 
 /// Size of a finding with its unit; empty for one that has none.
 fn size_text(kind: FindingKind, size: f64, std: f64) -> String {
+    let both = |mean: f64, std: f64, digits: usize| both(mean, std, digits).trim_start_matches('+').to_owned();
     match kind {
         FindingKind::Leak => format!(", {} % of its capacity a day", both(100.0 * size, 100.0 * std, 2)),
         FindingKind::Contact => format!(", {} % of its series resistance", both(100.0 * size, 100.0 * std, 0)),

@@ -7,6 +7,9 @@ use crate::quantity::Timestamp;
 /// Longest time between two samples whose difference shows the resistance, s.
 const STEP_S: f64 = 3.0;
 
+/// Least time between two samples that are taken, ns: more of them say the same again.
+const LEAST_APART_NS: i64 = 900_000_000;
+
 /// Sums of one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
@@ -36,6 +39,9 @@ impl CellSums {
         temperature_c: Option<f64>,
         ohm: f64,
     ) {
+        if self.last.is_some_and(|(before, ..)| time.nanos().wrapping_sub(before.nanos()) < LEAST_APART_NS) {
+            return;
+        }
         self.count += 1;
         if let Some(temperature_c) = temperature_c {
             self.temperature_c += temperature_c;
