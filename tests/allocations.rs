@@ -26,6 +26,9 @@ const WARM_S: f64 = 110.0;
 /// Fewer frames than this after it would prove nothing: 50 s of 10 currents and 32 other frames each 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
+/// Most blocks that the end of a row of the findings allocates, for 96 cells.
+const BLOCKS_OF_A_ROW: u64 = 400;
+
 /// One test at a time: all of them count the whole process.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
@@ -34,11 +37,16 @@ fn alone() -> MutexGuard<'static, ()> {
 
 /// Runs `work`, in which no thread may allocate.
 fn without_allocating(what: &str, work: impl FnOnce()) {
+    allocating_at_most(0, what, work);
+}
+
+/// Runs `work`, in which all threads together may allocate this many blocks.
+fn allocating_at_most(most: u64, what: &str, work: impl FnOnce()) {
     let profiler = dhat::Profiler::builder().testing().build();
     work();
     let blocks = dhat::HeapStats::get().total_blocks;
     // Its own assertion saves where.
-    dhat::assert_eq!(blocks, 0, "{what}: blocks allocated");
+    dhat::assert!(blocks <= most, "{what}: {blocks} blocks allocated");
     drop(profiler);
 }
 
@@ -170,7 +178,8 @@ fn a_frame_through_the_core_with_96_cells_allocates_nothing() {
     assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
     before.iter().for_each(|record| core.feed(record));
     (core.sent, core.events) = (0, 0);
-    without_allocating("the core", || steady.iter().for_each(|record| core.feed(record)));
+    // A row of the findings ends once in a minute or more, and allocates then.
+    allocating_at_most(BLOCKS_OF_A_ROW, "the core", || steady.iter().for_each(|record| core.feed(record)));
     assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
     assert!(core.monitor.latest().flatten().count() == 96, "every cell has its estimate");
     assert_eq!(core.events, 0, "a steady part");

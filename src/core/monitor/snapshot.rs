@@ -387,7 +387,9 @@ impl Snapshot {
     /// The state without what holds only where the same clock continues: smaller, for a program that will be restarted.
     #[must_use]
     pub fn for_restart(self) -> Self {
-        Self { continuation: None, ..self }
+        let mut diagnosis = self.diagnosis;
+        diagnosis.iter_mut().for_each(Diagnosis::interrupt);
+        Self { continuation: None, diagnosis, ..self }
     }
 
     /// What is known of single cells; `None` = the pack is too small for a comparison, or the state is of an earlier program.

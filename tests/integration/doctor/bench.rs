@@ -69,7 +69,7 @@ fn total() -> String {
     let head = head.replace("[input.cell_voltage]", "");
     // What needs cells of their own.
     let (before, rest) = tail.split_once("[[alarm]]\nrule = \"cell_imbalance\"").unwrap();
-    let (_, after) = rest.split_once("[[alarm]]").unwrap();
+    let (_, after) = rest.split_once("\n[[alarm]]").unwrap();
     format!("{head}{inputs}\n# A message that its sender{before}[[alarm]]{after}")
 }
 

@@ -67,7 +67,7 @@ fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5].map(CanId::Standard));
     let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
     assert_eq!(times_ms, [Some(100), Some(1000), Some(1000), Some(1000), None]);
-    assert_eq!(plan.digest_pages(), 3);
+    assert_eq!(plan.digest_pages(), 4);
     assert_eq!(plan.health_pages(), 5);
 }
 
