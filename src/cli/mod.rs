@@ -9,6 +9,7 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+#[cfg(feature = "lab")]
 mod diagnose;
 #[cfg(feature = "lab")]
 mod discover;
@@ -97,6 +98,7 @@ enum Command {
     /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
     Doctor(Box<doctor::Args>),
     /// Name the cells of a pack that are failing, and how: leaks, contacts, weak cells, sensors
+    #[cfg(feature = "lab")]
     Diagnose(Box<diagnose::Args>),
     /// List the cell models that are there, and the chemistries that a label may name
     Cells(cells::Args),
@@ -182,6 +184,7 @@ pub fn main() -> ExitCode {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        #[cfg(feature = "lab")]
         Command::Diagnose(args) => diagnose::run(&args),
         Command::Cells(args) => cells::run(&args),
         Command::Model(args) => model::run(&args),
