@@ -1,6 +1,6 @@
 //! A snapshot taken after any input, restored on the same clock, continues byte-identical: frames, events and estimates.
 //!
-//! A pack of two cells with protected inputs, alarms of every kind, commands from both sides, a J1939 node and diagnostic requests
+//! A pack of three cells with protected inputs, alarms of every kind, commands from both sides, a J1939 node and diagnostic requests
 //! is put through random drives, faults, holes, sleep and clocks that are set back. One monitor runs through; the other is
 //! replaced by its own snapshot (through JSON) at random inputs. So is a pack that learns the model of its cells, and one whose frames
 //! are authenticated; of the latter all but the freshness is compared, which begins again by design. `PACKWATCH_CUTS` sets the
@@ -32,7 +32,8 @@ BO_ 257 Pack: 8 A
 BO_ 272 Cells: 8 A
  SG_ Voltage1 : 0|16@1+ (0.0001,0) [0|5] "V" A
  SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] "V" A
- SG_ Serial : 32|32@1+ (1,0) [0|0] "" A
+ SG_ Voltage3 : 32|16@1+ (0.0001,0) [0|5] "V" A
+ SG_ Serial : 48|16@1+ (1,0) [0|0] "" A
 "#;
 
 const MORE: &str = r#"
@@ -103,6 +104,15 @@ warning = 10
 [[alarm]]
 rule = "recharge_period_low"
 info = 1000
+[[alarm]]
+rule = "cell_leak"
+warning = 0.001
+[[alarm]]
+rule = "connection_resistance"
+warning = 0.2
+[[alarm]]
+rule = "channel_faulty"
+warning = 0.5
 "#;
 
 /// One input that owns its frame.
@@ -127,7 +137,11 @@ impl Record {
 
 /// A pack with a model file; one that learns its model from a label; one with authenticated frames.
 fn configs() -> [MonitorConfig; 3] {
-    let pack = PACK.replace("Status.Soc", "Pack.Soc");
+    // Three cells: fewer are not compared with each other.
+    let pack = PACK
+        .replace("Status.Soc", "Pack.Soc")
+        .replace("cells = 2\n", "cells = 3\n")
+        .replace("cells = \"2\"", "cells = \"2-3\"");
     let label = "chemistry = \"nmc811-graphite\"\nrated_capacity_ah = 2.6";
     let learning = pack.replace("cell_model = \"cells/example_nmc_2600.toml\"", label);
     let secoc = "fd = true\nsecoc = \"fd\"\ndata_id = ";
@@ -186,7 +200,7 @@ impl Vehicle {
             if dice.one_in(200) { dice.between(-50.0, 200.0) } else { value + dice.between(-noise, noise) }
         };
         let (current_a, temperature_c) = (odd(self.current_a, 0.02), odd(self.temperature_c, 0.0));
-        let (first_v, second_v) = (odd(voltage_v, 0.002), odd(voltage_v - 0.02, 0.002));
+        let [first_v, second_v, third_v] = [0.0, -0.02, 0.01].map(|off_v| odd(voltage_v + off_v, 0.002));
         let values = [
             (Channel::Current, Some(current_a)),
             (Channel::Temperature(SensorIndex(0)), (!dice.one_in(50)).then_some(temperature_c)),
@@ -196,6 +210,7 @@ impl Vehicle {
             (Channel::Contactor, Some(if dice.one_in(100) { 0.0 } else { 1.0 })),
             (Channel::CellVoltage(CellIndex(0)), Some(first_v)),
             (Channel::CellVoltage(CellIndex(1)), Some(second_v)),
+            (Channel::CellVoltage(CellIndex(2)), Some(third_v)),
         ];
         let mut made = Vec::new();
         self.encoder.encode(&values, &mut made);

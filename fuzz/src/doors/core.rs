@@ -282,7 +282,7 @@ impl Vehicle {
             }
             13 => self.push(Input::UnknownGap { time }),
             14 => {
-                let (rule, seconds) = (Rule::from_number(source.byte() % 16).unwrap_or(Rule::SocLow), source.number());
+                let (rule, seconds) = (Rule::from_number(source.byte() % 20).unwrap_or(Rule::SocLow), source.number());
                 let cell = source.one_of(&[None, Some(CellIndex(0)), Some(CellIndex(1)), Some(CellIndex(900))]);
                 let which = Selector { rule: source.one_of(&[None, Some(rule)]), severity: None, cell };
                 let commands = [
@@ -344,6 +344,7 @@ impl Vehicle {
             (Channel::Contactor, Some(self.contactor)),
             (Channel::CellVoltage(CellIndex(0)), Some(voltage_v)),
             (Channel::CellVoltage(CellIndex(1)), Some(voltage_v - 0.02)),
+            (Channel::CellVoltage(CellIndex(2)), Some(voltage_v + 0.01)),
         ];
         let mut made = Vec::new();
         self.encoder.encode(&values, &mut made);

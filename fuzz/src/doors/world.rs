@@ -1,4 +1,4 @@
-//! The configuration that the doors of the core share: two cells, protected inputs, alarms of every kind, commands, a J1939 node and
+//! The configuration that the doors of the core share: three cells, protected inputs, alarms of every kind, commands, a J1939 node and
 //! diagnostic requests.
 
 use std::io::{Error, ErrorKind};
@@ -24,12 +24,13 @@ BO_ 257 Pack: 8 A
 BO_ 272 Cells: 8 A
  SG_ Voltage1 : 0|16@1+ (0.0001,0) [0|5] "V" A
  SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] "V" A
- SG_ Serial : 32|32@1+ (1,0) [0|0] "" A
+ SG_ Voltage3 : 32|16@1+ (0.0001,0) [0|5] "V" A
+ SG_ Serial : 48|16@1+ (1,0) [0|0] "" A
 "#;
 
 pub(super) const PACK: &str = r#"
 [pack]
-cells = 2
+cells = 3
 cell_model = "cell.toml"
 [[interface]]
 name = "can0"
@@ -45,7 +46,7 @@ signal = "Status.Temperature1"
 cells = "1"
 [[input.temperature]]
 signal = "Status.Temperature2"
-cells = "2"
+cells = "2-3"
 [input.reported_soc]
 signal = "Pack.Soc"
 [limits.temperature]
@@ -90,6 +91,15 @@ enabled = true
 address = 249
 identity_number = 1234
 manufacturer_code = 2047
+[[alarm]]
+rule = "cell_leak"
+warning = 0.001
+[[alarm]]
+rule = "connection_resistance"
+warning = 0.2
+[[alarm]]
+rule = "channel_faulty"
+warning = 0.5
 [[alarm]]
 rule = "capacity_low"
 warning = 5.0

@@ -453,6 +453,3 @@ impl Row {
         (step(self.soc, soc_width), step(self.temperature_c, CLASS_K), direction)
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -3,12 +3,14 @@
 use serde::{Deserialize, Serialize};
 
 use super::row::CellSums;
+use crate::quantity::InvalidState;
 
 /// Change of the other cells while a channel stays at one value, V.
 const FROZEN_V: f64 = 0.03;
-/// Fewest changes of the voltage in a row for a comparison with other channels, and rows that must agree.
+/// Fewest changes of the voltage in a row for a comparison with other channels, and rows in a row that must agree: with steps of
+/// 2.5 mV two of 96 cells agreed in three.
 const LEAST_CHANGES: u32 = 10;
-const DOUBLED_ROWS: u8 = 3;
+const DOUBLED_ROWS: u8 = 10;
 
 /// What is known of one channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -36,8 +38,16 @@ impl Channel {
         self.same_as.filter(|(_, rows)| *rows >= DOUBLED_ROWS).map(|(other, _)| other)
     }
 
-    pub(super) fn numbers(&self) -> Option<f64> {
-        self.middle_v
+    /// Checks the numbers of a stored channel of a pack of this many cells.
+    pub(super) fn check(&self, cells: usize) -> Result<(), InvalidState> {
+        InvalidState::unless_numbers("the voltage of a frozen channel's pack", self.middle_v)?;
+        let (other, _) = self.same_as.unwrap_or_default();
+        InvalidState::unless(
+            usize::from(other) < cells,
+            "the double of a channel",
+            f64::from(other),
+            "a cell of the pack",
+        )
     }
 }
 
@@ -98,7 +108,9 @@ mod tests {
         let shown = |offset: f64| -> Vec<f64> { (0..30).map(|i| 3.7 + offset + f64::from(i % 7) * 0.001).collect() };
         let mut channels = vec![Channel::default(); 4];
         let one_doubled = [shown(0.0), shown(0.002), shown(0.0), shown(0.005)].map(|v| row(&v));
-        (0..3).for_each(|_| compare(&mut channels, &one_doubled));
+        (0..9).for_each(|_| compare(&mut channels, &one_doubled));
+        assert_eq!(doubled(&channels), [None; 4], "too few rows");
+        compare(&mut channels, &one_doubled);
         assert_eq!(doubled(&channels), [Some(2), None, Some(0), None]);
         let alike = [shown(0.0), shown(0.0), shown(0.0), shown(0.0)].map(|v| row(&v));
         compare(&mut channels, &alike);

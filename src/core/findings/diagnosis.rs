@@ -1,15 +1,21 @@
-//! All cells of a pack: rows in, findings out.
+//! All cells of a pack: rows in, findings out (`judge`).
+//!
+//! The errors of a row are round numbers of a circuit model and a usual cell monitor. They were tried on the simulated pack of ten cells
+//! and on the simulator's packs; no measured pack had a part in them.
+
+mod judge;
 
 use serde::{Deserialize, Serialize};
 
 use super::channels::{Channel, compare};
-use super::difference::{self, CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
-use super::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN};
+use super::difference::{CHANNEL, CONTACT, Difference, Jump, Observation, RESISTANCE, SOC, STATES};
+use super::finding::{Finding, FindingKind};
 use super::row::{CellSums, PackSums};
 use super::temperature::Following;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
+use judge::Population;
 
 /// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
 /// the same again.
@@ -31,8 +37,6 @@ const ROW_CURVE: f64 = 0.001;
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
-/// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
-const TOO_FAR: f64 = 0.1;
 /// Error of a resistance by steps, fraction, and of a step's voltage, V.
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
@@ -42,14 +46,9 @@ const LEAST_STEPS: f64 = 0.02;
 const SOC_JUMP: f64 = 0.02;
 /// Rows of which the jumps of several cells are one event.
 const SAME_EVENT_S: f64 = 1800.0;
-/// The same of the cells of a module with more capacity than the others.
-const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
 const DAY_S: f64 = 86_400.0;
-/// Deviation up to which a size is known, in limits of its kind.
-const KNOWN_LIMITS: f64 = 2.0;
-
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
@@ -151,10 +150,6 @@ impl Diagnosis {
             let ScalarGaussian { mean, variance } = own.state(state);
             ScalarGaussian { mean: mean - middle, variance }
         }))
-    }
-
-    fn population(&self, state: usize) -> Population {
-        Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
     }
 
     /// The cell whose estimate stands for the mean cell in the present row.
@@ -378,145 +373,6 @@ impl Diagnosis {
         }
     }
 
-    /// Judges all cells.
-    fn judge(&mut self, time: Timestamp, is_balanced: bool) {
-        let populations = self.populations();
-        let charges = self.cells.iter().map(|cell| cell.difference.mean()[SOC]);
-        let lowest = charges.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell);
-        self.lowest = lowest.filter(|_| is_balanced);
-        for index in 0..self.cells.len() {
-            let judged = self.judged(index, &populations);
-            let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
-            for it in judged {
-                let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
-                self.take(time, index, &Judged { probability, ..it });
-            }
-        }
-        self.find_modules(time);
-    }
-
-    /// Per cell, what a kind is of, against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
-    /// too far from the others, its channel is faulty, or the value is not known well enough yet.
-    pub fn sizes(&self, kind: FindingKind) -> Vec<Option<ScalarGaussian>> {
-        let populations = self.populations();
-        (0..self.cells.len()).map(|cell| self.size(cell, kind, &populations)).collect()
-    }
-
-    fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
-        let cell = CellIndex(index as u16);
-        let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
-        let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
-        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() || is_found();
-        (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
-    }
-
-    /// Whether what is read as a cell's voltage is not that; `None` = not compared yet.
-    pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
-        let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
-        if is_found { Some(true) } else { self.last_row.map(|_| false) }
-    }
-
-    fn populations(&self) -> [Population; STATES] {
-        std::array::from_fn(|state| self.population(state))
-    }
-
-    /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
-    /// above them; where a BMS balances, all but the lowest one are. A leak that was found is still there when the others are bled.
-    fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
-        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
-        let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
-        let is_lowest = self.lowest.is_none_or(|lowest| lowest == index);
-        is_below && (is_lowest || self.findings.iter().any(is_found))
-    }
-
-    /// What one cell may have.
-    fn judged(&self, index: usize, populations: &[Population; STATES]) -> Vec<Judged> {
-        let cell = &self.cells[index];
-        let beyond = |state: usize, limit: f64, sign: f64, is_outlier: bool| {
-            let own = cell.difference.state(state);
-            let population = &populations[state];
-            let size = ScalarGaussian { mean: own.mean - population.middle, variance: own.variance };
-            let probability = normal_cdf((sign * size.mean - limit) / size.std().max(1e-12));
-            let stands_out = !is_outlier || sign * size.mean >= OUTLIER * population.std;
-            (size, if stands_out { probability } else { 0.0 })
-        };
-        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
-            kind,
-            size,
-            probability,
-            is_comparable: true,
-        };
-        let sure = |kind: FindingKind, is_so: bool| {
-            let so = if is_so { 1.0 } else { 0.0 };
-            of(kind, (ScalarGaussian { mean: so, variance: 0.0 }, so))
-        };
-        let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign, true));
-        let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
-        let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0, true);
-        if !self.can_leak(index, populations) {
-            leak.0.mean = leak.0.mean.min(0.0);
-            leak.1 = 0.0;
-        }
-        let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
-        let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
-            is_comparable,
-            ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
-        };
-        vec![
-            sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
-            sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
-            if_near(FindingKind::VoltageChannel, channel),
-            of(FindingKind::Leak, leak),
-            if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0, true)),
-            if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0, true)),
-            of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0, true)),
-            if_near(FindingKind::ForeignCell, beyond(difference::CAPACITY, finding::CAPACITY, 1.0, true)),
-        ]
-    }
-
-    /// Takes a judgement into the list.
-    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) {
-        let Judged { kind, size, probability, .. } = *judged;
-        let cell = &mut self.cells[index];
-        let suspected = &mut cell.suspected[kind as usize - 1];
-        if probability < WITHDRAWN {
-            *suspected = None;
-        } else if suspected.is_none() {
-            let is_after_jump = |jumped: &Timestamp| time.since(*jumped) < DAY_S;
-            *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
-        }
-        let other = if kind == FindingKind::DoubledChannels { cell.channel.doubled() } else { None };
-        let own = CellIndex(index as u16);
-        let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
-        let since = suspected.unwrap_or(time);
-        let is_in_module = kind == FindingKind::ForeignCell && self.is_in_module(index);
-        // The upper one of two doubled channels is in the finding of the lower one.
-        if cells.0 == own && !is_in_module {
-            self.put(Finding { kind, cells: Some(cells), since, reported: time, probability, size });
-        }
-    }
-
-    fn is_in_module(&self, index: usize) -> bool {
-        let holds = |(first, last): (CellIndex, CellIndex)| (first.index()..=last.index()).contains(&index);
-        self.findings.iter().any(|found| found.kind == FindingKind::Module && found.cells.is_some_and(holds))
-    }
-
-    /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
-    fn put(&mut self, finding: Finding) {
-        let first = |found: &Finding| found.cells.map(|cells| cells.0);
-        let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
-        match self.findings.iter().position(is_same) {
-            Some(at) if finding.probability < finding.kind.withdrawn_below() => drop(self.findings.remove(at)),
-            Some(at) => {
-                let Finding { since, reported, .. } = self.findings[at];
-                let since = if finding.cells.is_some() { finding.since } else { since };
-                self.findings[at] = Finding { since, reported, ..finding };
-            }
-            None if finding.probability >= REPORTED => self.findings.push(finding),
-            None => {}
-        }
-    }
-
     /// Compares the temperatures at the cells with that in the middle of the pack.
     fn observe_temperatures(&mut self, time: Timestamp, seconds: f64) {
         let of_cells: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_c()).collect();
@@ -543,60 +399,6 @@ impl Diagnosis {
                 self.findings.push(Finding { kind, cells, since, reported, probability: 1.0, size });
             }
             first += of_one.len();
-        }
-    }
-
-    /// Joins cells side by side with more capacity than the others, found at about the same time, to a replaced module.
-    fn find_modules(&mut self, time: Timestamp) {
-        let kind = FindingKind::ForeignCell;
-        let of_cell = |found: &Finding| {
-            found.cells.filter(|(first, last)| found.kind == kind && first == last).map(|(first, _)| first.index())
-        };
-        let mut since: Vec<Option<(Timestamp, ScalarGaussian)>> = vec![None; self.cells.len()];
-        for found in &self.findings {
-            if let Some(cell) = of_cell(found) {
-                since[cell] = Some((found.since, found.size));
-            }
-        }
-        let in_module = |at: usize| {
-            let holds = |(first, last): (CellIndex, CellIndex)| (first.index()..=last.index()).contains(&at);
-            let module = |found: &&Finding| found.kind == FindingKind::Module && found.cells.is_some_and(holds);
-            self.findings.iter().find(module).map(|found| (found.since, found.size))
-        };
-        let known: Vec<Option<(Timestamp, ScalarGaussian)>> =
-            since.iter().enumerate().map(|(at, since)| since.or_else(|| in_module(at))).collect();
-        let mut first = 0;
-        while first < known.len() {
-            let Some((begun, _)) = known[first] else {
-                first += 1;
-                continue;
-            };
-            let same = |other: &&Option<(Timestamp, ScalarGaussian)>| {
-                other.is_some_and(|(it, _)| it.since(begun).abs() <= SAME_MODULE_S)
-            };
-            let group: Vec<ScalarGaussian> =
-                known[first..].iter().take_while(same).filter_map(|it| it.map(|(_, size)| size)).collect();
-            let count = group.len();
-            let cells = Some((CellIndex(first as u16), CellIndex((first + count - 1) as u16)));
-            if count >= 2 && 2 * count <= known.len() {
-                let within =
-                    |found: &Finding| of_cell(found).is_some_and(|cell| (first..first + count).contains(&cell));
-                let overlaps = |found: &Finding| {
-                    found.kind == FindingKind::Module
-                        && found.cells.is_some_and(|(a, b)| a.index() < first + count && first <= b.index())
-                };
-                let earlier = self.findings.iter().find(|found| overlaps(found)).copied();
-                let reported = earlier.filter(|it| it.cells == cells).map_or(time, |it| it.reported);
-                let n = count as f64;
-                let size = ScalarGaussian {
-                    mean: group.iter().map(|size| size.mean).sum::<f64>() / n,
-                    variance: group.iter().map(|size| size.variance).sum::<f64>() / (n * n),
-                };
-                self.findings.retain(|found| !within(found) && !overlaps(found));
-                let kind = FindingKind::Module;
-                self.findings.push(Finding { kind, cells, since: begun, reported, probability: 1.0, size });
-            }
-            first += count.max(1);
         }
     }
 
@@ -639,11 +441,11 @@ impl Diagnosis {
         InvalidState::unless(middle <= cells, "the middle cell of the diagnosis", middle as f64, "a cell of the pack")?;
         for cell in &self.cells {
             cell.difference.check()?;
+            cell.channel.check(cells)?;
             let numbers = cell
                 .sums
                 .numbers()
                 .into_iter()
-                .chain(cell.channel.numbers())
                 .chain(cell.temperature.numbers())
                 .chain(cell.settled)
                 .chain(cell.before_jump);
@@ -661,16 +463,6 @@ impl Diagnosis {
         }
         Ok(())
     }
-}
-
-/// A judgement of one kind.
-#[derive(Debug, Clone, Copy)]
-struct Judged {
-    kind: FindingKind,
-    size: ScalarGaussian,
-    probability: f64,
-    /// Whether the cell is near enough to the others for it.
-    is_comparable: bool,
 }
 
 /// What all cells of a row share.
@@ -715,31 +507,6 @@ impl Row<'_> {
     /// The same in the middle of the charge at 25 degrees C: the unit of a contact, which follows neither.
     fn contact_ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))
-    }
-}
-
-/// Probability that a standard normal value is below.
-fn normal_cdf(value: f64) -> f64 {
-    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
-}
-
-/// Middle and robust standard deviation (median of the absolute deviations) of the cells.
-struct Population {
-    middle: f64,
-    std: f64,
-}
-
-impl Population {
-    fn of(values: impl Iterator<Item = f64>) -> Self {
-        let mut values: Vec<f64> = values.collect();
-        values.sort_by(f64::total_cmp);
-        let median = |sorted: &[f64]| {
-            if sorted.is_empty() { 0.0 } else { 0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2]) }
-        };
-        let middle = median(&values);
-        let mut off: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
-        off.sort_by(f64::total_cmp);
-        Self { middle, std: 1.4826 * median(&off) }
     }
 }
 

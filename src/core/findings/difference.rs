@@ -56,6 +56,10 @@ const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
 const JUMP_ROWS: u8 = 3;
 
+/// Least variance of a state, and most of a mean or covariance: a thousand times the cell itself.
+const LEAST_VARIANCE: f64 = 1e-12;
+const MOST: f64 = 1e3;
+
 /// The filter of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -141,6 +145,7 @@ impl Difference {
         }
         let moved = MOVED_STD * soc_change;
         self.covariance[pair(SOC, SOC)] += moved * moved;
+        self.keep_possible();
     }
 
     /// The charge is not known any more.
@@ -207,6 +212,20 @@ impl Difference {
             for j in i..STATES {
                 self.covariance[pair(i, j)] -= with[i] * with[j] / total;
             }
+        }
+        self.keep_possible();
+    }
+
+    /// Rounding may leave a variance below nothing. Where a number is none that a cell can have, it was no cell's reading: the filter
+    /// begins again.
+    fn keep_possible(&mut self) {
+        for i in 0..STATES {
+            let variance = &mut self.covariance[pair(i, i)];
+            *variance = variance.max(LEAST_VARIANCE);
+        }
+        let numbers = self.mean.iter().chain(&self.covariance);
+        if !numbers.clone().all(|number| number.abs() <= MOST) {
+            *self = Self::new();
         }
     }
 
@@ -279,6 +298,23 @@ mod tests {
                 assert!(off < 3.0 * found.std() + 1e-9, "{state}: state {other} is {found:?}, not {expected}");
             }
             assert!((filter.state(state).mean / size - 1.0).abs() < 0.15, "{state}: {:?}", filter.state(state));
+        }
+    }
+
+    #[test]
+    fn what_is_no_reading_of_a_cell_leaves_a_filter_whose_state_is_accepted() {
+        let slopes = [[1e9; STATES], [0.0; STATES], [f64::NAN; STATES], [1e-30, 1.0, -1e12, 3.0, 1.0, f64::INFINITY]];
+        for (slope, innovation) in slopes.into_iter().flat_map(|slope| [1e300, -1e9, f64::NAN, 0.0].map(|v| (slope, v)))
+        {
+            let mut filter = watched([0.0; STATES], 1);
+            for _ in 0..5 {
+                let observed = Observation { innovation, slope, variance: 1e-300 };
+                if filter.observe(&observed) {
+                    filter.open(Jump::Replaced, &observed);
+                }
+                filter.pass(1e5, 1e3);
+                assert_eq!(filter.check(), Ok(()), "{innovation} by {slope:?}");
+            }
         }
     }
 

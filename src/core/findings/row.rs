@@ -39,7 +39,8 @@ impl CellSums {
         temperature_c: Option<f64>,
         ohm: f64,
     ) {
-        if self.last.is_some_and(|(before, ..)| time.nanos().wrapping_sub(before.nanos()) < LEAST_APART_NS) {
+        let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
+        if self.last.is_some_and(|(before, ..)| (0..LEAST_APART_NS).contains(&apart_ns(before))) {
             return;
         }
         self.count += 1;
@@ -50,7 +51,7 @@ impl CellSums {
         self.voltage_v += voltage_v + ohm * current_a;
         if let Some((before, last_v, last_a)) = self.last.replace((time, voltage_v, current_a)) {
             let (step_v, step_a) = (voltage_v - last_v, current_a - last_a);
-            if time.since(before) <= STEP_S {
+            if (0.0..=STEP_S).contains(&time.since(before)) {
                 self.steps_a2 += step_a * step_a;
                 self.steps_va += step_a * step_v;
             }

@@ -81,18 +81,6 @@ impl Diagnosing {
             let CellSample { cell, time, voltage_v, current_a, temperature_c, .. } = *sample;
             self.diagnosis.add(cell.index(), time, voltage_v, current_a, temperature_c);
         }
-        self.observe_mean(now, samples, estimation, learning, is_current_frozen, out)
-    }
-
-    fn observe_mean(
-        &mut self,
-        now: Timestamp,
-        samples: &[CellSample],
-        estimation: &Estimation,
-        learning: &Learning,
-        is_current_frozen: bool,
-        out: &mut Outputs,
-    ) -> bool {
         let middle = self.diagnosis.middle();
         let Some(sample) = samples.iter().find(|sample| sample.cell.index() == middle) else { return false };
         let bank = &estimation.bank;

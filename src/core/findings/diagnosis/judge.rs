@@ -1,0 +1,237 @@
+//! What a row has shown of each cell, as findings: from when on one is reported, and when it is withdrawn.
+
+use super::Diagnosis;
+use crate::filter::ScalarGaussian;
+use crate::findings::difference::{self, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
+use crate::findings::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Time within which the cells of a module are found to have more capacity than the others.
+const SAME_MODULE_S: f64 = 3.0 * DAY_S;
+/// Deviation up to which a size is known, in limits of its kind.
+const KNOWN_LIMITS: f64 = 2.0;
+
+/// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
+const TOO_FAR: f64 = 0.1;
+const DAY_S: f64 = 86_400.0;
+
+/// A judgement of one kind.
+#[derive(Debug, Clone, Copy)]
+struct Judged {
+    kind: FindingKind,
+    size: ScalarGaussian,
+    probability: f64,
+    /// Whether the cell is near enough to the others for it.
+    is_comparable: bool,
+}
+
+/// Probability that a standard normal value is below.
+fn normal_cdf(value: f64) -> f64 {
+    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
+}
+
+/// Middle and robust standard deviation (median of the absolute deviations) of the cells.
+pub(super) struct Population {
+    pub(super) middle: f64,
+    std: f64,
+}
+
+impl Population {
+    pub(super) fn of(values: impl Iterator<Item = f64>) -> Self {
+        let mut values: Vec<f64> = values.collect();
+        values.sort_by(f64::total_cmp);
+        let median = |sorted: &[f64]| {
+            if sorted.is_empty() { 0.0 } else { 0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2]) }
+        };
+        let middle = median(&values);
+        let mut off: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
+        off.sort_by(f64::total_cmp);
+        Self { middle, std: 1.4826 * median(&off) }
+    }
+}
+
+impl Diagnosis {
+    pub(super) fn population(&self, state: usize) -> Population {
+        Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
+    }
+
+    /// Judges all cells.
+    pub(super) fn judge(&mut self, time: Timestamp, is_balanced: bool) {
+        let populations = self.populations();
+        let charges = self.cells.iter().map(|cell| cell.difference.mean()[SOC]);
+        let lowest = charges.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell);
+        self.lowest = lowest.filter(|_| is_balanced);
+        for index in 0..self.cells.len() {
+            let judged = self.judged(index, &populations);
+            let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
+            for it in judged {
+                let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
+                self.take(time, index, &Judged { probability, ..it });
+            }
+        }
+        self.find_modules(time);
+    }
+
+    /// Per cell, what a kind is of, against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
+    /// too far from the others, its channel is faulty, or the value is not known well enough yet.
+    pub fn sizes(&self, kind: FindingKind) -> Vec<Option<ScalarGaussian>> {
+        let populations = self.populations();
+        (0..self.cells.len()).map(|cell| self.size(cell, kind, &populations)).collect()
+    }
+
+    fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
+        let cell = CellIndex(index as u16);
+        let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
+        let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
+        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() || is_found();
+        (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
+    }
+
+    /// Whether what is read as a cell's voltage is not that; `None` = not compared yet.
+    pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
+        let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
+        if is_found { Some(true) } else { self.last_row.map(|_| false) }
+    }
+
+    fn populations(&self) -> [Population; STATES] {
+        std::array::from_fn(|state| self.population(state))
+    }
+
+    /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
+    /// above them; where a BMS balances, all but the lowest one are. A leak that was found is still there when the others are bled.
+    fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
+        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
+        let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
+        let is_lowest = self.lowest.is_none_or(|lowest| lowest == index);
+        is_below && (is_lowest || self.findings.iter().any(is_found))
+    }
+
+    /// What one cell may have.
+    fn judged(&self, index: usize, populations: &[Population; STATES]) -> Vec<Judged> {
+        let cell = &self.cells[index];
+        let beyond = |state: usize, limit: f64, sign: f64| {
+            let own = cell.difference.state(state);
+            let population = &populations[state];
+            let size = ScalarGaussian { mean: own.mean - population.middle, variance: own.variance };
+            let probability = normal_cdf((sign * size.mean - limit) / size.std().max(1e-12));
+            let stands_out = sign * size.mean >= OUTLIER * population.std;
+            (size, if stands_out { probability } else { 0.0 })
+        };
+        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            kind,
+            size,
+            probability,
+            is_comparable: true,
+        };
+        let sure = |kind: FindingKind, is_so: bool| {
+            let so = if is_so { 1.0 } else { 0.0 };
+            of(kind, (ScalarGaussian { mean: so, variance: 0.0 }, so))
+        };
+        let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign));
+        let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
+        let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0);
+        if !self.can_leak(index, populations) {
+            leak.0.mean = leak.0.mean.min(0.0);
+            leak.1 = 0.0;
+        }
+        let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
+        let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+            is_comparable,
+            ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
+        };
+        vec![
+            sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
+            sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
+            if_near(FindingKind::VoltageChannel, channel),
+            of(FindingKind::Leak, leak),
+            if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0)),
+            if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0)),
+            of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0)),
+            if_near(FindingKind::ForeignCell, beyond(difference::CAPACITY, finding::CAPACITY, 1.0)),
+        ]
+    }
+
+    /// Takes a judgement into the list.
+    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) {
+        let Judged { kind, size, probability, .. } = *judged;
+        let cell = &mut self.cells[index];
+        let suspected = &mut cell.suspected[kind as usize - 1];
+        if probability < WITHDRAWN {
+            *suspected = None;
+        } else if suspected.is_none() {
+            let is_after_jump = |jumped: &Timestamp| time.since(*jumped) < DAY_S;
+            *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
+        }
+        let other = if kind == FindingKind::DoubledChannels { cell.channel.doubled() } else { None };
+        let own = CellIndex(index as u16);
+        let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
+        let since = suspected.unwrap_or(time);
+        let is_in_module = kind == FindingKind::ForeignCell && self.module_of(index).is_some();
+        // The upper one of two doubled channels is in the finding of the lower one.
+        if cells.0 == own && !is_in_module {
+            self.put(Finding { kind, cells: Some(cells), since, reported: time, probability, size });
+        }
+    }
+
+    /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
+    pub(super) fn put(&mut self, finding: Finding) {
+        let first = |found: &Finding| found.cells.map(|cells| cells.0);
+        let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
+        match self.findings.iter().position(is_same) {
+            Some(at) if finding.probability < finding.kind.withdrawn_below() => drop(self.findings.remove(at)),
+            Some(at) => {
+                let Finding { since, reported, .. } = self.findings[at];
+                let since = if finding.cells.is_some() { finding.since } else { since };
+                self.findings[at] = Finding { since, reported, ..finding };
+            }
+            None if finding.probability >= REPORTED => self.findings.push(finding),
+            None => {}
+        }
+    }
+
+    /// The module that a cell was found to be of.
+    fn module_of(&self, index: usize) -> Option<&Finding> {
+        let is_of = |found: &&Finding| found.kind == FindingKind::Module && found.is_of(CellIndex(index as u16));
+        self.findings.iter().find(is_of)
+    }
+
+    /// Joins cells side by side with more capacity than the others, found at about the same time, to a replaced module.
+    fn find_modules(&mut self, time: Timestamp) {
+        let foreign = |index: usize| {
+            let is_it =
+                |found: &&Finding| found.kind == FindingKind::ForeignCell && found.is_of(CellIndex(index as u16));
+            self.findings.iter().find(is_it).or_else(|| self.module_of(index)).copied()
+        };
+        let known: Vec<Option<Finding>> = (0..self.cells.len()).map(foreign).collect();
+        let is_same_event = |a: &Option<Finding>, b: &Option<Finding>| {
+            a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
+        };
+        let mut first = 0;
+        for group in known.chunk_by(is_same_event) {
+            let cells = (CellIndex(first as u16), CellIndex((first + group.len() - 1) as u16));
+            first += group.len();
+            if group.len() >= 2 && 2 * group.len() <= known.len() {
+                self.put_module(time, cells, group);
+            }
+        }
+    }
+
+    /// Puts a module in place of the findings of its cells.
+    fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<Finding>]) {
+        let found = || group.iter().flatten();
+        let (count, kind) = (group.len() as f64, FindingKind::Module);
+        let size = ScalarGaussian {
+            mean: found().map(|it| it.size.mean).sum::<f64>() / count,
+            variance: found().map(|it| it.size.variance).sum::<f64>() / (count * count),
+        };
+        let since = found().map(|it| it.since).min().unwrap_or(time);
+        let earlier = found().find(|it| it.kind == kind && it.cells == Some(cells));
+        let reported = earlier.map_or(time, |it| it.reported);
+        let is_within = |it: &Finding| {
+            matches!(it.kind, FindingKind::ForeignCell | FindingKind::Module)
+                && it.cells.is_some_and(|(a, b)| cells.0 <= b && a <= cells.1)
+        };
+        self.findings.retain(|it| !is_within(it));
+        self.findings.push(Finding { kind, cells: Some(cells), since, reported, probability: 1.0, size });
+    }
+}
