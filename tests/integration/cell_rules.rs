@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use crate::support::config_texts;
 use packwatch::alarm::{AlarmState, Change, Rule};
 use packwatch::can::encode::InputEncoder;
+use packwatch::findings::FindingKind;
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};
@@ -236,4 +237,36 @@ fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_ne
     pack.monitor.handle(Input::Command { time: pack.monitor.now(), command: Command::PackReplaced }, &mut out);
     assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Unknown);
     assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Suppressed, "until the first row of the new pack");
+}
+
+/// Kinds that were found, with their first and last cells.
+fn found(pack: &FaultyPack) -> Vec<(FindingKind, Option<(CellIndex, CellIndex)>)> {
+    pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
+}
+
+#[test]
+fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() {
+    let mut pack = FaultyPack::new("weak:3:-12% swap:3:8@day3");
+    pack.run_to(3.0);
+    assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
+    pack.run_to(6.0);
+    let swapped = (FindingKind::SwappedChannels, Some((CellIndex(2), CellIndex(7))));
+    assert!(found(&pack).contains(&swapped), "{:?}", found(&pack));
+}
+
+#[test]
+fn cells_of_a_replaced_module_are_one_finding() {
+    let mut pack = FaultyPack::new("module:5-8:+15%@day2");
+    pack.run_to(6.0);
+    assert_eq!(found(&pack), [(FindingKind::Module, Some((CellIndex(4), CellIndex(7))))]);
+}
+
+#[test]
+fn a_contact_is_no_aged_cell_and_an_aged_cell_no_contact() {
+    for (fault, kind) in [("contact:3:+40%", FindingKind::Contact), ("resistance:3:+30%", FindingKind::HighResistance)]
+    {
+        let mut pack = FaultyPack::new(fault);
+        pack.run_to(3.0);
+        assert_eq!(found(&pack), [(kind, Some((CellIndex(2), CellIndex(2))))], "{fault}");
+    }
 }
