@@ -5,11 +5,11 @@ use std::fmt::Write as _;
 use crate::support::config_texts;
 use packwatch::alarm::{AlarmState, Change, Rule};
 use packwatch::can::encode::InputEncoder;
-use packwatch::findings::FindingKind;
+use packwatch::findings::{Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};
-use packwatch::sim::{Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
+use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
 /// A hole in the record longer than this is sleep, s.
@@ -116,6 +116,19 @@ impl FaultyPack {
             ticks: Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S),
             events: Vec::new(),
         }
+    }
+
+    /// A healthy pack that a BMS balances.
+    fn balanced(seed: u64) -> Self {
+        let mut pack = Self::new("");
+        let mut settings = Settings::of(Scenario::EvDay, 2.6);
+        (settings.seed, settings.pack.cells, settings.pack.spread.soc) = (seed, CELLS, 0.005);
+        settings.sensors = Sensors::of_quality(SensorQuality::Good);
+        (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
+        settings.duration_s = None;
+        let sim = Simulation::new(pack.config.model.clone(), settings, Wiring::single());
+        pack.sim = sim.with_balancing(Balancing::usual(2.6));
+        pack
     }
 
     /// Runs up to a day, and a quarter of an hour further: a row ends, and no input is missing any more after a night.
@@ -242,6 +255,17 @@ fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_ne
 /// Kinds that were found, with their first and last cells.
 fn found(pack: &FaultyPack) -> Vec<(FindingKind, Option<(CellIndex, CellIndex)>)> {
     pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
+}
+
+#[test]
+fn cells_that_a_bms_bleeds_do_not_leak() {
+    for seed in [1, 3] {
+        let mut pack = FaultyPack::balanced(seed);
+        pack.run_to(30.0);
+        let is_leak =
+            |event: &&Event| matches!(event.kind, EventKind::Finding(Finding { kind: FindingKind::Leak, .. }));
+        assert_eq!(pack.events.iter().filter(is_leak).collect::<Vec<_>>(), Vec::<&Event>::new(), "seed {seed}");
+    }
 }
 
 #[test]

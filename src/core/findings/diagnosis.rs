@@ -96,7 +96,9 @@ pub struct Diagnosis {
     ohm: f64,
     /// The cell with the middle SOC.
     middle: usize,
-    /// The cell with the least charge, in a pack that a BMS balances.
+    /// A BMS may bleed the cells that are above the lowest one.
+    is_balanced: bool,
+    /// The cell with the least charge, where there is no doubt.
     lowest: Option<usize>,
     findings: Vec<Finding>,
 }
@@ -121,6 +123,7 @@ impl Diagnosis {
             rest_s: 0.0,
             ohm: 0.0,
             middle: 0,
+            is_balanced: false,
             lowest: None,
             findings: Vec::new(),
         }

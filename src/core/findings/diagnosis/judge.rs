@@ -11,6 +11,8 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation up to which a size is known, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
+/// Distance of two charges, in deviations, from which on one is below the other: a BMS begins to bleed at a larger one, 1 % of SOC.
+const BEYOND_DOUBT: f64 = 2.0;
 /// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
@@ -58,9 +60,8 @@ impl Diagnosis {
     /// Judges all cells.
     pub(super) fn judge(&mut self, time: Timestamp, is_balanced: bool) {
         let populations = self.populations();
-        let charges = self.cells.iter().map(|cell| cell.difference.mean()[SOC]);
-        let lowest = charges.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell);
-        self.lowest = lowest.filter(|_| is_balanced);
+        self.is_balanced = is_balanced;
+        self.lowest = self.clearly_lowest();
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
             let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
@@ -97,13 +98,22 @@ impl Diagnosis {
         std::array::from_fn(|state| self.population(state))
     }
 
+    /// The cell with less charge than any other beyond doubt; `None` = none.
+    fn clearly_lowest(&self) -> Option<usize> {
+        let mut order: Vec<(usize, ScalarGaussian)> =
+            self.cells.iter().map(|cell| cell.difference.state(SOC)).enumerate().collect();
+        order.sort_by(|a, b| a.1.mean.total_cmp(&b.1.mean));
+        let [(lowest, charge), (_, next), ..] = order[..] else { return None };
+        (next.mean - charge.mean > BEYOND_DOUBT * charge.std().hypot(next.std())).then_some(lowest)
+    }
+
     /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
-    /// above them; where a BMS balances, all but the lowest one are. A leak that was found is still there when the others are bled.
+    /// above them; where a BMS balances, all but the lowest one may be. A leak that was found is still there when the others are bled.
     fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
         let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
         let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
-        let is_lowest = self.lowest.is_none_or(|lowest| lowest == index);
-        is_below && (is_lowest || self.findings.iter().any(is_found))
+        let is_lowest = self.lowest == Some(index);
+        is_below && (!self.is_balanced || is_lowest || self.findings.iter().any(is_found))
     }
 
     /// What one cell may have.
