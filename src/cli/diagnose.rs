@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::Failure;
+use super::finding_text::{self, with_deviation};
 use super::output::{self, print_json, table};
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config;
@@ -97,7 +98,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         return output::unless_closed(print_json(&page));
     }
-    output::print(&text(&page))
+    output::print(&text(diagnosis, &page))
 }
 
 fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
@@ -149,23 +150,17 @@ fn page(diagnosis: &Diagnosis) -> Page {
     Page { version: 1, findings: diagnosis.findings().iter().map(row).collect(), cells: cells.collect() }
 }
 
-fn text(page: &Page) -> String {
+fn text(diagnosis: &Diagnosis, page: &Page) -> String {
     let mut text = String::new();
-    if page.findings.is_empty() {
+    if diagnosis.findings().is_empty() {
         text += "nothing found\n";
     }
-    for found in &page.findings {
-        let place = match (found.first_cell, found.last_cell) {
-            (Some(first), Some(last)) if first == last => format!("cell {first}"),
-            (Some(first), Some(last)) if found.kind.is_of_pair() => format!("cells {first} and {last}"),
-            (Some(first), Some(last)) => format!("cells {first} to {last}"),
-            _ => "pack".to_owned(),
-        };
-        let size = size_text(found.kind, found.size, found.size_std);
-        text += &format!("{place}: {}{size}, since {}\n    {}\n", found.what, found.since, found.advice);
+    for found in diagnosis.findings() {
+        let (what, since) = (finding_text::line(found), format_utc(found.since));
+        text += &format!("{what}, since {since}\n    {}\n", found.kind.advice());
     }
     text += "\ndifference from the middle of the pack\n";
-    let percent = |value: Value| both(100.0 * value.mean, 100.0 * value.std, 1);
+    let percent = |value: Value| with_deviation(100.0 * value.mean, 100.0 * value.std, 1);
     let rows = page.cells.iter().map(|cell| {
         vec![
             cell.cell.to_string(),
@@ -173,31 +168,10 @@ fn text(page: &Page) -> String {
             percent(cell.capacity),
             percent(cell.resistance),
             percent(cell.contact),
-            both(1e3 * cell.channel_v.mean, 1e3 * cell.channel_v.std, 1),
-            both(100.0 * cell.leak_per_day.mean, 100.0 * cell.leak_per_day.std, 2),
+            with_deviation(1e3 * cell.channel_v.mean, 1e3 * cell.channel_v.std, 1),
+            with_deviation(100.0 * cell.leak_per_day.mean, 100.0 * cell.leak_per_day.std, 2),
         ]
     });
     let heads = ["cell", "SOC, points", "capacity, %", "resistance, %", "contact, %", "channel, mV", "leak, %/day"];
     text + &table(&heads, rows, 0)
-}
-
-/// Size of a finding with its unit; empty for one that has none.
-fn size_text(kind: FindingKind, size: f64, std: f64) -> String {
-    let both = |mean: f64, std: f64, digits: usize| both(mean, std, digits).trim_start_matches('+').to_owned();
-    match kind {
-        FindingKind::Leak => format!(", {} % of its capacity a day", both(100.0 * size, 100.0 * std, 2)),
-        FindingKind::Contact => format!(", {} % of its series resistance", both(100.0 * size, 100.0 * std, 0)),
-        FindingKind::VoltageChannel => format!(", {} mV", both(1e3 * size, 1e3 * std, 0)),
-        FindingKind::CurrentOffset => {
-            format!(", {} % of the rated capacity per hour", both(100.0 * size, 100.0 * std, 2))
-        }
-        _ if std > 0.0 => format!(", {} %", both(100.0 * size, 100.0 * std, 1)),
-        _ => String::new(),
-    }
-}
-
-/// With a deviation; a zero is positive.
-fn both(mean: f64, std: f64, digits: usize) -> String {
-    let scale = 10f64.powi(i32::try_from(digits).unwrap_or(0));
-    format!("{:+.digits$} ± {std:.digits$}", (mean * scale).round() / scale + 0.0)
 }

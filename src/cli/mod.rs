@@ -17,6 +17,7 @@ mod doctor;
 #[cfg(feature = "lab")]
 mod export;
 mod exporter;
+mod finding_text;
 #[cfg(feature = "lab")]
 mod fit;
 #[cfg(feature = "lab")]

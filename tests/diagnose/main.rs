@@ -1,12 +1,12 @@
 //! Measures the diagnosis on simulated packs: healthy ones, and ones with one fault each.
 //!
-//! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--write]`
+//! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
 //! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); cells have spread. Every kind of fault is
 //! injected in packs with good, usual and poor sensors, with and without balancing, at a random cell on a random day of the first
 //! third. `--packs` are distributed over the rows, each at least one. `--quick` simulates one pack per fault with usual sensors and
 //! balancing. `--only WORD` takes the faults whose name has the word: `--only healthy --packs 3000` for the rate of false findings.
-//! `--write` writes `tests/diagnose.md`. Needs the repository's cell model and nothing else.
+//! `--list` tells each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's cell model and nothing else.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
 
 mod finding;
@@ -66,14 +66,16 @@ struct Options {
     seed: u64,
     only: String,
     is_quick: bool,
+    lists: bool,
     writes: bool,
 }
 
 impl Options {
     fn parse() -> Result<Self, String> {
         let only = String::new();
+        let (is_quick, lists, writes) = (false, false, false);
         let mut options =
-            Self { packs: 120, days: 30, period_ms: 1000, jobs: 2, seed: 1, only, is_quick: false, writes: false };
+            Self { packs: 120, days: 30, period_ms: 1000, jobs: 2, seed: 1, only, is_quick, lists, writes };
         let mut arguments = std::env::args().skip(1);
         while let Some(name) = arguments.next() {
             let mut number = || arguments.next().and_then(|text| text.parse::<u32>().ok()).filter(|n| *n > 0);
@@ -86,10 +88,11 @@ impl Options {
                 "--seed" => options.seed = u64::from(number().ok_or_else(missing)?),
                 "--only" => options.only = arguments.next().ok_or("--only: a word must follow")?,
                 "--quick" => (options.is_quick, options.packs) = (true, 1),
+                "--list" => options.lists = true,
                 "--write" => options.writes = true,
                 _ => {
                     return Err(format!(
-                        "{name}, must be --quick, --packs, --days, --period, --jobs, --seed, --only or --write"
+                        "{name}, must be --quick, --packs, --days, --period, --jobs, --seed, --only, --list or --write"
                     ));
                 }
             }
@@ -107,7 +110,7 @@ fn main() -> Result<(), String> {
     }
     let cases = cases(&options)?;
     let started = Instant::now();
-    let scores = run_all(&cases, &configs, options.jobs);
+    let scores = run_all(&cases, &configs, &options);
     let wall_s = started.elapsed().as_secs_f64();
     let text = table(&scores, &options);
     print!("{text}");
@@ -176,13 +179,16 @@ fn fault_of(text: &str, size: PackSize, seed: u64, days: u32) -> Result<Option<F
     format!("{text}@{hours}h").parse().map(Some).map_err(|error| format!("{text}: {error}"))
 }
 
-fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], jobs: usize) -> BTreeMap<Row, Score> {
+fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) -> BTreeMap<Row, Score> {
     let (next, scores) = (AtomicUsize::new(0), Mutex::new(BTreeMap::<Row, Score>::new()));
     std::thread::scope(|scope| {
-        for _ in 0..jobs {
+        for _ in 0..options.jobs {
             scope.spawn(|| {
                 while let Some((row, case)) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
                     let seen = case.run(&configs[FAULTS[row.0].1]);
+                    if options.lists {
+                        list(*row, case, &seen);
+                    }
                     if let Ok(mut scores) = scores.lock() {
                         scores.entry(*row).or_default().add(case, &seen);
                     }
@@ -191,6 +197,20 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], jobs: usize) -> BTr
         }
     });
     scores.into_inner().unwrap_or_default()
+}
+
+/// Tells the findings that are not the fault's.
+fn list((f, q, is_balancing): Row, case: &Case, seen: &pack::Seen) {
+    let (from_s, kind) =
+        case.fault.map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
+    for (at_s, found) in seen.iter().filter(|(at_s, found)| *at_s < from_s || Some(found.kind) != kind) {
+        let (name, size, quality) = (FAULTS[f].0, SIZES[FAULTS[f].1].cells, QUALITIES[q].0);
+        let (day, fault_day) = (at_s / 86_400.0, from_s / 86_400.0);
+        eprintln!(
+            "{name} (day {fault_day:.2}), {size} cells, {quality}, balancing {is_balancing}, seed {}, day {day:.2}: {found:?}",
+            case.seed
+        );
+    }
 }
 
 fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {

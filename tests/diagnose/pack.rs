@@ -6,11 +6,14 @@ use std::path::Path;
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
+use packwatch::findings::finding::{CHANNEL_V, OFFSET_PER_H};
 use packwatch::findings::{Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};
 use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
+
+use crate::finding::kind_of;
 
 /// A hole in the record longer than this is sleep, s.
 const SLEEP_GAP_S: f64 = 30.0;
@@ -154,7 +157,7 @@ impl Case {
         if self.is_balancing { sim.with_balancing(Balancing::usual(self.size.capacity_ah)) } else { sim }
     }
 
-    /// Runs the pack; the findings in the order in which they were there first.
+    /// Runs the pack; the findings in the order in which they were there first, without those that are true of the sensors' own errors.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Seen {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
@@ -180,8 +183,24 @@ impl Case {
                 seen.note(moment.time.secs(), monitor.findings());
             }
         }
+        let asked = self.fault.and_then(|fault| kind_of(&fault.kind));
+        let (offset_a, offsets_v) = sim.sensor_offsets();
+        let is_true = |found: &Finding| match (found.kind, found.cells) {
+            (FindingKind::CurrentOffset, _) => offset_a.abs() >= OFFSET_PER_H * self.size.capacity_ah,
+            (FindingKind::VoltageChannel, Some((cell, _))) => {
+                (offsets_v[cell.index()] - median(&offsets_v)).abs() >= CHANNEL_V
+            }
+            _ => false,
+        };
+        seen.first.retain(|(_, found)| Some(found.kind) == asked || !is_true(found));
         seen.first
     }
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2])
 }
 
 /// Collects the first time of each finding.

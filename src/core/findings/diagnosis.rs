@@ -48,6 +48,8 @@ const SOC_JUMP: f64 = 0.02;
 const SAME_EVENT_S: f64 = 1800.0;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
+/// SOC at which a BMS bleeds: near the end of a charge.
+const BLED_SOC: f64 = 0.9;
 const DAY_S: f64 = 86_400.0;
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -98,7 +100,7 @@ pub struct Diagnosis {
     middle: usize,
     /// A BMS may bleed the cells that are above the lowest one.
     is_balanced: bool,
-    /// The cell with the least charge, where there is no doubt.
+    /// The cell that shows the least charge, where there is no doubt.
     lowest: Option<usize>,
     findings: Vec<Finding>,
 }
@@ -206,14 +208,27 @@ impl Diagnosis {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `sensors`: how probable a fault is of the
-    /// sensors that all cells share, by those who know. `is_balanced`: fuller cells may be bled after a charge. Returns the findings that are new.
+    /// Takes how probable a fault is of a sensor that all cells share, by those who know; whether that is a new finding.
+    pub fn note_sensor(
+        &mut self,
+        time: Timestamp,
+        kind: FindingKind,
+        probability: f64,
+        size: ScalarGaussian,
+    ) -> Option<Finding> {
+        let find = |findings: &[Finding]| findings.iter().copied().find(|found| found.kind == kind);
+        let was_known = find(&self.findings).is_some();
+        self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
+        find(&self.findings).filter(|_| !was_known)
+    }
+
+    /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
+    /// after a charge. Returns the findings that are new.
     pub fn close_row(
         &mut self,
         model: &CellModel,
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
-        sensors: &[(FindingKind, f64, ScalarGaussian)],
         is_balanced: bool,
     ) -> Vec<Finding> {
         let pack = std::mem::take(&mut self.pack);
@@ -236,12 +251,9 @@ impl Diagnosis {
         let before = self.findings.clone();
         if self.observe(time, &row) {
             self.observe_temperatures(time, seconds);
-            self.judge(time, is_balanced);
+            let slope_v = || model.ocv_slope_v(&model.grid_position(BLED_SOC, row.temperature_c), capacity_ah);
+            self.judge(time, is_balanced.then(slope_v));
         }
-        for &(kind, probability, size) in sensors {
-            self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
-        }
-        self.findings.sort_by_key(|found| (found.cells, found.kind));
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
         self.ohm = model.r0_ohm(&model.grid_position(soc, row.temperature_c));
         self.choose_middle(socs);
@@ -273,8 +285,8 @@ impl Diagnosis {
         self.cells.iter_mut().zip(channels).for_each(|(cell, channel)| cell.channel = channel);
         let mut jumped: Vec<(usize, Observation)> = Vec::new();
         for (index, voltage_v) in voltages_v.iter().enumerate() {
-            let Some(voltage_v) = voltage_v else { continue };
             let cell = &mut self.cells[index];
+            let Some(voltage_v) = voltage_v.filter(|_| !cell.channel.is_frozen) else { continue };
             let observed = row.observation(cell.difference.mean(), voltage_v - middle_v);
             if cell.difference.is_settled() {
                 cell.settled = *cell.difference.mean();
@@ -360,7 +372,7 @@ impl Diagnosis {
         } else {
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
             let kind = FindingKind::SwappedChannels;
-            self.findings.push(Finding { kind, cells, since: time, reported: time, probability: 1.0, size });
+            self.insert(Finding { kind, cells, since: time, reported: time, probability: 1.0, size });
         }
         for cell in [a, b] {
             self.cells[cell].jumped = None;
@@ -369,10 +381,12 @@ impl Diagnosis {
     }
 
     fn choose_middle(&mut self, socs: impl Fn(usize) -> Option<f64>) {
-        let mut order: Vec<(f64, usize)> = (0..self.cells.len()).filter_map(|cell| Some((socs(cell)?, cell))).collect();
-        order.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        if let Some((_, cell)) = order.get(order.len() / 2) {
-            self.middle = *cell;
+        let of_cells: Vec<Option<f64>> = (0..self.cells.len()).map(socs).collect();
+        let middle = Population::of(of_cells.iter().flatten().copied()).middle;
+        let off = |soc: &Option<f64>| soc.map_or(f64::INFINITY, |soc| (soc - middle).abs());
+        let nearest = of_cells.iter().enumerate().min_by(|a, b| off(a.1).total_cmp(&off(b.1)));
+        if let Some((cell, Some(_))) = nearest {
+            self.middle = cell;
         }
     }
 
@@ -392,16 +406,19 @@ impl Diagnosis {
         let reported: Vec<Finding> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
         self.findings.retain(|found| found.kind != kind);
         let mut first = 0;
+        let mut detached: Vec<(CellIndex, CellIndex)> = Vec::new();
         for of_one in self.cells.chunk_by(|a, b| a.temperature == b.temperature) {
             if of_one[0].temperature.is_detached {
-                let cells = Some((CellIndex(first as u16), CellIndex((first + of_one.len() - 1) as u16)));
-                let before = reported.iter().find(|found| found.cells == cells);
-                let since = before.map_or(time, |found| found.since);
-                let reported = before.map_or(time, |found| found.reported);
-                let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-                self.findings.push(Finding { kind, cells, since, reported, probability: 1.0, size });
+                detached.push((CellIndex(first as u16), CellIndex((first + of_one.len() - 1) as u16)));
             }
             first += of_one.len();
+        }
+        for cells in detached.into_iter().map(Some) {
+            let before = reported.iter().find(|found| found.cells == cells);
+            let since = before.map_or(time, |found| found.since);
+            let reported = before.map_or(time, |found| found.reported);
+            let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
+            self.insert(Finding { kind, cells, since, reported, probability: 1.0, size });
         }
     }
 

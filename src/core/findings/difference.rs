@@ -156,6 +156,24 @@ impl Difference {
         self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
     }
 
+    /// What is lost from now on need not be a leak: nothing is known of that.
+    pub(super) fn forget_leak(&mut self) {
+        self.mean[LEAK] = 0.0;
+        for j in 0..STATES {
+            self.covariance[pair(LEAK, j)] = 0.0;
+        }
+        self.covariance[pair(LEAK, LEAK)] = FIRST_STD[LEAK] * FIRST_STD[LEAK];
+    }
+
+    /// What its channel shows at rest beside the middle's, V, where the open-circuit curve has this slope, V.
+    pub(super) fn reading_v(&self, slope_v: f64) -> ScalarGaussian {
+        let mean = slope_v * self.mean[SOC] + self.mean[CHANNEL];
+        let variance = slope_v * slope_v * self.covariance[pair(SOC, SOC)]
+            + 2.0 * slope_v * self.covariance[pair(SOC, CHANNEL)]
+            + self.covariance[pair(CHANNEL, CHANNEL)];
+        ScalarGaussian { mean, variance: variance.max(0.0) }
+    }
+
     /// Innovation in its own standard deviations.
     pub(super) fn deviations(&self, observed: &Observation) -> f64 {
         observed.innovation / self.by_slope(observed).1.sqrt()

@@ -189,6 +189,9 @@ pub const RESISTANCE: f64 = 0.1;
 /// See [`CONTACT`].
 pub const CHANNEL_V: f64 = 0.015;
 
+/// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
+pub const OFFSET_PER_H: f64 = 0.01;
+
 /// Probability from which on a finding is reported, and below which it is withdrawn.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;

@@ -11,12 +11,10 @@ use super::stages::Stages;
 use super::{Event, EventKind, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::filter::ScalarGaussian;
+use crate::findings::finding::OFFSET_PER_H;
 use crate::findings::{Diagnosis, FindingKind, MeanCell};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
-
-/// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
-const OFFSET_PER_H: f64 = 0.01;
 
 /// The diagnosis stage.
 #[derive(Debug)]
@@ -63,6 +61,16 @@ impl Diagnosing {
         (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
     }
 
+    /// Takes whether the reading of the current is frozen. No row ends without a current: the finding does not wait for one.
+    pub(super) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
+        let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == FindingKind::CurrentFrozen);
+        if self.diagnosis.is_active() && is_frozen != is_found() {
+            let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
+            let new = self.diagnosis.note_sensor(now, FindingKind::CurrentFrozen, f64::from(u8::from(is_frozen)), size);
+            out.events.extend(new.map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+        }
+    }
+
     /// Takes samples that have made their step; whether a row ended.
     #[inline]
     pub(super) fn observe(
@@ -71,7 +79,6 @@ impl Diagnosing {
         samples: &[CellSample],
         estimation: &Estimation,
         learning: &Learning,
-        is_current_frozen: bool,
         out: &mut Outputs,
     ) -> bool {
         if !self.diagnosis.is_active() {
@@ -98,8 +105,9 @@ impl Diagnosing {
         let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
         if is_complete {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
-            let sensors = shared_sensors(is_current_frozen, learning, model.rated_capacity_ah);
-            let reported = self.diagnosis.close_row(model, capacity_ah, socs, &sensors, self.is_balanced);
+            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced);
+            let (probability, size) = current_offset(learning, model.rated_capacity_ah);
+            reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
             out.events
                 .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
@@ -113,8 +121,8 @@ impl Stages {
     pub(super) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.diagnosing.diagnosis;
-        let [leaks, contacts] = [FindingKind::Leak, FindingKind::Contact].map(|kind| diagnosis.sizes(kind));
-        for (cell, (leak, contact)) in (0..).map(CellIndex).zip(leaks.into_iter().zip(contacts)) {
+        let sizes = diagnosis.sizes([FindingKind::Leak, FindingKind::Contact]);
+        for (cell, [leak, contact]) in (0..).map(CellIndex).zip(sizes) {
             if is_new && !self.sampling.inputs_valid(cell, now) {
                 continue;
             }
@@ -139,19 +147,11 @@ impl Stages {
     }
 }
 
-/// How probable a fault is of the sensors that all cells share: what the other stages know of them.
-fn shared_sensors(
-    is_current_frozen: bool,
-    learning: &Learning,
-    rated_ah: f64,
-) -> [(FindingKind, f64, ScalarGaussian); 2] {
-    let frozen = ScalarGaussian { mean: 1.0, variance: 0.0 };
+/// How probable it is that the current's sensor is off, and by how much, by the learned offset; part of the rated capacity per hour.
+fn current_offset(learning: &Learning, rated_ah: f64) -> (f64, ScalarGaussian) {
     let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
     let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });
     let size = ScalarGaussian { mean: offset.mean / rated_ah, variance: offset.variance / (rated_ah * rated_ah) };
     let beyond = (size.mean.abs() - OFFSET_PER_H) / (size.std() * std::f64::consts::SQRT_2).max(1e-12);
-    [
-        (FindingKind::CurrentFrozen, f64::from(u8::from(is_current_frozen)), frozen),
-        (FindingKind::CurrentOffset, 0.5 * libm::erfc(-beyond), size),
-    ]
+    (0.5 * libm::erfc(-beyond), size)
 }

@@ -194,8 +194,7 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
-        let is_frozen = self.sampling.sampler.is_current_frozen();
-        let has_row_ended = self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, is_frozen, out);
+        let has_row_ended = self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
         if has_row_ended {
             self.publish_diagnosis(now, true, out);
@@ -381,8 +380,9 @@ impl Stages {
             self.forget_pack_state();
         }
         // A current that is not the cells', or not alone on the bus, moves their estimates.
-        self.estimation.is_current_doubtful =
-            self.sampling.has_second_sender || self.sampling.sampler.is_current_frozen();
+        let is_current_frozen = self.sampling.sampler.is_current_frozen();
+        self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen;
+        self.diagnosing.watch_current(now, is_current_frozen, out);
         if is_judged {
             self.watch(now, out);
         }

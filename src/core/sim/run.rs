@@ -162,6 +162,11 @@ impl Simulation {
         &self.readings
     }
 
+    /// Constant errors of the sensors, faults apart: of the current, A, and of a cell's voltage, V.
+    pub fn sensor_offsets(&self) -> (f64, Vec<f64>) {
+        (self.sensors.current.offset(), self.sensors.voltages.iter().map(Sensor::offset).collect())
+    }
+
     /// The true pack.
     pub fn pack(&self) -> &Pack {
         &self.pack

@@ -26,7 +26,7 @@ const LONGEST_SUMMARY_S: f64 = 3600.0;
 
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
 pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
-    serde_json::to_writer(&mut *out, event)?;
+    out.write_all(&serde_json::to_vec(event)?)?;
     out.write_all(b"\n")
 }
 

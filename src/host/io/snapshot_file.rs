@@ -12,7 +12,7 @@ use crate::monitor::Snapshot;
 /// Disk full and the like; the message names the file.
 pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
-    serde_json::to_writer(&mut file, snapshot)?;
+    file.write_all(&serde_json::to_vec(snapshot)?)?;
     file.write_all(b"\n")?;
     file.finish()
 }

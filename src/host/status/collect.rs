@@ -146,6 +146,7 @@ impl Sources<'_> {
             floods: self.floods(),
             intruders: self.intruders(),
             current_frozen: self.monitor.is_current_frozen(),
+            findings: self.monitor.findings().to_vec(),
             latency: self.latency.clone(),
             store: self.store,
             events: Vec::new(),

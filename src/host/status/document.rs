@@ -19,6 +19,7 @@ use crate::can::poll::PollSilence;
 use crate::cell::Chemistry;
 use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
+use crate::findings::Finding;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, ModelState, Statistics, Validity};
 use crate::quantity::{Mode, Timestamp};
@@ -83,6 +84,9 @@ pub struct StatusDocument {
     /// The current's reading is frozen: the voltages show another load.
     #[serde(default)]
     pub current_frozen: bool,
+    /// What is found of single cells and of the sensors, as `--events` writes it.
+    #[serde(default)]
+    pub findings: Vec<Finding>,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
     pub latency: Latency,
     /// The store of state and history; `None` = it is off.

@@ -1,8 +1,7 @@
 //! The stored state: the core's snapshot with its moment. JSON in the runtime folder, packed in the database.
 
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
 use std::path::Path;
+use std::{fs, io};
 
 use serde::{Deserialize, Serialize};
 
@@ -32,10 +31,7 @@ impl StateDocument {
     /// Writes it to a temporary name and renames it. Does not sync: the file lies in memory.
     pub(super) fn write(&self, path: &Path) -> io::Result<()> {
         let part = path.with_extension("json.part");
-        let mut file = BufWriter::new(File::create(&part)?);
-        serde_json::to_writer(&mut file, self)?;
-        file.flush()?;
-        drop(file);
+        fs::write(&part, serde_json::to_vec(self)?)?;
         fs::rename(&part, path)
     }
 }

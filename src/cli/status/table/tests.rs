@@ -8,6 +8,7 @@ fn a_short_pack_is_listed_whole_and_what_is_unknown_is_a_dash() {
     let text = table(&sample(3), false);
     let wanted = "\
 packwatch 1.2.3, process 4711, up 3 h 12 min, 2027-01-15T08:00:00Z, configuration pack.toml (01234567)
+found      cell 1: loses charge by itself, 0.15 ± 0.01 % of its capacity a day, for 2 d 7 h
 pack       valid: SOC 63.2 % (95 %: 60.8 to 65.6 %), discharge, 10.95 V, 12.50 A, at most 31.2 °C
 health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
 reference charger 5432 ± 61 s

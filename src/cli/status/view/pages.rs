@@ -12,8 +12,9 @@ use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
 use crate::cli::alarm_groups::{AlarmGroup, grouped};
+use crate::cli::finding_text;
 use crate::cli::status::table::alarm_line;
-use crate::cli::status::{number, shown, with_std, word};
+use crate::cli::status::{duration, number, shown, with_std, word};
 use crate::quantity::Timestamp;
 use crate::status::document::StatusDocument;
 
@@ -203,6 +204,10 @@ fn alarms(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
         let (rule, severity) = (unknown.rule.name(), unknown.severity.name());
         Line::from(format!("cannot be evaluated: {severity} {rule}, {} of its alarms", unknown.alarms))
     }));
+    for found in &document.findings {
+        text.push(Line::from(finding_text::line(found)));
+        text.push(Line::from(format!("    found, for {}", duration(document.time.since(found.since)))));
+    }
     text
 }
 

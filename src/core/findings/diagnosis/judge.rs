@@ -11,7 +11,7 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation up to which a size is known, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// Distance of two charges, in deviations, from which on one is below the other: a BMS begins to bleed at a larger one, 1 % of SOC.
+/// Distance of two readings, in deviations, from which on one is below the other.
 const BEYOND_DOUBT: f64 = 2.0;
 /// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
 const TOO_FAR: f64 = 0.1;
@@ -46,9 +46,9 @@ impl Population {
             if sorted.is_empty() { 0.0 } else { 0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2]) }
         };
         let middle = median(&values);
-        let mut off: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
-        off.sort_by(f64::total_cmp);
-        Self { middle, std: 1.4826 * median(&off) }
+        values.iter_mut().for_each(|value| *value = (*value - middle).abs());
+        values.sort_by(f64::total_cmp);
+        Self { middle, std: 1.4826 * median(&values) }
     }
 }
 
@@ -57,27 +57,34 @@ impl Diagnosis {
         Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
     }
 
-    /// Judges all cells.
-    pub(super) fn judge(&mut self, time: Timestamp, is_balanced: bool) {
+    /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve where a BMS bleeds, V; `None` = it does not.
+    pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         let populations = self.populations();
-        self.is_balanced = is_balanced;
-        self.lowest = self.clearly_lowest();
+        self.is_balanced = bled_slope_v.is_some();
+        self.lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
-            let has_channel_fault = judged.iter().any(|it| it.kind.is_of_channel() && it.probability >= REPORTED);
+            // The first channel fault, if any, in the order of `judged`: nothing else is known then.
+            let fault =
+                judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
-                let probability = if has_channel_fault && !it.kind.is_of_channel() { 0.0 } else { it.probability };
+                let probability = if fault.is_some_and(|fault| fault != it.kind) { 0.0 } else { it.probability };
                 self.take(time, index, &Judged { probability, ..it });
             }
         }
         self.find_modules(time);
+        for index in 0..self.cells.len() {
+            if self.may_be_bled(index) {
+                self.cells[index].difference.forget_leak();
+            }
+        }
     }
 
-    /// Per cell, what a kind is of, against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
+    /// Per cell and kind, its size against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
     /// too far from the others, its channel is faulty, or the value is not known well enough yet.
-    pub fn sizes(&self, kind: FindingKind) -> Vec<Option<ScalarGaussian>> {
+    pub fn sizes<const N: usize>(&self, kinds: [FindingKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
-        (0..self.cells.len()).map(|cell| self.size(cell, kind, &populations)).collect()
+        (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
     }
 
     fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
@@ -98,26 +105,38 @@ impl Diagnosis {
         std::array::from_fn(|state| self.population(state))
     }
 
-    /// The cell with less charge than any other beyond doubt; `None` = none.
-    fn clearly_lowest(&self) -> Option<usize> {
-        let mut order: Vec<(usize, ScalarGaussian)> =
-            self.cells.iter().map(|cell| cell.difference.state(SOC)).enumerate().collect();
-        order.sort_by(|a, b| a.1.mean.total_cmp(&b.1.mean));
-        let [(lowest, charge), (_, next), ..] = order[..] else { return None };
-        (next.mean - charge.mean > BEYOND_DOUBT * charge.std().hypot(next.std())).then_some(lowest)
+    /// The cell whose channel shows less than any other beyond doubt where a BMS bleeds; `None` = none. It is the one cell that
+    /// no BMS bleeds: a BMS goes by the readings, whatever their errors. It stays the one until another shows less.
+    fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
+        let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
+        for (index, shown) in self.cells.iter().map(|cell| cell.difference.reading_v(slope_v)).enumerate() {
+            if lowest.is_none_or(|(_, least)| shown.mean < least.mean) {
+                next = lowest.replace((index, shown)).map(|(_, shown)| shown);
+            } else if next.is_none_or(|next| shown.mean < next.mean) {
+                next = Some(shown);
+            }
+        }
+        let ((lowest, shown), next) = lowest.zip(next)?;
+        if self.lowest == Some(lowest) {
+            return self.lowest;
+        }
+        (next.mean - shown.mean > BEYOND_DOUBT * shown.std().hypot(next.std())).then_some(lowest)
     }
 
     /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
     /// above them; where a BMS balances, all but the lowest one may be. A leak that was found is still there when the others are bled.
     fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
-        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
         let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
-        let is_lowest = self.lowest == Some(index);
-        is_below && (!self.is_balanced || is_lowest || self.findings.iter().any(is_found))
+        is_below && !self.may_be_bled(index)
+    }
+
+    fn may_be_bled(&self, index: usize) -> bool {
+        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
+        self.is_balanced && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
 
     /// What one cell may have.
-    fn judged(&self, index: usize, populations: &[Population; STATES]) -> Vec<Judged> {
+    fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judged; 8] {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64| {
             let own = cell.difference.state(state);
@@ -144,12 +163,14 @@ impl Diagnosis {
             leak.0.mean = leak.0.mean.min(0.0);
             leak.1 = 0.0;
         }
+        // An offset without loss of charge: with a leak the cell's own charge explains the voltage.
+        let channel = (channel.0, if leak.1 >= WITHDRAWN { 0.0 } else { channel.1 });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
         let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
-        vec![
+        [
             sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
             sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
             if_near(FindingKind::VoltageChannel, channel),
@@ -188,15 +209,22 @@ impl Diagnosis {
         let first = |found: &Finding| found.cells.map(|cells| cells.0);
         let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
         match self.findings.iter().position(is_same) {
-            Some(at) if finding.probability < finding.kind.withdrawn_below() => drop(self.findings.remove(at)),
             Some(at) => {
-                let Finding { since, reported, .. } = self.findings[at];
-                let since = if finding.cells.is_some() { finding.since } else { since };
-                self.findings[at] = Finding { since, reported, ..finding };
+                let Finding { since, reported, .. } = self.findings.remove(at);
+                if finding.probability >= finding.kind.withdrawn_below() {
+                    let since = if finding.cells.is_some() { finding.since } else { since };
+                    self.insert(Finding { since, reported, ..finding });
+                }
             }
-            None if finding.probability >= REPORTED => self.findings.push(finding),
+            None if finding.probability >= REPORTED => self.insert(finding),
             None => {}
         }
+    }
+
+    /// Puts a new finding into the list, in the order of the cells.
+    pub(super) fn insert(&mut self, finding: Finding) {
+        let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
+        self.findings.insert(at, finding);
     }
 
     /// The module that a cell was found to be of.
@@ -242,6 +270,6 @@ impl Diagnosis {
                 && it.cells.is_some_and(|(a, b)| cells.0 <= b && a <= cells.1)
         };
         self.findings.retain(|it| !is_within(it));
-        self.findings.push(Finding { kind, cells: Some(cells), since, reported, probability: 1.0, size });
+        self.insert(Finding { kind, cells: Some(cells), since, reported, probability: 1.0, size });
     }
 }

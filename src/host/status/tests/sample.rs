@@ -5,6 +5,8 @@ use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
+use crate::filter::ScalarGaussian;
+use crate::findings::{Finding, FindingKind};
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, ModelState, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};
@@ -80,6 +82,14 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
         intruders: Vec::new(),
         current_frozen: false,
+        findings: vec![Finding {
+            kind: FindingKind::Leak,
+            cells: Some((CellIndex(0), CellIndex(0))),
+            since: Timestamp::from_secs(1_799_800_000.0),
+            reported: Timestamp::from_secs(1_799_900_000.0),
+            probability: 0.9995,
+            size: ScalarGaussian { mean: 0.0015, variance: 1e-8 },
+        }],
         floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
         latency,
         store: Some(StoreStatus {
