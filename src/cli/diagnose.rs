@@ -7,14 +7,14 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::Failure;
-use super::finding_text::{self, with_deviation};
-use super::output::{self, print_json, table};
+use super::output::{self, create_folder, failure, print_json, table};
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config;
 use crate::findings::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
 use crate::findings::{Diagnosis, Finding, FindingKind};
 use crate::io::log::LogSource;
 use crate::io::stamp::format_utc;
+use crate::lab::{self, chart};
 use crate::monitor::{Monitor, Snapshot};
 use crate::quantity::CellIndex;
 use crate::replay::{self, ReplaySettings, Sinks};
@@ -34,6 +34,9 @@ pub(crate) struct Args {
     state: Option<PathBuf>,
     #[command(flatten)]
     input: InputArgs,
+    /// Write a picture of every difference as SVG and PNG into this folder
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -94,6 +97,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
                                  earlier program",
         ));
     };
+    if let Some(folder) = &args.plots {
+        create_folder(folder)?;
+        chart::write_all(folder, &lab::finding_pictures::all(diagnosis)).map_err(failure)?;
+    }
     let page = page(diagnosis);
     if args.json {
         return output::unless_closed(print_json(&page));
@@ -156,8 +163,7 @@ fn text(diagnosis: &Diagnosis, page: &Page) -> String {
         text += "nothing found\n";
     }
     for found in diagnosis.findings() {
-        let (what, since) = (finding_text::line(found), format_utc(found.since));
-        text += &format!("{what}, since {since}\n    {}\n", found.kind.advice());
+        text += &format!("{found}, since {}\n    {}\n", format_utc(found.since), found.kind.advice());
     }
     text += "\ndifference from the middle of the pack\n";
     let percent = |value: Value| with_deviation(100.0 * value.mean, 100.0 * value.std, 1);
@@ -174,4 +180,10 @@ fn text(diagnosis: &Diagnosis, page: &Page) -> String {
     });
     let heads = ["cell", "SOC, points", "capacity, %", "resistance, %", "contact, %", "channel, mV", "leak, %/day"];
     text + &table(&heads, rows, 0)
+}
+
+/// With its sign and deviation; a zero is positive.
+fn with_deviation(mean: f64, std: f64, digits: usize) -> String {
+    let scale = 10f64.powi(i32::try_from(digits).unwrap_or(0));
+    format!("{:+.digits$} ± {std:.digits$}", (mean * scale).round() / scale + 0.0)
 }

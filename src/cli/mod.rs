@@ -17,7 +17,6 @@ mod doctor;
 #[cfg(feature = "lab")]
 mod export;
 mod exporter;
-mod finding_text;
 #[cfg(feature = "lab")]
 mod fit;
 #[cfg(feature = "lab")]

@@ -70,6 +70,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         config: config.as_ref(),
         model: cell_model(snapshot.as_ref(), config.as_ref())?,
         config_text: config_text?,
+        diagnosis: snapshot.as_ref().and_then(Snapshot::diagnosis),
         reference: reference.unwrap_or_default(),
         provenance,
     };

@@ -9,6 +9,7 @@ pub mod chart;
 pub mod discover;
 pub mod error;
 mod fields;
+pub mod finding_pictures;
 pub mod fit;
 pub mod fleet;
 pub mod gpr;

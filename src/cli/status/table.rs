@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::cli::alarm_groups::{AlarmGroup, grouped};
 use crate::cli::alarms::with_unit;
-use crate::cli::{finding_text, output};
+use crate::cli::output;
 use crate::io::stamp;
 use crate::monitor::ModelState;
 use crate::status::counters::LATENCY_BOUNDS_S;
@@ -64,8 +64,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
         let _ = writeln!(text, "current    frozen: its reading does not change, and the voltages show another load");
     }
     for found in &document.findings {
-        let (what, age) = (finding_text::line(found), duration(document.time.since(found.since)));
-        let _ = writeln!(text, "found      {what}, for {age}");
+        let _ = writeln!(text, "found      {found}, for {}", duration(document.time.since(found.since)));
     }
     let band = match (pack.soc_low, pack.soc_high) {
         (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),

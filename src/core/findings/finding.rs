@@ -1,5 +1,7 @@
 //! What is found, and from when on it is reported.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use crate::filter::ScalarGaussian;
@@ -175,6 +177,30 @@ impl Finding {
     pub fn is_of(&self, cell: CellIndex) -> bool {
         let Some((first, last)) = self.cells else { return false };
         if self.kind.is_of_pair() { first == cell || last == cell } else { (first..=last).contains(&cell) }
+    }
+}
+
+/// In words, cells counted from 1: `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`. The deviation is one standard
+/// deviation.
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let number = |cell: CellIndex| cell.0 + 1;
+        match self.cells.map(|(first, last)| (number(first), number(last))) {
+            Some((first, last)) if first == last => write!(f, "cell {first}")?,
+            Some((first, last)) if self.kind.is_of_pair() => write!(f, "cells {first} and {last}")?,
+            Some((first, last)) => write!(f, "cells {first} to {last}")?,
+            None => f.write_str("pack")?,
+        }
+        write!(f, ": {}", self.kind.words())?;
+        let (scale, digits, unit) = match self.kind {
+            FindingKind::Leak => (100.0, 2, "% of its capacity a day"),
+            FindingKind::Contact => (100.0, 0, "% of its series resistance"),
+            FindingKind::VoltageChannel => (1e3, 0, "mV"),
+            FindingKind::CurrentOffset => (100.0, 2, "% of the rated capacity per hour"),
+            _ if self.size.variance > 0.0 => (100.0, 1, "%"),
+            _ => return Ok(()),
+        };
+        write!(f, ", {:.digits$} ± {:.digits$} {unit}", scale * self.size.mean, scale * self.size.std())
     }
 }
 

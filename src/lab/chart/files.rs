@@ -39,6 +39,18 @@ pub fn write(path: &Path, picture: &Picture, format: Format) -> Result<(), PlotE
     write_stack(path, std::slice::from_ref(picture), format)
 }
 
+/// Writes each picture under its name into a folder, as SVG and PNG.
+///
+/// # Errors
+/// A file cannot be written, or there is no font for the words of a PNG.
+pub fn write_all(folder: &Path, pictures: &[(String, Picture)]) -> Result<(), PlotError> {
+    for (name, picture) in pictures {
+        write(&folder.join(format!("{name}.svg")), picture, Format::Svg)?;
+        write(&folder.join(format!("{name}.png")), picture, Format::Png)?;
+    }
+    Ok(())
+}
+
 /// Writes pictures one below the other.
 ///
 /// # Errors

@@ -3,6 +3,7 @@
 use super::reference::Reference;
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
+use crate::findings::Diagnosis;
 
 /// Content of a page in addition to the data.
 #[derive(Debug, Default)]
@@ -15,6 +16,8 @@ pub struct PageContext<'a> {
     pub config_text: Option<String>,
     /// The cells' model, as it was at the end of the data; `None` = not known.
     pub model: Option<SourcedModel>,
+    /// What is found of single cells; `None` = they were not compared.
+    pub diagnosis: Option<&'a Diagnosis>,
     /// Measured or true values.
     pub reference: Reference,
     /// Lines of the provenance: name and value.

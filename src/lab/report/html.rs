@@ -8,6 +8,8 @@ use super::pictures::{self, NOT_STORED};
 use super::{forecast, model, raised, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
+use crate::finding_pictures;
+use crate::io::stamp::format_utc;
 
 /// Most rows of a table; the pictures and `packwatch history` show all.
 const MAX_ROWS: usize = 200;
@@ -27,7 +29,7 @@ struct Section {
     none: fn(&Data) -> &'static str,
 }
 
-const SECTIONS: [Section; 8] = [
+const SECTIONS: [Section; 9] = [
     Section {
         id: "soc",
         title: "State of charge",
@@ -77,6 +79,20 @@ const SECTIONS: [Section; 8] = [
         },
     },
     Section {
+        id: "findings",
+        title: "Which cell is failing",
+        pictures: &finding_pictures::NAMES,
+        note: "Every cell beside the middle of its pack: all carry the same current, so what is common to them cancels. A cell whose \
+               bar lies beyond the line is reported when it also stands out from the others.",
+        none: |data| {
+            if data.cells() < 3 {
+                "fewer than three cells: there is no middle to compare with"
+            } else {
+                "unknown: no state of the cells is at hand"
+            }
+        },
+    },
+    Section {
         id: "model",
         title: "How well do I know this battery",
         pictures: &["model_curve", "model_resistance", "model_temperature", "model_soc_error"],
@@ -115,6 +131,7 @@ pub fn page(data: &Data, context: &PageContext<'_>) -> String {
                         @match section.id {
                             "capacity" => { (forecast_note(data, &outlook)) }
                             ALARMS_AFTER => { (alarms(data, context, outlook.as_ref().ok(), &pictures)) }
+                            "findings" => { (findings(context)) }
                             "model" => { (knowledge(data, context)) }
                             "estimator" => { (estimator(data)) }
                             _ => {}
@@ -330,6 +347,20 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
 }
 
 /// The figures of the cells' model, and what would make it better.
+fn findings(context: &PageContext<'_>) -> Markup {
+    let Some(diagnosis) = context.diagnosis else { return html! {} };
+    let found = diagnosis.findings();
+    html! {
+        @if found.is_empty() { p { "Nothing was found." } } @else {
+            ul {
+                @for found in found {
+                    li { (found.to_string()) ", since " (format_utc(found.since)) ": " (found.kind.advice()) }
+                }
+            }
+        }
+    }
+}
+
 fn knowledge(data: &Data, context: &PageContext<'_>) -> Markup {
     let rows = model::rows(data, context);
     if rows.is_empty() {

@@ -11,9 +11,9 @@ use super::summary;
 use super::trace::{OF_95, TraceBin};
 use crate::alarm::Rule;
 use crate::chart::{
-    self, Axis, Chart, Format, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
+    self, Axis, Chart, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
 };
-use crate::model_pictures;
+use crate::{finding_pictures, model_pictures};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
@@ -33,10 +33,7 @@ const MAX_RECENT: f64 = 0.9;
 /// A file cannot be written, or there is no font for the words of a PNG.
 pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Result<usize, PlotError> {
     let pictures = all(data, context);
-    for (name, picture) in &pictures {
-        chart::write(&folder.join(format!("{name}.svg")), picture, Format::Svg)?;
-        chart::write(&folder.join(format!("{name}.png")), picture, Format::Png)?;
-    }
+    chart::write_all(folder, &pictures)?;
     Ok(pictures.len())
 }
 
@@ -60,7 +57,8 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
         named("innovation", innovation(data)),
         named("coverage", coverage(data)),
     ];
-    of_data.into_iter().flatten().chain(of_model).collect()
+    let of_cells = context.diagnosis.into_iter().flat_map(finding_pictures::all);
+    of_data.into_iter().flatten().chain(of_cells).chain(of_model).collect()
 }
 
 /// The x axis: dates, or time since the start in a suitable unit.

@@ -12,7 +12,6 @@ use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
 use crate::cli::alarm_groups::{AlarmGroup, grouped};
-use crate::cli::finding_text;
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{duration, number, shown, with_std, word};
 use crate::quantity::Timestamp;
@@ -205,7 +204,7 @@ fn alarms(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
         Line::from(format!("cannot be evaluated: {severity} {rule}, {} of its alarms", unknown.alarms))
     }));
     for found in &document.findings {
-        text.push(Line::from(finding_text::line(found)));
+        text.push(Line::from(found.to_string()));
         text.push(Line::from(format!("    found, for {}", duration(document.time.since(found.since)))));
     }
     text

@@ -54,13 +54,17 @@ impl Population {
 
 impl Diagnosis {
     pub(super) fn population(&self, state: usize) -> Population {
+        if state == LEAK && self.is_balanced {
+            // What the others lose is not known: they may be bled.
+            return Population { middle: 0.0, std: 0.0 };
+        }
         Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
     }
 
     /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve where a BMS bleeds, V; `None` = it does not.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
-        let populations = self.populations();
         self.is_balanced = bled_slope_v.is_some();
+        let populations = self.populations();
         self.lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);

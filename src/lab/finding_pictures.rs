@@ -1,0 +1,146 @@
+//! Pictures of a diagnosis: each cell's difference from the middle of its pack, one picture per state.
+//!
+//! A bar is a 95 % interval. Red cells are those of a finding that the picture shows.
+
+use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
+use crate::filter::ScalarGaussian;
+use crate::findings::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
+use crate::findings::finding;
+use crate::findings::{Diagnosis, Finding, FindingKind};
+use crate::quantity::CellIndex;
+
+/// Half of a 95 % interval, standard deviations.
+const OF_95: f64 = 1.96;
+/// Half the width of a bar, cells.
+const HALF_BAR: f64 = 0.3;
+
+/// A picture: state, file name, title, axis, factor to its unit, limits in that unit, and the kinds of findings that it shows.
+struct Shown {
+    state: usize,
+    name: &'static str,
+    title: &'static str,
+    label: &'static str,
+    scale: f64,
+    limits: &'static [f64],
+    kinds: &'static [FindingKind],
+}
+
+/// In the order of a report; charge first, because it has no finding of its own.
+const SHOWN: [Shown; STATES] = [
+    Shown {
+        state: SOC,
+        name: "difference_soc",
+        title: "Charge of the cells",
+        label: "SOC beside the pack's middle, points",
+        scale: 100.0,
+        limits: &[],
+        kinds: &[],
+    },
+    Shown {
+        state: LEAK,
+        name: "difference_leak",
+        title: "Loss of charge",
+        label: "loss beside the pack's middle, % of the capacity a day",
+        scale: 100.0,
+        limits: &[100.0 * finding::LEAK_PER_DAY],
+        kinds: &[FindingKind::Leak],
+    },
+    Shown {
+        state: CONTACT,
+        name: "difference_contact",
+        title: "Contact resistance",
+        label: "beside the pack's middle, % of the series resistance",
+        scale: 100.0,
+        limits: &[100.0 * finding::CONTACT],
+        kinds: &[FindingKind::Contact],
+    },
+    Shown {
+        state: CAPACITY,
+        name: "difference_capacity",
+        title: "Capacity of the cells",
+        label: "beside the pack's middle, %",
+        scale: 100.0,
+        limits: &[100.0 * finding::CAPACITY, -100.0 * finding::CAPACITY],
+        kinds: &[FindingKind::WeakCell, FindingKind::ForeignCell, FindingKind::Module],
+    },
+    Shown {
+        state: RESISTANCE,
+        name: "difference_resistance",
+        title: "Resistance of the cells",
+        label: "beside the pack's middle, %",
+        scale: 100.0,
+        limits: &[100.0 * finding::RESISTANCE],
+        kinds: &[FindingKind::HighResistance],
+    },
+    Shown {
+        state: CHANNEL,
+        name: "difference_channel",
+        title: "Offset of the voltage channels",
+        label: "beside the pack's middle, mV",
+        scale: 1e3,
+        limits: &[1e3 * finding::CHANNEL_V, -1e3 * finding::CHANNEL_V],
+        kinds: &[
+            FindingKind::VoltageChannel,
+            FindingKind::VoltageFrozen,
+            FindingKind::DoubledChannels,
+            FindingKind::SwappedChannels,
+        ],
+    },
+];
+
+/// Names of the pictures, in the order of [`all`].
+pub const NAMES: [&str; STATES] = [
+    "difference_soc",
+    "difference_leak",
+    "difference_contact",
+    "difference_capacity",
+    "difference_resistance",
+    "difference_channel",
+];
+
+/// Every picture with the name of its file.
+pub fn all(diagnosis: &Diagnosis) -> Vec<(String, Picture)> {
+    let cells: Vec<[ScalarGaussian; STATES]> =
+        (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
+    SHOWN.iter().map(|shown| (shown.name.to_owned(), picture(shown, &cells, diagnosis.findings()))).collect()
+}
+
+fn picture(shown: &Shown, cells: &[[ScalarGaussian; STATES]], findings: &[Finding]) -> Picture {
+    let is_found = |cell: usize| {
+        findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
+    };
+    let bars = |wanted: bool| {
+        let of_one = move |(cell, states): (usize, &[ScalarGaussian; STATES])| {
+            let size = states[shown.state];
+            let (x, mean, half) = (cell as f64 + 1.0, shown.scale * size.mean, OF_95 * shown.scale * size.std());
+            // A hole separates a bar from the next one.
+            let hole = (x + HALF_BAR, f64::NAN, f64::NAN);
+            [(x - HALF_BAR, mean - half, mean + half), (x + HALF_BAR, mean - half, mean + half), hole]
+        };
+        cells.iter().enumerate().filter(move |(cell, _)| is_found(*cell) == wanted).flat_map(of_one).collect::<Vec<_>>()
+    };
+    let points = |wanted: bool| {
+        let of_one = move |(cell, states): (usize, &[ScalarGaussian; STATES])| {
+            let (x, y) = (cell as f64 + 1.0, shown.scale * states[shown.state].mean);
+            let half = OF_95 * shown.scale * states[shown.state].std();
+            Point { x, y, tip: format!("cell {x}: {y:.2} (95 %: {:.2} to {:.2})", y - half, y + half) }
+        };
+        cells.iter().enumerate().filter(move |(cell, _)| is_found(*cell) == wanted).map(of_one).collect::<Vec<_>>()
+    };
+    let mut layers = vec![
+        Layer::band("", Ink::Grey, bars(false)),
+        Layer::new("cell, with its 95 % interval", Ink::Blue, Shape::Points(points(false))),
+    ];
+    if (0..cells.len()).any(is_found) {
+        layers.push(Layer::band("", Ink::Red, bars(true)));
+        layers.push(Layer::new("found", Ink::Red, Shape::Points(points(true))));
+    }
+    let limit = |(i, limit): (usize, &f64)| {
+        Layer::new(if i == 0 { "reported from" } else { "" }, Ink::Amber, Shape::Level(*limit))
+    };
+    layers.extend(shown.limits.iter().enumerate().map(limit));
+    let description =
+        format!("{} of {} cells, each with its 95 % interval, beside the middle of the pack", shown.title, cells.len());
+    let axis = Axis::number("cell").within(0.0, cells.len() as f64 + 1.0);
+    Picture::Chart(Chart { description, ..Chart::new(shown.title, axis, shown.label, layers) })
+}
