@@ -396,10 +396,12 @@ impl Diagnosis {
         if of_cells.iter().flatten().count() < LEAST_CELLS {
             return;
         }
-        let middle_c = Population::of(of_cells.iter().flatten().copied()).middle;
-        for (cell, here_c) in self.cells.iter_mut().zip(of_cells) {
-            if let Some(here_c) = here_c {
-                cell.temperature.observe(seconds, middle_c, here_c);
+        let warm = |(cell, here_c): (&mut Watched, Option<f64>)| Some(cell.temperature.warming_k(seconds, here_c?));
+        let warmings_k: Vec<Option<f64>> = self.cells.iter_mut().zip(of_cells).map(warm).collect();
+        let middle_k = Population::of(warmings_k.iter().flatten().copied()).middle;
+        for (cell, here_k) in self.cells.iter_mut().zip(warmings_k) {
+            if let Some(here_k) = here_k {
+                cell.temperature.compare(seconds, middle_k, here_k);
             }
         }
         let kind = FindingKind::TemperatureSensor;

@@ -18,25 +18,24 @@ const ATTACHED: f64 = 0.6;
 /// How one cell's temperature follows the pack's.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Following {
-    /// Slow means, of the pack and here, degrees C.
-    slow_c: Option<[f64; 2]>,
-    /// Sums of squares of the pack's warming and of products, K^2.
+    /// Slow mean, degrees C.
+    slow_c: Option<f64>,
+    /// Sums of squares of the pack's warming and of products with the one here, K^2.
     squares_k2: f64,
     products_k2: f64,
     pub(super) is_detached: bool,
 }
 
 impl Following {
-    /// Takes a row `seconds` after the one before.
-    pub(super) fn observe(&mut self, seconds: f64, middle_c: f64, here_c: f64) {
-        let Some([middle_slow_c, here_slow_c]) = &mut self.slow_c else {
-            self.slow_c = Some([middle_c, here_c]);
-            return;
-        };
-        let keep = libm::exp(-seconds.max(0.0) / SLOW_S);
-        *middle_slow_c = middle_c + keep * (*middle_slow_c - middle_c);
-        *here_slow_c = here_c + keep * (*here_slow_c - here_c);
-        let (middle_k, here_k) = (middle_c - *middle_slow_c, here_c - *here_slow_c);
+    /// Takes the temperature of a row `seconds` after the one before; the warming, K: an offset of the sensor is none.
+    pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
+        let slow_c = self.slow_c.get_or_insert(here_c);
+        *slow_c = here_c + libm::exp(-seconds.max(0.0) / SLOW_S) * (*slow_c - here_c);
+        here_c - *slow_c
+    }
+
+    /// Compares the warming of a row with that in the middle of the pack.
+    pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
         let older = libm::exp2(-seconds.max(0.0) / HALF_S);
         self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
         self.products_k2 = older * self.products_k2 + middle_k * here_k;
@@ -46,9 +45,8 @@ impl Following {
         }
     }
 
-    pub(super) fn numbers(&self) -> [f64; 4] {
-        let [middle_c, here_c] = self.slow_c.unwrap_or_default();
-        [middle_c, here_c, self.squares_k2, self.products_k2]
+    pub(super) fn numbers(&self) -> [f64; 3] {
+        [self.slow_c.unwrap_or_default(), self.squares_k2, self.products_k2]
     }
 }
 
@@ -58,10 +56,12 @@ mod tests {
 
     /// Two days: the pack warms by 8 K each time; the sensor shows this part of it.
     fn after_days(part: f64) -> Following {
-        let mut following = Following::default();
+        let (mut pack, mut following) = (Following::default(), Following::default());
         for row in 0..2 * 288 {
             let warming_k = if row % 72 < 24 { 8.0 * f64::from(row % 72) / 24.0 } else { 0.0 };
-            following.observe(300.0, 20.0 + warming_k, 21.0 + part * warming_k);
+            let middle_k = pack.warming_k(300.0, 20.0 + warming_k);
+            let here_k = following.warming_k(300.0, 25.0 + part * warming_k);
+            following.compare(300.0, middle_k, here_k);
         }
         following
     }
@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn a_pack_that_does_not_warm_says_nothing() {
         let mut following = Following::default();
-        (0..1000).for_each(|row| following.observe(300.0, 20.0 + 0.1 * f64::from(row % 2), 20.0));
+        (0..1000).for_each(|row| following.compare(300.0, 0.1 * f64::from(row % 2), 0.0));
         assert!(!following.is_detached, "{following:?}");
     }
 }

@@ -8,6 +8,8 @@ use crate::quantity::{CellIndex, Timestamp};
 
 /// Time within which the cells of a module are found to have more capacity than the others.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
+/// Probability that is not reported yet.
+const UNSETTLED: f64 = 0.99;
 /// Deviation up to which a size is known, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
@@ -66,6 +68,7 @@ impl Diagnosis {
         self.is_balanced = bled_slope_v.is_some();
         let populations = self.populations();
         self.lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
+        let mut foreign: Vec<Option<Finding>> = Vec::with_capacity(self.cells.len());
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
             // The first channel fault, if any, in the order of `judged`: nothing else is known then.
@@ -73,10 +76,13 @@ impl Diagnosis {
                 judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
                 let probability = if fault.is_some_and(|fault| fault != it.kind) { 0.0 } else { it.probability };
-                self.take(time, index, &Judged { probability, ..it });
+                let candidate = self.take(time, index, &Judged { probability, ..it });
+                if it.kind == FindingKind::ForeignCell {
+                    foreign.push(self.module_of(index).copied().or(candidate));
+                }
             }
         }
-        self.find_modules(time);
+        self.find_modules(time, &foreign);
         for index in 0..self.cells.len() {
             if self.may_be_bled(index) {
                 self.cells[index].difference.forget_leak();
@@ -95,7 +101,8 @@ impl Diagnosis {
         let cell = CellIndex(index as u16);
         let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
         let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
-        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() || is_found();
+        let is_unsettled = self.settling_s(kind) > 0.0 && self.cells[index].suspected[kind as usize - 1].is_some();
+        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() && !is_unsettled || is_found();
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
@@ -167,8 +174,9 @@ impl Diagnosis {
             leak.0.mean = leak.0.mean.min(0.0);
             leak.1 = 0.0;
         }
-        // An offset without loss of charge: with a leak the cell's own charge explains the voltage.
-        let channel = (channel.0, if leak.1 >= WITHDRAWN { 0.0 } else { channel.1 });
+        // An offset without loss of charge: with a leak the cell's own charge explains the voltage. Nor is it a new cell then.
+        let unless_leaking =
+            |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
         let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
             is_comparable,
@@ -177,34 +185,53 @@ impl Diagnosis {
         [
             sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
             sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
-            if_near(FindingKind::VoltageChannel, channel),
+            if_near(FindingKind::VoltageChannel, unless_leaking(channel)),
             of(FindingKind::Leak, leak),
             if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0)),
             if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0)),
             of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0)),
-            if_near(FindingKind::ForeignCell, beyond(difference::CAPACITY, finding::CAPACITY, 1.0)),
+            if_near(FindingKind::ForeignCell, unless_leaking(beyond(difference::CAPACITY, finding::CAPACITY, 1.0))),
         ]
     }
 
-    /// Takes a judgement into the list.
-    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) {
+    /// Takes a judgement into the list, when it has lasted as long as its kind needs; what is likelier than not, reported or not.
+    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> Option<Finding> {
         let Judged { kind, size, probability, .. } = *judged;
+        let settling_s = self.settling_s(kind);
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
             *suspected = None;
         } else if suspected.is_none() {
-            let is_after_jump = |jumped: &Timestamp| time.since(*jumped) < DAY_S;
+            let is_after_jump = |jumped: &Timestamp| kind != FindingKind::Leak && time.since(*jumped) < DAY_S;
             *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
         }
+        let since = *suspected;
         let other = if kind == FindingKind::DoubledChannels { cell.channel.doubled() } else { None };
         let own = CellIndex(index as u16);
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
-        let since = suspected.unwrap_or(time);
+        let (cells, since) = (Some(cells), since.unwrap_or(time));
+        let finding = Finding { kind, cells, since, reported: time, probability, size };
         let is_in_module = kind == FindingKind::ForeignCell && self.module_of(index).is_some();
         // The upper one of two doubled channels is in the finding of the lower one.
-        if cells.0 == own && !is_in_module {
-            self.put(Finding { kind, cells: Some(cells), since, reported: time, probability, size });
+        if finding.cells.is_some_and(|(first, _)| first == own) && !is_in_module {
+            let has_lasted = time.since(since) >= settling_s;
+            self.put(Finding {
+                probability: if has_lasted { probability } else { probability.min(UNSETTLED) },
+                ..finding
+            });
+        }
+        Some(finding).filter(|it| it.probability >= WITHDRAWN)
+    }
+
+    /// Time for which a kind must have been likelier than not before it is reported, s. Where a BMS balances, nothing is known of a
+    /// leak at first, so anything else that happens looks like one until the cell has been through a cycle. A cell with more capacity
+    /// waits for its neighbours: together they are a module.
+    fn settling_s(&self, kind: FindingKind) -> f64 {
+        match kind {
+            FindingKind::Leak if self.is_balanced => DAY_S,
+            FindingKind::ForeignCell => SAME_MODULE_S,
+            _ => 0.0,
         }
     }
 
@@ -237,22 +264,18 @@ impl Diagnosis {
         self.findings.iter().find(is_of)
     }
 
-    /// Joins cells side by side with more capacity than the others, found at about the same time, to a replaced module.
-    fn find_modules(&mut self, time: Timestamp) {
-        let foreign = |index: usize| {
-            let is_it =
-                |found: &&Finding| found.kind == FindingKind::ForeignCell && found.is_of(CellIndex(index as u16));
-            self.findings.iter().find(is_it).or_else(|| self.module_of(index)).copied()
-        };
-        let known: Vec<Option<Finding>> = (0..self.cells.len()).map(foreign).collect();
+    /// Joins cells side by side with more capacity than the others, since about the same time, to a replaced module: two of them
+    /// for certain. `foreign`: of each cell, its module, or that it may be foreign.
+    fn find_modules(&mut self, time: Timestamp, foreign: &[Option<Finding>]) {
         let is_same_event = |a: &Option<Finding>, b: &Option<Finding>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
         };
         let mut first = 0;
-        for group in known.chunk_by(is_same_event) {
+        for group in foreign.chunk_by(is_same_event) {
             let cells = (CellIndex(first as u16), CellIndex((first + group.len() - 1) as u16));
             first += group.len();
-            if group.len() >= 2 && 2 * group.len() <= known.len() {
+            let certain = group.iter().flatten().filter(|it| it.probability >= REPORTED).count();
+            if certain >= 2 && 2 * group.len() <= foreign.len() {
                 self.put_module(time, cells, group);
             }
         }
