@@ -65,16 +65,16 @@ struct FindingRow {
     advice: &'static str,
 }
 
-/// A cell's difference from the middle of the pack.
+/// A cell's difference from the middle of the pack; what is not known is `null`.
 #[derive(Debug, Serialize)]
 struct CellRow {
     cell: u16,
-    soc: Value,
-    capacity: Value,
-    resistance: Value,
-    contact: Value,
-    channel_v: Value,
-    leak_per_day: Value,
+    soc: Option<Value>,
+    capacity: Option<Value>,
+    resistance: Option<Value>,
+    contact: Option<Value>,
+    channel_v: Option<Value>,
+    leak_per_day: Option<Value>,
 }
 
 /// A value with its standard deviation.
@@ -143,7 +143,7 @@ fn page(diagnosis: &Diagnosis) -> Page {
     };
     let cells = (0..).map(CellIndex).map_while(|cell| {
         let states = diagnosis.relative(cell)?;
-        let value = |state: usize| Value { mean: states[state].mean, std: states[state].std() };
+        let value = |state: usize| states[state].map(|size| Value { mean: size.mean, std: size.std() });
         Some(CellRow {
             cell: number(cell),
             soc: value(SOC),
@@ -166,16 +166,18 @@ fn text(diagnosis: &Diagnosis, page: &Page) -> String {
         text += &format!("{found}, since {}\n    {}\n", format_utc(found.since), found.kind.advice());
     }
     text += "\ndifference from the middle of the pack\n";
-    let percent = |value: Value| with_deviation(100.0 * value.mean, 100.0 * value.std, 1);
+    let shown = |value: Option<Value>, scale: f64, digits: usize| {
+        value.map_or_else(|| "-".to_owned(), |it| with_deviation(scale * it.mean, scale * it.std, digits))
+    };
     let rows = page.cells.iter().map(|cell| {
         vec![
             cell.cell.to_string(),
-            percent(cell.soc),
-            percent(cell.capacity),
-            percent(cell.resistance),
-            percent(cell.contact),
-            with_deviation(1e3 * cell.channel_v.mean, 1e3 * cell.channel_v.std, 1),
-            with_deviation(100.0 * cell.leak_per_day.mean, 100.0 * cell.leak_per_day.std, 2),
+            shown(cell.soc, 100.0, 1),
+            shown(cell.capacity, 100.0, 1),
+            shown(cell.resistance, 100.0, 1),
+            shown(cell.contact, 100.0, 1),
+            shown(cell.channel_v, 1e3, 1),
+            shown(cell.leak_per_day, 100.0, 2),
         ]
     });
     let heads = ["cell", "SOC, points", "capacity, %", "resistance, %", "contact, %", "channel, mV", "leak, %/day"];

@@ -100,32 +100,36 @@ pub const NAMES: [&str; STATES] = [
 
 /// Every picture with the name of its file.
 pub fn all(diagnosis: &Diagnosis) -> Vec<(String, Picture)> {
-    let cells: Vec<[ScalarGaussian; STATES]> =
+    let cells: Vec<[Option<ScalarGaussian>; STATES]> =
         (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
     SHOWN.iter().map(|shown| (shown.name.to_owned(), picture(shown, &cells, diagnosis.findings()))).collect()
 }
 
-fn picture(shown: &Shown, cells: &[[ScalarGaussian; STATES]], findings: &[Finding]) -> Picture {
+fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: &[Finding]) -> Picture {
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };
-    let bars = |wanted: bool| {
-        let of_one = move |(cell, states): (usize, &[ScalarGaussian; STATES])| {
-            let size = states[shown.state];
-            let (x, mean, half) = (cell as f64 + 1.0, shown.scale * size.mean, OF_95 * shown.scale * size.std());
-            // A hole separates a bar from the next one.
-            let hole = (x + HALF_BAR, f64::NAN, f64::NAN);
-            [(x - HALF_BAR, mean - half, mean + half), (x + HALF_BAR, mean - half, mean + half), hole]
+    // Of each cell its number, value and half its interval.
+    let shown_of = |wanted: bool| {
+        let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
+            let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;
+            Some((cell as f64 + 1.0, shown.scale * size.mean, OF_95 * shown.scale * size.std()))
         };
-        cells.iter().enumerate().filter(move |(cell, _)| is_found(*cell) == wanted).flat_map(of_one).collect::<Vec<_>>()
+        cells.iter().enumerate().filter_map(of_one).collect::<Vec<_>>()
+    };
+    let bars = |wanted: bool| {
+        // A hole separates a bar from the next one.
+        let bar = |(x, y, half): (f64, f64, f64)| {
+            [(x - HALF_BAR, y - half, y + half), (x + HALF_BAR, y - half, y + half), (x + HALF_BAR, f64::NAN, f64::NAN)]
+        };
+        shown_of(wanted).into_iter().flat_map(bar)
     };
     let points = |wanted: bool| {
-        let of_one = move |(cell, states): (usize, &[ScalarGaussian; STATES])| {
-            let (x, y) = (cell as f64 + 1.0, shown.scale * states[shown.state].mean);
-            let half = OF_95 * shown.scale * states[shown.state].std();
-            Point { x, y, tip: format!("cell {x}: {y:.2} (95 %: {:.2} to {:.2})", y - half, y + half) }
+        let point = |(x, y, half): (f64, f64, f64)| {
+            let tip = format!("cell {x}: {y:.2} (95 %: {:.2} to {:.2})", y - half, y + half);
+            Point { x, y, tip }
         };
-        cells.iter().enumerate().filter(move |(cell, _)| is_found(*cell) == wanted).map(of_one).collect::<Vec<_>>()
+        shown_of(wanted).into_iter().map(point).collect::<Vec<_>>()
     };
     let mut layers = vec![
         Layer::band("", Ink::Grey, bars(false)),

@@ -8,7 +8,7 @@ mod judge;
 use serde::{Deserialize, Serialize};
 
 use super::channels::{Channel, compare};
-use super::difference::{CHANNEL, CONTACT, Difference, Jump, Observation, RESISTANCE, SOC, STATES};
+use super::difference::{CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{Finding, FindingKind};
 use super::row::{CellSums, PackSums};
 use super::temperature::Following;
@@ -19,8 +19,8 @@ use judge::Population;
 
 /// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
 /// the same again.
-const ROW_SOC: f64 = 0.02;
-const ROW_S: f64 = 300.0;
+const ROW_SOC: f64 = 0.01;
+const ROW_S: f64 = 120.0;
 const REST_PART: f64 = 0.5;
 /// Longest time between two samples of a row, s.
 const HOLE_S: f64 = 60.0;
@@ -147,13 +147,15 @@ impl Diagnosis {
         self.cells.get(cell.index()).map(|cell| &cell.difference)
     }
 
-    /// A cell's states less those of the middle of the pack; `None` = the pack is not compared, or has no such cell.
-    pub fn relative(&self, cell: CellIndex) -> Option<[ScalarGaussian; STATES]> {
+    /// A cell's states less those of the middle of the pack; `None` = the pack is not compared, or has no such cell. A state is
+    /// `None` where nothing is known of it: the leak of a cell that may be bled.
+    pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let own = &self.cells.get(cell.index())?.difference;
         Some(std::array::from_fn(|state| {
             let middle = self.population(state).middle;
             let ScalarGaussian { mean, variance } = own.state(state);
-            ScalarGaussian { mean: mean - middle, variance }
+            let is_known = state != LEAK || !self.may_be_bled(cell.index());
+            is_known.then_some(ScalarGaussian { mean: mean - middle, variance })
         }))
     }
 

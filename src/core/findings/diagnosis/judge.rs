@@ -141,7 +141,8 @@ impl Diagnosis {
         is_below && !self.may_be_bled(index)
     }
 
-    fn may_be_bled(&self, index: usize) -> bool {
+    /// Whether a BMS may take charge out of the cell.
+    pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
         self.is_balanced && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
