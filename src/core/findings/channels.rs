@@ -15,7 +15,7 @@ const DOUBLED_ROWS: u8 = 10;
 /// What is known of one channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Voltage of the middle cells in the row in which the channel last changed, V; `None` = it has never changed.
+    /// Voltage of the middle cells in the row in which the channel last changed, or in the first one, V.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
     /// The channel whose values it has shown, and in how many rows.
@@ -31,6 +31,11 @@ impl Channel {
             let was_v = *self.middle_v.get_or_insert(middle_v);
             self.is_frozen |= (middle_v - was_v).abs() > FROZEN_V;
         }
+    }
+
+    /// After a hole the voltages have moved unseen, and the channel's perhaps with them.
+    pub(super) fn interrupt(&mut self) {
+        self.middle_v = None;
     }
 
     /// The channel whose values it shows.
@@ -101,6 +106,10 @@ mod tests {
         assert!(channel.is_frozen);
         channel.end_row(&row(&[3.71, 3.70]), 3.66);
         assert!(!channel.is_frozen, "it lives again");
+        channel.interrupt();
+        channel.end_row(&row(&[3.71, 3.71]), 3.60);
+        channel.end_row(&row(&[3.71, 3.71]), 3.61);
+        assert!(!channel.is_frozen, "the others have moved in a hole of the record");
     }
 
     #[test]

@@ -17,10 +17,14 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
 use judge::Population;
 
-/// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
-/// the same again.
-const ROW_SOC: f64 = 0.01;
-const ROW_S: f64 = 120.0;
+/// A row ends when this part of the charge has moved, or after this time, s: sooner where it has this many samples of the middle cell,
+/// because cells are sampled at different moments, an error that only their number makes small. At rest after this part of the rest,
+/// because it says the same again.
+const ROW_SOC: f64 = 0.02;
+const ROW_S: f64 = 300.0;
+const SAMPLED_ROW_SOC: f64 = 0.01;
+const SAMPLED_ROW_S: f64 = 120.0;
+const ROW_SAMPLES: u32 = 60;
 const REST_PART: f64 = 0.5;
 /// Longest time between two samples of a row, s.
 const HOLE_S: f64 = 60.0;
@@ -82,6 +86,14 @@ struct Watched {
     suspected: [Option<Timestamp>; FindingKind::ALL.len()],
     /// When it last changed at once.
     jumped: Option<Timestamp>,
+}
+
+impl Watched {
+    /// What follows does not hang together with the samples so far.
+    fn interrupt(&mut self) {
+        self.sums.interrupt();
+        self.channel.interrupt();
+    }
 }
 
 /// The diagnosis of a pack.
@@ -193,7 +205,7 @@ impl Diagnosis {
         if pack.last.is_some_and(|last| time.since(last) > HOLE_S) {
             *pack = PackSums::default();
             self.rest_s = 0.0;
-            self.cells.iter_mut().for_each(|cell| cell.sums.interrupt());
+            self.cells.iter_mut().for_each(Watched::interrupt);
         }
         let seconds = pack.last.replace(time).map_or(0.0, |last| time.since(last).max(0.0));
         let begun = *pack.begun.get_or_insert(time);
@@ -206,8 +218,10 @@ impl Diagnosis {
         pack.temperature_c += mean.temperature_c;
         pack.charge_ah += mean.charge_ah - first_ah;
         self.rest_s = if mean.current_a.abs() < REST_PER_H * capacity_ah { self.rest_s + seconds } else { 0.0 };
-        (mean.charge_ah - first_ah).abs() >= ROW_SOC * capacity_ah
-            || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
+        let is_sampled = self.pack.count >= ROW_SAMPLES;
+        let (row_soc, row_s) = if is_sampled { (SAMPLED_ROW_SOC, SAMPLED_ROW_S) } else { (ROW_SOC, ROW_S) };
+        (mean.charge_ah - first_ah).abs() >= row_soc * capacity_ah
+            || time.since(begun) >= row_s.max(REST_PART * self.rest_s)
     }
 
     /// Takes how probable a fault is of a sensor that all cells share, by those who know; whether that is a new finding.
@@ -437,7 +451,7 @@ impl Diagnosis {
     pub fn interrupt(&mut self) {
         self.pack = PackSums::default();
         self.rest_s = 0.0;
-        self.cells.iter_mut().for_each(|cell| cell.sums.interrupt());
+        self.cells.iter_mut().for_each(Watched::interrupt);
     }
 
     /// Moves every stamp by `by_nanos`, onto another clock.
