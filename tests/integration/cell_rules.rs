@@ -271,7 +271,7 @@ fn cells_that_a_bms_bleeds_do_not_leak() {
 #[test]
 fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() {
     let mut pack = FaultyPack::new("weak:3:-12% swap:3:8@day3");
-    pack.run_to(3.0);
+    pack.run_to(1.9);
     assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
     pack.run_to(6.0);
     let swapped = (FindingKind::SwappedChannels, Some((CellIndex(2), CellIndex(7))));

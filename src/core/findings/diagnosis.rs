@@ -17,14 +17,10 @@ use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
 use judge::Population;
 
-/// A row ends when this part of the charge has moved, or after this time, s: sooner where it has this many samples of the middle cell,
-/// because cells are sampled at different moments, an error that only their number makes small. At rest after this part of the rest,
-/// because it says the same again.
+/// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
+/// the same again. Shorter rows find a contact sooner, but an aged cell is taken for one and exchanged channels are not seen.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
-const SAMPLED_ROW_SOC: f64 = 0.01;
-const SAMPLED_ROW_S: f64 = 120.0;
-const ROW_SAMPLES: u32 = 60;
 const REST_PART: f64 = 0.5;
 /// Longest time between two samples of a row, s.
 const HOLE_S: f64 = 60.0;
@@ -46,6 +42,8 @@ const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
 /// Least sum of squared steps for a resistance, squares of the capacity per hour.
 const LEAST_STEPS: f64 = 0.02;
+/// What a deviating resistance counts against a cell as the middle one, SOC: its voltage drop is not that of the others.
+const OFF_DROP: f64 = 0.1;
 /// Most that the mean cell's SOC may differ from what the charge says between two rows.
 const SOC_JUMP: f64 = 0.02;
 /// Rows of which the jumps of several cells are one event.
@@ -108,7 +106,7 @@ pub struct Diagnosis {
     rest_s: f64,
     /// Series resistance of the mean cell in this row, ohm.
     ohm: f64,
-    /// The cell with the middle SOC.
+    /// The cell with the middle SOC and resistance.
     middle: usize,
     /// A BMS may bleed the cells that are above the lowest one.
     is_balanced: bool,
@@ -218,10 +216,8 @@ impl Diagnosis {
         pack.temperature_c += mean.temperature_c;
         pack.charge_ah += mean.charge_ah - first_ah;
         self.rest_s = if mean.current_a.abs() < REST_PER_H * capacity_ah { self.rest_s + seconds } else { 0.0 };
-        let is_sampled = self.pack.count >= ROW_SAMPLES;
-        let (row_soc, row_s) = if is_sampled { (SAMPLED_ROW_SOC, SAMPLED_ROW_S) } else { (ROW_SOC, ROW_S) };
-        (mean.charge_ah - first_ah).abs() >= row_soc * capacity_ah
-            || time.since(begun) >= row_s.max(REST_PART * self.rest_s)
+        (mean.charge_ah - first_ah).abs() >= ROW_SOC * capacity_ah
+            || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
     /// Takes how probable a fault is of a sensor that all cells share, by those who know; whether that is a new finding.
@@ -399,8 +395,13 @@ impl Diagnosis {
     fn choose_middle(&mut self, socs: impl Fn(usize) -> Option<f64>) {
         let of_cells: Vec<Option<f64>> = (0..self.cells.len()).map(socs).collect();
         let middle = Population::of(of_cells.iter().flatten().copied()).middle;
-        let off = |soc: &Option<f64>| soc.map_or(f64::INFINITY, |soc| (soc - middle).abs());
-        let nearest = of_cells.iter().enumerate().min_by(|a, b| off(a.1).total_cmp(&off(b.1)));
+        let off = |cell: usize, soc: &Option<f64>| {
+            let mean = self.cells[cell].difference.mean();
+            soc.map_or(f64::INFINITY, |soc| {
+                (soc - middle).abs() + OFF_DROP * (mean[RESISTANCE].abs() + mean[CONTACT].abs())
+            })
+        };
+        let nearest = of_cells.iter().enumerate().min_by(|a, b| off(a.0, a.1).total_cmp(&off(b.0, b.1)));
         if let Some((cell, Some(_))) = nearest {
             self.middle = cell;
         }

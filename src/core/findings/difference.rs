@@ -49,6 +49,8 @@ const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// The same when only its resistance has changed.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.2, 0.5, 0.0, 0.0];
+/// Charge that a BMS may bleed from a cell in a day, standard deviation: the cells differ by that much, and it ends when they do not.
+const BLED_PER_DAY: f64 = 0.002;
 /// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
 /// in a row are a jump.
 const HUBER: f64 = 3.0;
@@ -156,13 +158,13 @@ impl Difference {
         self.covariance[pair(SOC, SOC)] = FIRST_STD[SOC] * FIRST_STD[SOC];
     }
 
-    /// What is lost from now on need not be a leak: nothing is known of that.
+    /// What is lost from now on may be bled: nothing is known of a leak.
     pub(super) fn forget_leak(&mut self) {
         self.mean[LEAK] = 0.0;
         for j in 0..STATES {
             self.covariance[pair(LEAK, j)] = 0.0;
         }
-        self.covariance[pair(LEAK, LEAK)] = FIRST_STD[LEAK] * FIRST_STD[LEAK];
+        self.covariance[pair(LEAK, LEAK)] = BLED_PER_DAY * BLED_PER_DAY;
     }
 
     /// What its channel shows at rest beside the middle's, V, where the open-circuit curve has this slope, V.
@@ -212,11 +214,16 @@ impl Difference {
 
     /// The cell has changed at once; takes the row that said so.
     pub(super) fn open(&mut self, jump: Jump, observed: &Observation) {
+        self.widen_as(jump);
+        self.update(observed, 1.0);
+    }
+
+    /// The cell may have changed at once.
+    pub(super) fn widen_as(&mut self, jump: Jump) {
         self.widen(match jump {
             Jump::Alone => &ALONE_STD,
             Jump::Replaced => &REPLACED_STD,
         });
-        self.update(observed, 1.0);
     }
 
     /// Takes an observation whose variance is multiplied so that the innovation counts linearly beyond the limit.

@@ -2,7 +2,7 @@
 
 use super::Diagnosis;
 use crate::filter::ScalarGaussian;
-use crate::findings::difference::{self, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
+use crate::findings::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
 use crate::findings::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN};
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -134,14 +134,8 @@ impl Diagnosis {
         (next.mean - shown.mean > BEYOND_DOUBT * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a loss of charge is the cell's own. A cell that is bled until it is like the others loses charge as well, but it is
-    /// above them; where a BMS balances, all but the lowest one may be. A leak that was found is still there when the others are bled.
-    fn can_leak(&self, index: usize, populations: &[Population; STATES]) -> bool {
-        let is_below = self.cells[index].difference.mean()[SOC] < populations[SOC].middle;
-        is_below && !self.may_be_bled(index)
-    }
-
-    /// Whether a BMS may take charge out of the cell.
+    /// Whether a BMS may take charge out of the cell: where one balances, out of all but the lowest one. A leak that was found is still
+    /// there when the others are bled.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
         self.is_balanced && self.lowest != Some(index) && !self.findings.iter().any(is_found)
@@ -171,9 +165,12 @@ impl Diagnosis {
         let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign));
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0);
-        if !self.can_leak(index, populations) {
-            leak.0.mean = leak.0.mean.min(0.0);
-            leak.1 = 0.0;
+        if self.may_be_bled(index) {
+            // A leak makes it the lowest cell: until then there is none that matters.
+            leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
+        } else if cell.difference.mean()[SOC] >= populations[SOC].middle {
+            // Above the others it is bled until it is like them, or it has been so far.
+            leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
         // An offset without loss of charge: with a leak the cell's own charge explains the voltage. Nor is it a new cell then.
         let unless_leaking =
@@ -299,5 +296,12 @@ impl Diagnosis {
         };
         self.findings.retain(|it| !is_within(it));
         self.insert(Finding { kind, cells: Some(cells), since, reported, probability: 1.0, size });
+        if earlier.is_none() {
+            // Where it ends is not known yet: cells that changed less at once may belong to it.
+            let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
+            for edge in edges.into_iter().flatten() {
+                self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));
+            }
+        }
     }
 }
