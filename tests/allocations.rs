@@ -27,7 +27,7 @@ const WARM_S: f64 = 110.0;
 const MIN_FRAMES: u64 = 20_000;
 
 /// Most blocks that the end of a row of the findings allocates, for 96 cells.
-const BLOCKS_OF_A_ROW: u64 = 400;
+const BLOCKS_OF_A_ROW: u64 = 64;
 
 /// One test at a time: all of them count the whole process.
 fn alone() -> MutexGuard<'static, ()> {

@@ -100,7 +100,10 @@ struct FaultyPack {
 
 impl FaultyPack {
     fn new(fault: &str) -> Self {
-        let config = config();
+        Self::of(config(), fault)
+    }
+
+    fn of(config: MonitorConfig, fault: &str) -> Self {
         let mut settings = Settings::of(Scenario::EvDay, 2.6);
         settings.pack.cells = CELLS;
         settings.pack.spread.resistance = 0.01;
@@ -270,7 +273,7 @@ fn cells_that_a_bms_bleeds_do_not_leak() {
 
 #[test]
 fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() {
-    let mut pack = FaultyPack::new("weak:3:-12% swap:3:8@day3");
+    let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, "weak:3:-12% swap:3:8@day3");
     pack.run_to(1.9);
     assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
     pack.run_to(6.0);

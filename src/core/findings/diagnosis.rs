@@ -261,7 +261,7 @@ impl Diagnosis {
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
         let before = self.findings.clone();
-        if self.observe(time, &row) {
+        if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
             let slope_v = || model.ocv_slope_v(&model.grid_position(BLED_SOC, row.temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
@@ -284,8 +284,8 @@ impl Diagnosis {
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell with the middle ones; whether there was something to compare.
-    fn observe(&mut self, time: Timestamp, row: &Row<'_>) -> bool {
+    /// Compares every cell with the middle ones, `seconds` after the row before; whether there was something to compare.
+    fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
         let Some(middle_v) = middle(voltages_v.iter().flatten().copied()) else { return false };
         for cell in &mut self.cells {
@@ -296,10 +296,14 @@ impl Diagnosis {
         compare(&mut channels, &sums);
         self.cells.iter_mut().zip(channels).for_each(|(cell, channel)| cell.channel = channel);
         let mut jumped: Vec<(usize, Observation)> = Vec::new();
+        let may_be_bled: Vec<bool> = (0..self.cells.len()).map(|cell| self.may_be_bled(cell)).collect();
         for (index, voltage_v) in voltages_v.iter().enumerate() {
             let cell = &mut self.cells[index];
             let Some(voltage_v) = voltage_v.filter(|_| !cell.channel.is_frozen) else { continue };
             let observed = row.observation(cell.difference.mean(), voltage_v - middle_v);
+            if may_be_bled[index] {
+                cell.difference.open_charge(seconds / DAY_S, &observed);
+            }
             if cell.difference.is_settled() {
                 cell.settled = *cell.difference.mean();
             }

@@ -51,6 +51,8 @@ const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.2, 0.5, 0.0, 0.0];
 /// Charge that a BMS may bleed from a cell in a day, standard deviation: the cells differ by that much, and it ends when they do not.
 const BLED_PER_DAY: f64 = 0.002;
+/// Time between two rows in which a cell may lose much charge, days.
+const UNSEEN_DAYS: f64 = 0.04;
 /// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
 /// in a row are a jump.
 const HUBER: f64 = 3.0;
@@ -160,11 +162,30 @@ impl Difference {
 
     /// What is lost from now on may be bled: nothing is known of a leak.
     pub(super) fn forget_leak(&mut self) {
+        self.begin_leak(BLED_PER_DAY);
+    }
+
+    /// It is not bled any more: what it loses from now on is a leak.
+    pub(super) fn watch_leak(&mut self) {
+        self.begin_leak(FIRST_STD[LEAK]);
+    }
+
+    fn begin_leak(&mut self, std: f64) {
         self.mean[LEAK] = 0.0;
         for j in 0..STATES {
             self.covariance[pair(LEAK, j)] = 0.0;
         }
-        self.covariance[pair(LEAK, LEAK)] = BLED_PER_DAY * BLED_PER_DAY;
+        self.covariance[pair(LEAK, LEAK)] = std * std;
+    }
+
+    /// Hours have passed unseen in which more may have been lost than is usual: where the row contradicts what is known, the charge
+    /// has changed or the channel: the next drive tells.
+    pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
+        if days >= UNSEEN_DAYS && self.deviations(observed).abs() > JUMP {
+            let lost = FIRST_STD[LEAK] * days;
+            self.covariance[pair(SOC, SOC)] += lost * lost;
+            self.covariance[pair(CHANNEL, CHANNEL)] += ALONE_STD[CHANNEL] * ALONE_STD[CHANNEL];
+        }
     }
 
     /// What its channel shows at rest beside the middle's, V, where the open-circuit curve has this slope, V.

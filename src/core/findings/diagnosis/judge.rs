@@ -67,7 +67,11 @@ impl Diagnosis {
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let populations = self.populations();
-        self.lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
+        let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
+        if let Some(cell) = lowest.filter(|_| self.lowest != lowest) {
+            self.cells[cell].difference.watch_leak();
+        }
+        self.lowest = lowest;
         let mut foreign: Vec<Option<Finding>> = Vec::with_capacity(self.cells.len());
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
