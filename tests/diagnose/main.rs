@@ -6,7 +6,7 @@
 //! injected in packs with good, usual and poor sensors, with and without balancing, at a random cell on a random day of the first
 //! third. `--packs` are distributed over the rows, each at least one. `--quick` simulates one pack per fault with usual sensors and
 //! balancing. `--only WORD` takes the faults whose name has the word: `--only healthy --packs 3000` for the rate of false findings.
-//! `--list` tells each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's cell model and nothing else.
+//! `--list` prints each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's cell model and nothing else.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
 
 mod finding;
@@ -199,7 +199,7 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
     scores.into_inner().unwrap_or_default()
 }
 
-/// Tells the findings that are not the fault's.
+/// Prints the findings that are not the fault's.
 fn list((f, q, is_balancing): Row, case: &Case, seen: &pack::Seen) {
     let (from_s, kind) =
         case.fault.map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));

@@ -179,7 +179,7 @@ impl Difference {
     }
 
     /// Hours have passed unseen in which more may have been lost than is usual: where the row contradicts what is known, the charge
-    /// has changed or the channel: the next drive tells.
+    /// has changed or the channel: the next drive shows which.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
         if days >= UNSEEN_DAYS && self.deviations(observed).abs() > JUMP {
             let lost = FIRST_STD[LEAK] * days;
