@@ -3,6 +3,7 @@
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
+use crate::findings::Diagnosis;
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
@@ -123,7 +124,8 @@ fn alarm(half: u16, active: bool) -> EventKind {
 #[test]
 fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
     let model = crate::config::of_label(&Label::usual(Chemistry::Nmc811Graphite, 2.6));
-    let context = PageContext { title: "pack".into(), model, ..PageContext::default() };
+    let diagnosis = Diagnosis::new(96);
+    let context = PageContext { title: "pack".into(), model, diagnosis: Some(&diagnosis), ..PageContext::default() };
     let page = page(&life(), &context);
     println!("{} bytes", page.len());
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
