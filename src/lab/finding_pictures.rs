@@ -14,14 +14,18 @@ const OF_95: f64 = 1.96;
 /// Half the width of a bar, cells.
 const HALF_BAR: f64 = 0.3;
 
-/// A picture: state, file name, title, axis, factor to its unit, limits in that unit, and the kinds of findings that it shows.
+/// A picture.
 struct Shown {
     state: usize,
+    /// Of its file.
     name: &'static str,
     title: &'static str,
     label: &'static str,
+    /// From the state's unit to the label's.
     scale: f64,
+    /// From which size on a cell is reported, in the state's unit.
     limits: &'static [f64],
+    /// Findings that it shows.
     kinds: &'static [FindingKind],
 }
 
@@ -42,7 +46,7 @@ const SHOWN: [Shown; STATES] = [
         title: "Loss of charge",
         label: "loss beside the pack's middle, % of the capacity a day",
         scale: 100.0,
-        limits: &[100.0 * finding::LEAK_PER_DAY],
+        limits: &[finding::LEAK_PER_DAY],
         kinds: &[FindingKind::Leak],
     },
     Shown {
@@ -51,7 +55,7 @@ const SHOWN: [Shown; STATES] = [
         title: "Contact resistance",
         label: "beside the pack's middle, % of the series resistance",
         scale: 100.0,
-        limits: &[100.0 * finding::CONTACT],
+        limits: &[finding::CONTACT],
         kinds: &[FindingKind::Contact],
     },
     Shown {
@@ -60,7 +64,7 @@ const SHOWN: [Shown; STATES] = [
         title: "Capacity of the cells",
         label: "beside the pack's middle, %",
         scale: 100.0,
-        limits: &[100.0 * finding::CAPACITY, -100.0 * finding::CAPACITY],
+        limits: &[finding::CAPACITY, -finding::CAPACITY],
         kinds: &[FindingKind::WeakCell, FindingKind::ForeignCell, FindingKind::Module],
     },
     Shown {
@@ -69,7 +73,7 @@ const SHOWN: [Shown; STATES] = [
         title: "Resistance of the cells",
         label: "beside the pack's middle, %",
         scale: 100.0,
-        limits: &[100.0 * finding::RESISTANCE],
+        limits: &[finding::RESISTANCE],
         kinds: &[FindingKind::HighResistance],
     },
     Shown {
@@ -78,7 +82,7 @@ const SHOWN: [Shown; STATES] = [
         title: "Offset of the voltage channels",
         label: "beside the pack's middle, mV",
         scale: 1e3,
-        limits: &[1e3 * finding::CHANNEL_V, -1e3 * finding::CHANNEL_V],
+        limits: &[finding::CHANNEL_V, -finding::CHANNEL_V],
         kinds: &[
             FindingKind::VoltageChannel,
             FindingKind::VoltageFrozen,
@@ -89,14 +93,15 @@ const SHOWN: [Shown; STATES] = [
 ];
 
 /// Names of the pictures, in the order of [`all`].
-pub const NAMES: [&str; STATES] = [
-    "difference_soc",
-    "difference_leak",
-    "difference_contact",
-    "difference_capacity",
-    "difference_resistance",
-    "difference_channel",
-];
+pub const NAMES: [&str; STATES] = {
+    let mut names = [""; STATES];
+    let mut i = 0;
+    while i < STATES {
+        names[i] = SHOWN[i].name;
+        i += 1;
+    }
+    names
+};
 
 /// Every picture with the name of its file.
 pub fn all(diagnosis: &Diagnosis) -> Vec<(String, Picture)> {
@@ -140,7 +145,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
         layers.push(Layer::new("found", Ink::Red, Shape::Points(points(true))));
     }
     let limit = |(i, limit): (usize, &f64)| {
-        Layer::new(if i == 0 { "reported from" } else { "" }, Ink::Amber, Shape::Level(*limit))
+        Layer::new(if i == 0 { "reported from" } else { "" }, Ink::Amber, Shape::Level(shown.scale * limit))
     };
     layers.extend(shown.limits.iter().enumerate().map(limit));
     let description =

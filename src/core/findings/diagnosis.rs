@@ -220,7 +220,7 @@ impl Diagnosis {
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }
 
-    /// Takes how probable a fault is of a sensor that all cells share, by those who know; whether that is a new finding.
+    /// Takes how probable a fault is of a sensor that all cells share, by those who know; the finding when it is new.
     pub fn note_sensor(
         &mut self,
         time: Timestamp,

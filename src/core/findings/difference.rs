@@ -49,9 +49,9 @@ const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// The same when only its resistance has changed.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.2, 0.5, 0.0, 0.0];
-/// Charge that a BMS may bleed from a cell in a day, standard deviation: the cells differ by that much, and it ends when they do not.
+/// Usual loss of a cell that a BMS may bleed, standard deviation, fraction of the capacity in a day, and the time without a row from
+/// which on it may have lost much more, days (`open_charge`). With 0.01 a day, exchanged channels and modules drown in it.
 const BLED_PER_DAY: f64 = 0.002;
-/// Time between two rows in which a cell may lose much charge, days.
 const UNSEEN_DAYS: f64 = 0.04;
 /// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
 /// in a row are a jump.
@@ -355,10 +355,13 @@ mod tests {
             let mut filter = watched([0.0; STATES], 1);
             for _ in 0..5 {
                 let observed = Observation { innovation, slope, variance: 1e-300 };
+                filter.open_charge(1e5, &observed);
                 if filter.observe(&observed) {
                     filter.open(Jump::Replaced, &observed);
                 }
+                filter.forget_leak();
                 filter.pass(1e5, 1e3);
+                filter.watch_leak();
                 assert_eq!(filter.check(), Ok(()), "{innovation} by {slope:?}");
             }
         }

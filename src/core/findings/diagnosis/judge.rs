@@ -8,8 +8,6 @@ use crate::quantity::{CellIndex, Timestamp};
 
 /// Time within which the cells of a module are found to have more capacity than the others.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// Probability that is not reported yet.
-const UNSETTLED: f64 = 0.99;
 /// Deviation up to which a size is known, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
@@ -80,9 +78,10 @@ impl Diagnosis {
                 judged.iter().find(|it| it.kind.is_of_channel() && it.probability >= REPORTED).map(|it| it.kind);
             for it in judged {
                 let probability = if fault.is_some_and(|fault| fault != it.kind) { 0.0 } else { it.probability };
-                let candidate = self.take(time, index, &Judged { probability, ..it });
+                let finding = self.take(time, index, &Judged { probability, ..it });
                 if it.kind == FindingKind::ForeignCell {
-                    foreign.push(self.module_of(index).copied().or(candidate));
+                    let certain = Some(finding).filter(|it| it.probability >= REPORTED);
+                    foreign.push(self.module_of(index).copied().or(certain));
                 }
             }
         }
@@ -105,8 +104,9 @@ impl Diagnosis {
         let cell = CellIndex(index as u16);
         let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
         let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
-        let is_unsettled = self.settling_s(kind) > 0.0 && self.cells[index].suspected[kind as usize - 1].is_some();
-        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() && !is_unsettled || is_found();
+        let since = self.cells[index].suspected[kind as usize - 1];
+        let is_settled = since.zip(self.last_row).is_none_or(|(since, (now, ..))| self.has_lasted(kind, since, now));
+        let is_known = judged.size.std() <= KNOWN_LIMITS * kind.limit() && is_settled || is_found();
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
@@ -196,10 +196,9 @@ impl Diagnosis {
         ]
     }
 
-    /// Takes a judgement into the list, when it has lasted as long as its kind needs; what is likelier than not, reported or not.
-    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> Option<Finding> {
+    /// Takes a judgement into the list, when it has lasted as long as its kind needs; the finding that it is, listed or not.
+    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> Finding {
         let Judged { kind, size, probability, .. } = *judged;
-        let settling_s = self.settling_s(kind);
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
@@ -208,39 +207,36 @@ impl Diagnosis {
             let is_after_jump = |jumped: &Timestamp| kind != FindingKind::Leak && time.since(*jumped) < DAY_S;
             *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
         }
-        let since = *suspected;
+        let since = suspected.unwrap_or(time);
         let other = if kind == FindingKind::DoubledChannels { cell.channel.doubled() } else { None };
         let own = CellIndex(index as u16);
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
-        let (cells, since) = (Some(cells), since.unwrap_or(time));
-        let finding = Finding { kind, cells, since, reported: time, probability, size };
+        let finding = Finding { kind, cells: Some(cells), since, reported: time, probability, size };
         let is_in_module = kind == FindingKind::ForeignCell && self.module_of(index).is_some();
         // The upper one of two doubled channels is in the finding of the lower one.
-        if finding.cells.is_some_and(|(first, _)| first == own) && !is_in_module {
-            let has_lasted = time.since(since) >= settling_s;
-            self.put(Finding {
-                probability: if has_lasted { probability } else { probability.min(UNSETTLED) },
-                ..finding
-            });
+        if cells.0 == own && !is_in_module {
+            self.put(finding);
         }
-        Some(finding).filter(|it| it.probability >= WITHDRAWN)
+        finding
     }
 
-    /// Time for which a kind must have been likelier than not before it is reported, s. Where a BMS balances, nothing is known of a
-    /// leak at first, so anything else that happens looks like one until the cell has been through a cycle. A cell with more capacity
-    /// waits for its neighbours: together they are a module.
-    fn settling_s(&self, kind: FindingKind) -> f64 {
-        match kind {
+    /// Whether what is likelier than not since a time has been so for long enough to be reported. Where a BMS balances, nothing is
+    /// known of a leak at first, so anything else that happens looks like one until the cell has been through a cycle. A cell with
+    /// more capacity waits for its neighbours: together they are a module.
+    fn has_lasted(&self, kind: FindingKind, since: Timestamp, now: Timestamp) -> bool {
+        let settling_s = match kind {
             FindingKind::Leak if self.is_balanced => DAY_S,
             FindingKind::ForeignCell => SAME_MODULE_S,
             _ => 0.0,
-        }
+        };
+        now.since(since) >= settling_s
     }
 
     /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
     pub(super) fn put(&mut self, finding: Finding) {
         let first = |found: &Finding| found.cells.map(|cells| cells.0);
         let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
+        let has_lasted = self.has_lasted(finding.kind, finding.since, finding.reported);
         match self.findings.iter().position(is_same) {
             Some(at) => {
                 let Finding { since, reported, .. } = self.findings.remove(at);
@@ -249,7 +245,7 @@ impl Diagnosis {
                     self.insert(Finding { since, reported, ..finding });
                 }
             }
-            None if finding.probability >= REPORTED => self.insert(finding),
+            None if has_lasted && finding.probability >= REPORTED => self.insert(finding),
             None => {}
         }
     }
@@ -266,8 +262,8 @@ impl Diagnosis {
         self.findings.iter().find(is_of)
     }
 
-    /// Joins cells side by side with more capacity than the others, since about the same time, to a replaced module: two of them
-    /// for certain. `foreign`: of each cell, its module, or that it may be foreign.
+    /// Joins cells side by side with more capacity than the others, since about the same time, to a replaced module. `foreign`: of
+    /// each cell, its module, or that it certainly has more capacity.
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<Finding>]) {
         let is_same_event = |a: &Option<Finding>, b: &Option<Finding>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
@@ -276,8 +272,7 @@ impl Diagnosis {
         for group in foreign.chunk_by(is_same_event) {
             let cells = (CellIndex(first as u16), CellIndex((first + group.len() - 1) as u16));
             first += group.len();
-            let certain = group.iter().flatten().filter(|it| it.probability >= REPORTED).count();
-            if certain >= 2 && 2 * group.len() <= foreign.len() {
+            if group.len() >= 2 && 2 * group.len() <= foreign.len() {
                 self.put_module(time, cells, group);
             }
         }
