@@ -54,22 +54,23 @@ impl Population {
 
 impl Diagnosis {
     pub(super) fn population(&self, state: usize) -> Population {
-        if state == LEAK && self.is_balanced {
-            // What the others lose is not known: they may be bled.
-            return Population { middle: 0.0, std: 0.0 };
-        }
         Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
     }
 
     /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve where a BMS bleeds, V; `None` = it does not.
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
-        let populations = self.populations();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
         if let Some(cell) = lowest.filter(|_| self.lowest != lowest) {
             self.cells[cell].difference.watch_leak();
         }
         self.lowest = lowest;
+        for index in 0..self.cells.len() {
+            if self.may_be_bled(index) {
+                self.cells[index].difference.forget_leak();
+            }
+        }
+        let populations = self.populations();
         let mut foreign: Vec<Option<Finding>> = Vec::with_capacity(self.cells.len());
         for index in 0..self.cells.len() {
             let judged = self.judged(index, &populations);
@@ -86,11 +87,6 @@ impl Diagnosis {
             }
         }
         self.find_modules(time, &foreign);
-        for index in 0..self.cells.len() {
-            if self.may_be_bled(index) {
-                self.cells[index].difference.forget_leak();
-            }
-        }
     }
 
     /// Per cell and kind, its size against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
