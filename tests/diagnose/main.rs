@@ -6,7 +6,8 @@
 //! injected in packs with good, usual and poor sensors, with and without balancing, at a random cell on a random day of the first
 //! third. `--packs` are distributed over the rows, each at least one. `--quick` simulates one pack per fault with usual sensors and
 //! balancing. `--only WORD` takes the faults whose name has the word: `--only healthy --packs 3000` for the rate of false findings.
-//! `--list` prints each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's cell model and nothing else.
+//! `--list` prints each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's
+//! cell model and nothing else.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
 
 mod finding;
@@ -20,9 +21,9 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use pack::{Case, PackSize};
+use pack::{Case, PackSize, Seen};
 use packwatch::monitor::MonitorConfig;
-use packwatch::sim::{Fault, SensorQuality};
+use packwatch::sim::{Fault, FaultKind, SensorQuality};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use score::Score;
@@ -35,7 +36,7 @@ const QUALITIES: [(&str, SensorQuality); 3] =
 const QUICK_QUALITY: usize = 1;
 
 /// Kinds of faults: name, pack size, text of the fault with places for two cells (A, B) and a sensor (S).
-const FAULTS: [(&str, usize, &str); 20] = [
+const FAULTS: [(&str, usize, &str); 21] = [
     ("healthy", 0, ""),
     ("healthy", 1, ""),
     ("leak 1 kohm", 0, "leak:A:1kohm"),
@@ -45,6 +46,7 @@ const FAULTS: [(&str, usize, &str); 20] = [
     ("contact +20 %", 1, "contact:A:+20%"),
     ("weak -10 %", 0, "weak:A:-10%"),
     ("resistance +20 %", 0, "resistance:A:+20%"),
+    ("resistance +20 % in 10 days", 0, "resistance:A:+20%"),
     ("module +15 %", 0, "module:5-8:+15%"),
     ("current offset 2 %", 0, "current-offset:1.2A"),
     ("current gain +5 %", 0, "current-gain:+5%"),
@@ -57,6 +59,11 @@ const FAULTS: [(&str, usize, &str); 20] = [
     ("temperature off", 0, "temperature-off:S"),
     ("temperature off", 1, "temperature-off:S"),
 ];
+
+/// Name of a fault that grows for ten days, and its steps.
+const SLOWLY: &str = " in 10 days";
+const SLOW_S: f64 = 10.0 * 86_400.0;
+const SLOW_STEPS: u32 = 80;
 
 struct Options {
     packs: usize,
@@ -151,15 +158,27 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     let mut cases = Vec::new();
     for i in 0..each {
         for row @ (f, q, is_balancing) in rows.iter().copied() {
-            let (_, size, text) = FAULTS[f];
+            let (name, size, text) = FAULTS[f];
             // The same pack in every row: rows differ by their fault and sensors alone.
             let seed = options.seed + i as u64;
             let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
             let fault = fault_of(text, size, seed, days)?;
-            cases.push((row, Case { size, quality, is_balancing, fault, seed, days, period_ms: options.period_ms }));
+            let faults = if name.ends_with(SLOWLY) { slowly(fault) } else { fault.into_iter().collect() };
+            cases.push((row, Case { size, quality, is_balancing, faults, seed, days, period_ms: options.period_ms }));
         }
     }
     Ok(cases)
+}
+
+/// The same fault, growing in small steps.
+fn slowly(fault: Option<Fault>) -> Vec<Fault> {
+    let Some(Fault { kind: FaultKind::Resistance { cell, change }, from_s }) = fault else { return Vec::new() };
+    let change = (1.0 + change).powf(1.0 / f64::from(SLOW_STEPS)) - 1.0;
+    let step = |i| Fault {
+        kind: FaultKind::Resistance { cell, change },
+        from_s: from_s + f64::from(i) * SLOW_S / f64::from(SLOW_STEPS),
+    };
+    (0..SLOW_STEPS).map(step).collect()
 }
 
 fn fault_of(text: &str, size: PackSize, seed: u64, days: u32) -> Result<Option<Fault>, String> {
@@ -200,14 +219,14 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
 }
 
 /// Prints the findings that are not the fault's.
-fn list((f, q, is_balancing): Row, case: &Case, seen: &pack::Seen) {
+fn list((f, q, is_balancing): Row, case: &Case, seen: &[Seen]) {
     let (from_s, kind) =
-        case.fault.map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
-    for (at_s, found) in seen.iter().filter(|(at_s, found)| *at_s < from_s || Some(found.kind) != kind) {
+        case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
+    for Seen { at_s, found, .. } in seen.iter().filter(|it| it.at_s < from_s || Some(it.found.kind) != kind) {
         let (name, size, quality) = (FAULTS[f].0, SIZES[FAULTS[f].1].cells, QUALITIES[q].0);
         let (day, fault_day) = (at_s / 86_400.0, from_s / 86_400.0);
         eprintln!(
-            "{name} (day {fault_day:.2}), {size} cells, {quality}, balancing {is_balancing}, seed {}, day {day:.2}: {found:?}",
+            "{name} (day {fault_day:.2}), {size} cells, {quality}, balancing {is_balancing}, seed {}, day {day:.2}: {found}",
             case.seed
         );
     }
@@ -217,13 +236,14 @@ fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {
     let days = options.days;
     let mut text = format!(
         "# Diagnosis of simulated packs\n\nWritten by `tests/diagnose/run --write`. {days} days each. Found: right kind and right cell. Delays in days \
-         from the beginning of the fault, over all packs of the row: `-` when so many were not found. Wrong cell: right kind, on other cells only. \
+         from the beginning of the fault, over all packs of the row: `-` when so many were not found. In one drive: found before the second drive \
+         with the fault began. Wrong cell: right kind, on other cells only. \
          Wrong kind: in addition or instead. False: findings per pack-month without a fault, and in brackets the rate that they exclude at 95 %. \
          A finding that comes and goes counts once.\n\n\
          Rows are no independent samples: row by row the packs are the same ones, up to the fault. The packs' true cells follow the cell model that \
          the monitor has; real cells do not.\n\n\
-         | fault | pack | sensors | balancing | packs | found | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
-         | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
+         | fault | pack | sensors | balancing | packs | found | in one drive | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
+         | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
     );
     for ((f, q, is_balancing), score) in scores {
         let (name, size, _) = FAULTS[*f];

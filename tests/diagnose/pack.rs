@@ -19,6 +19,9 @@ use crate::finding::kind_of;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Time between two looks at the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;
+/// Discharge of a drive, part of the capacity per hour; and a time without one that ends it, s.
+const DRIVE_PER_H: f64 = 0.05;
+const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
 /// Capacity of the cells of the model file, Ah.
@@ -37,14 +40,22 @@ pub(crate) struct Case {
     pub(crate) size: PackSize,
     pub(crate) quality: SensorQuality,
     pub(crate) is_balancing: bool,
-    pub(crate) fault: Option<Fault>,
+    /// The fault; one that grows is several.
+    pub(crate) faults: Vec<Fault>,
     pub(crate) seed: u64,
     pub(crate) days: u32,
     pub(crate) period_ms: u32,
 }
 
-/// When each finding was there for the first time, s from the start.
-pub(crate) type Seen = Vec<(f64, Finding)>;
+/// A finding when it was there for the first time.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seen {
+    /// From the start, s.
+    pub(crate) at_s: f64,
+    /// Drives that have begun since the start of the fault, with the one in which it began.
+    pub(crate) drives: u32,
+    pub(crate) found: Finding,
+}
 
 /// The configuration of a pack, written into `folder`.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
@@ -140,6 +151,11 @@ fn pack(size: PackSize, sensors: u16) -> String {
 }
 
 impl Case {
+    /// The fault as it begins.
+    pub(crate) fn fault(&self) -> Option<Fault> {
+        self.faults.first().copied()
+    }
+
     fn simulation(&self, config: &MonitorConfig) -> Simulation {
         let mut settings = Settings::of(Scenario::EvDay, self.size.capacity_ah);
         settings.seed = self.seed;
@@ -153,18 +169,21 @@ impl Case {
         let sensors = self.size.cells.div_ceil(CELLS_PER_SENSOR);
         let temperature_at = (0..sensors).map(|i| Some(CellIndex(i * CELLS_PER_SENSOR))).collect();
         let sim = Simulation::new(config.model.clone(), settings, Wiring { strings: 1, temperature_at });
-        let sim = sim.with_faults(self.fault.as_slice());
+        let sim = sim.with_faults(&self.faults);
         if self.is_balancing { sim.with_balancing(Balancing::usual(self.size.capacity_ah)) } else { sim }
     }
 
     /// Runs the pack; the findings in the order in which they were there first, without those that are true of the sensors' own errors.
-    pub(crate) fn run(&self, config: &MonitorConfig) -> Seen {
+    pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<Seen> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
         let mut monitor = Monitor::new(MonitorConfig { is_balanced: self.is_balancing, ..config.clone() });
         let (mut ticks, mut out, mut frames) =
             (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
         let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);
+        let from_s = self.fault().map_or(f64::INFINITY, |fault| fault.from_s);
+        let least_a = DRIVE_PER_H * self.size.capacity_ah;
+        let mut drives = Drives::default();
         while let Some(moment) = sim.advance() {
             frames.clear();
             encoder.encode(sim.readings(), &mut frames);
@@ -177,13 +196,16 @@ impl Case {
                 monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
             }
             out.clear();
+            if moment.current_a > least_a {
+                drives.note(moment.time.secs(), from_s);
+            }
             if moment.time >= next_look {
                 next_look = moment.time.plus_secs(LOOK_S);
                 monitor.settle(&mut out);
-                seen.note(moment.time.secs(), monitor.findings());
+                seen.note(moment.time.secs(), drives.begun, monitor.findings());
             }
         }
-        let asked = self.fault.and_then(|fault| kind_of(&fault.kind));
+        let asked = self.fault().and_then(|fault| kind_of(&fault.kind));
         let (offset_a, offsets_v) = sim.sensor_offsets();
         let is_true = |found: &Finding| match (found.kind, found.cells) {
             (FindingKind::CurrentOffset, _) => offset_a.abs() >= OFFSET_PER_H * self.size.capacity_ah,
@@ -192,7 +214,7 @@ impl Case {
             }
             _ => false,
         };
-        seen.first.retain(|(_, found)| Some(found.kind) == asked || !is_true(found));
+        seen.first.retain(|seen| Some(seen.found.kind) == asked || !is_true(&seen.found));
         seen.first
     }
 }
@@ -206,16 +228,33 @@ fn median(values: &[f64]) -> f64 {
 /// Collects the first time of each finding.
 #[derive(Debug, Default)]
 struct Looks {
-    first: Seen,
+    first: Vec<Seen>,
     known: BTreeMap<(u8, Option<(CellIndex, CellIndex)>), ()>,
 }
 
 impl Looks {
-    fn note(&mut self, now_s: f64, found: &[Finding]) {
-        for finding in found {
-            if self.known.insert((code(finding.kind), finding.cells), ()).is_none() {
-                self.first.push((now_s, *finding));
+    fn note(&mut self, at_s: f64, drives: u32, found: &[Finding]) {
+        for &found in found {
+            if self.known.insert((code(found.kind), found.cells), ()).is_none() {
+                self.first.push(Seen { at_s, drives, found });
             }
+        }
+    }
+}
+
+/// Counts drives, from the one in which a fault begins.
+#[derive(Debug, Default)]
+struct Drives {
+    begun: u32,
+    last_s: Option<f64>,
+}
+
+impl Drives {
+    /// Takes a moment of a drive.
+    fn note(&mut self, now_s: f64, from_s: f64) {
+        let is_new = self.last_s.replace(now_s).is_none_or(|last_s| now_s - last_s > PARKED_S);
+        if now_s >= from_s && (is_new || self.begun == 0) {
+            self.begun += 1;
         }
     }
 }

@@ -17,6 +17,8 @@ pub(crate) struct Score {
     days: f64,
     /// Days from the beginning of the fault to the right finding, of the packs in which it was found.
     delays_days: Vec<f64>,
+    /// Packs in which it was found before the second drive with the fault began.
+    in_one_drive: u32,
     /// Packs whose fault was found on another cell only.
     wrong_cell: u32,
     /// Packs with a finding of another kind after the beginning.
@@ -30,21 +32,22 @@ pub(crate) struct Score {
 }
 
 impl Score {
-    pub(crate) fn add(&mut self, case: &Case, seen: &Seen) {
+    pub(crate) fn add(&mut self, case: &Case, seen: &[Seen]) {
         self.packs += 1;
         self.days += f64::from(case.days);
-        let from_s = case.fault.map_or(f64::INFINITY, |fault| fault.from_s);
+        let from_s = case.fault().map_or(f64::INFINITY, |fault| fault.from_s);
         self.healthy_days += f64::from(case.days).min(from_s / DAY_S);
-        self.false_findings +=
-            u32::try_from(seen.iter().filter(|(at_s, _)| *at_s < from_s).count()).unwrap_or(u32::MAX);
-        let Some(fault) = case.fault else { return };
-        let after = || seen.iter().filter(|(at_s, _)| *at_s >= from_s);
+        self.false_findings += seen.iter().filter(|seen| seen.at_s < from_s).count() as u32;
+        let Some(fault) = case.fault() else { return };
+        let after = || seen.iter().filter(|seen| seen.at_s >= from_s);
         let (kind, cells) = (kind_of(&fault.kind), places(&fault.kind));
-        let right = after().find(|(_, found)| Some(found.kind) == kind && is_right_place(&cells, found.cells));
-        self.delays_days.extend(right.map(|(at_s, _)| (at_s - from_s) / DAY_S));
-        let elsewhere = after().any(|(_, found)| Some(found.kind) == kind && !is_right_place(&cells, found.cells));
+        let is_right = |seen: &&Seen| is_right_place(&cells, seen.found.cells);
+        let right = after().filter(|seen| Some(seen.found.kind) == kind).find(is_right);
+        self.delays_days.extend(right.map(|seen| (seen.at_s - from_s) / DAY_S));
+        self.in_one_drive += u32::from(right.is_some_and(|seen| seen.drives <= 1));
+        let elsewhere = after().any(|seen| Some(seen.found.kind) == kind && !is_right(&seen));
         self.wrong_cell += u32::from(right.is_none() && elsewhere);
-        self.wrong_kind += u32::from(after().any(|(_, found)| Some(found.kind) != kind));
+        self.wrong_kind += u32::from(after().any(|seen| Some(seen.found.kind) != kind));
         self.any += u32::from(after().next().is_some());
     }
 
@@ -53,9 +56,10 @@ impl Score {
         let share = |count: usize| format!("{:.0} %", 100.0 * count as f64 / f64::from(self.packs.max(1)));
         let rate = self.false_rate();
         format!(
-            "{} | {} | {} | {} | {} | {} | {} | {rate}",
+            "{} | {} | {} | {} | {} | {} | {} | {} | {rate}",
             self.packs,
             share(self.delays_days.len()),
+            share(self.in_one_drive as usize),
             self.delay(0.5),
             self.delay(0.9),
             share(self.wrong_cell as usize),

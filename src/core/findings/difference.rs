@@ -43,12 +43,12 @@ const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Deviations that are added when a cell has changed at once, alone: its contact, its channel, or itself; but charge goes nowhere
-/// without a current.
-const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
+/// without a current, and what ages does so over weeks: a resistance that jumps is a contact.
+const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.01, 0.5, 0.04, 0.01];
 /// The same of a cell that is another one: its module has been replaced.
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// The same when only its resistance has changed.
-const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.2, 0.5, 0.0, 0.0];
+const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
 /// Usual loss of a cell that a BMS may bleed, standard deviation, fraction of the capacity in a day, and the time without a row from
 /// which on it may have lost much more, days (`open_charge`). With 0.01 a day, exchanged channels and modules drown in it.
 const BLED_PER_DAY: f64 = 0.002;
@@ -60,6 +60,8 @@ const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
 const JUMP_ROWS: u8 = 3;
 
+/// Least capacity, part of the mean cell's.
+const LEAST_CAPACITY: f64 = 0.1;
 /// Least variance of a state, and most of a mean or covariance: a thousand times the cell itself.
 const LEAST_VARIANCE: f64 = 1e-12;
 const MOST: f64 = 1e3;
@@ -131,9 +133,10 @@ impl Difference {
 
     /// Time and charge pass: days, and the change of the mean cell's SOC.
     pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
-        // charge += -capacity * soc_change - leak * days
-        let (by_capacity, by_leak) = (-soc_change, -days);
-        self.mean[SOC] += by_capacity * self.mean[CAPACITY] + by_leak * self.mean[LEAK];
+        // charge += (1 / (1 + capacity) - 1) * soc_change - leak * days
+        let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(LEAST_CAPACITY);
+        let (by_capacity, by_leak) = (-part * part * soc_change, -days);
+        self.mean[SOC] += (part - 1.0) * soc_change + by_leak * self.mean[LEAK];
         let get = |cov: &[f64; PAIRS], i, j| cov[pair(i, j)];
         let old = self.covariance;
         for j in 1..STATES {
@@ -318,7 +321,7 @@ mod tests {
             };
             let (passed_days, current) = (if change == 0.0 { 1.0 / 30.0 } else { 1.0 / 120.0 }, -change);
             soc += change;
-            charge += -truth[CAPACITY] * change - truth[LEAK] * passed_days;
+            charge += (1.0 / (1.0 + truth[CAPACITY]) - 1.0) * change - truth[LEAK] * passed_days;
             filter.pass(passed_days, change);
             // A curve that is not straight, a drop whose slow part comes late, a contact.
             let slope_v = 0.4 + 12.0 * (soc - 0.5) * (soc - 0.5);
