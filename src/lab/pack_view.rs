@@ -8,6 +8,9 @@ use crate::findings::imbalance::{CellSpread, LeftOut, LimitingCell, mean_ocv_v};
 use crate::findings::{Imbalance, UnknownImbalance};
 use crate::quantity::CellIndex;
 
+/// Most cells that are left out by name: more do not fit into a line.
+const MOST_NAMED: usize = 12;
+
 /// The lines; without a `model` there is no energy.
 pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&CellModel>) -> Vec<(String, String)> {
     let pack = match imbalance {
@@ -29,7 +32,11 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
     lines.extend(without.iter().filter_map(|(reason, words)| {
         let cells: Vec<String> =
             pack.left_out.iter().filter(|it| it.1 == *reason).map(|it| number(it.0).to_string()).collect();
-        (!cells.is_empty()).then(|| ("left out", format!("{words}: cell {}", cells.join(", "))))
+        match cells.len() {
+            0 => None,
+            count if count > MOST_NAMED => Some(("left out", format!("{words}: {count} cells"))),
+            _ => Some(("left out", format!("{words}: cell {}", cells.join(", ")))),
+        }
     }));
     lines.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }

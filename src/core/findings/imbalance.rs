@@ -15,7 +15,8 @@
 //! difference of the two limiting cells' capacities). The smallest of many uncertain values is below the smallest true one: the
 //! losses of a pack whose cells differ by no more than their deviations are too high.
 //!
-//! A cell with a faulty channel, and one whose difference is not known yet, is left out. Fewer than three cells: unknown.
+//! A cell with a faulty channel, and one whose difference is not known yet, is left out.
+//! Fewer than three cells, or than half of them: unknown.
 
 use serde::Serialize;
 
@@ -136,12 +137,14 @@ pub enum UnknownImbalance {
     #[error("the cells were not compared yet")]
     NotCompared,
     /// Too few cells can be compared.
-    #[error("{known} of {cells} cells can be compared, must be at least {LEAST_CELLS}")]
+    #[error("{known} of {cells} cells can be compared, must be at least {least}")]
     TooFewCells {
         /// Cells that can be compared.
         known: usize,
         /// Cells of the pack.
         cells: usize,
+        /// Fewest that must be.
+        least: usize,
     },
 }
 
@@ -180,9 +183,10 @@ impl Diagnosis {
                 known.push(ComparedCell { cell, soc, capacity, resistance, middle_soc, leaks, is_weak });
             }
         }
-        if known.len() < LEAST_CELLS {
-            let cells = known.len() + left_out.len();
-            return Err(UnknownImbalance::TooFewCells { known: known.len(), cells });
+        let cells = known.len() + left_out.len();
+        let least = LEAST_CELLS.max(cells.div_ceil(2));
+        if known.len() < least {
+            return Err(UnknownImbalance::TooFewCells { known: known.len(), cells, least });
         }
         Ok(Imbalance { left_out, ..imbalance(time, &known, middle_ah) })
     }
