@@ -2,6 +2,8 @@
 //!
 //! In: logs, which are replayed, or the stored state of a vehicle. Every "±" is one standard deviation.
 
+mod pack;
+
 use std::path::PathBuf;
 
 use serde::Serialize;
@@ -9,16 +11,19 @@ use serde::Serialize;
 use super::Failure;
 use super::output::{self, create_folder, failure, print_json, table};
 use super::replay::{Bar, InputArgs, log_options};
-use crate::config;
+use super::report::cell_model;
+use crate::config::{self, Config};
+use crate::filter::ScalarGaussian;
 use crate::findings::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
-use crate::findings::{Diagnosis, Finding, FindingKind};
+use crate::findings::{Diagnosis, Finding, FindingKind, UnknownImbalance};
 use crate::io::log::LogSource;
 use crate::io::stamp::format_utc;
-use crate::lab::{self, chart};
+use crate::lab::{self, chart, pack_view};
 use crate::monitor::{Monitor, Snapshot};
 use crate::quantity::CellIndex;
 use crate::replay::{self, ReplaySettings, Sinks};
 use crate::store::HistoryReader;
+use pack::PackPage;
 
 /// Arguments of `diagnose`.
 #[derive(Debug, clap::Args)]
@@ -47,6 +52,7 @@ pub(crate) struct Args {
 struct Page {
     version: u32,
     findings: Vec<FindingRow>,
+    pack: PackPage,
     cells: Vec<CellRow>,
 }
 
@@ -84,11 +90,18 @@ struct Value {
     std: f64,
 }
 
+impl From<ScalarGaussian> for Value {
+    fn from(value: ScalarGaussian) -> Self {
+        Self { mean: value.mean, std: value.std() }
+    }
+}
+
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let snapshot = match (&args.state, &args.config) {
+    let config = args.config.as_deref().map(config::load).transpose()?;
+    let snapshot = match (&args.state, &config) {
         (Some(folder), _) => stored(folder)?,
-        (None, Some(path)) => replayed(args, path)?,
+        (None, Some(config)) => replayed(args, config)?,
         (None, None) => return Err(Failure::new("neither --state nor --config, one must be given")),
     };
     let Some(diagnosis) = snapshot.diagnosis() else {
@@ -101,11 +114,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         create_folder(folder)?;
         chart::write_all(folder, &lab::finding_pictures::all(diagnosis)).map_err(failure)?;
     }
-    let page = page(diagnosis);
+    let imbalance = snapshot.imbalance().unwrap_or(Err(UnknownImbalance::NotCompared));
+    let model = cell_model(Some(&snapshot), config.as_ref())?.map(|sourced| sourced.model);
+    let page = page(diagnosis, PackPage::new(&imbalance, model.as_ref()));
     if args.json {
         return output::unless_closed(print_json(&page));
     }
-    output::print(&text(diagnosis, &page))
+    output::print(&text(diagnosis, pack_view::lines(&imbalance, model.as_ref()), &page))
 }
 
 fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
@@ -114,20 +129,19 @@ fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
     snapshot.ok_or_else(|| Failure::new(format!("{}: no state is stored there", folder.display())))
 }
 
-fn replayed(args: &Args, path: &std::path::Path) -> Result<Snapshot, Failure> {
-    let config = config::load(path)?;
-    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, &config));
+fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {
+    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     let settings = ReplaySettings { snapshot: true, ..plain };
     let bar = Bar::new(&args.logs);
-    let monitor = Monitor::new(config.monitor);
+    let monitor = Monitor::new(config.monitor.clone());
     let result = replay::run(&mut source, monitor, Sinks::default(), settings, &mut |progress| bar.show(progress));
     bar.clear();
     let (_, snapshot) = result.map_err(|error| Failure::new(error.to_string()))?;
     snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
 }
 
-fn page(diagnosis: &Diagnosis) -> Page {
+fn page(diagnosis: &Diagnosis, pack: PackPage) -> Page {
     let number = |cell: CellIndex| cell.0 + 1;
     let row = |found: &Finding| FindingRow {
         kind: found.kind,
@@ -143,7 +157,7 @@ fn page(diagnosis: &Diagnosis) -> Page {
     };
     let cells = (0..).map(CellIndex).map_while(|cell| {
         let states = diagnosis.relative(cell)?;
-        let value = |state: usize| states[state].map(|size| Value { mean: size.mean, std: size.std() });
+        let value = |state: usize| states[state].map(Value::from);
         Some(CellRow {
             cell: number(cell),
             soc: value(SOC),
@@ -154,10 +168,10 @@ fn page(diagnosis: &Diagnosis) -> Page {
             leak_per_day: value(LEAK),
         })
     });
-    Page { version: 1, findings: diagnosis.findings().iter().map(row).collect(), cells: cells.collect() }
+    Page { version: 1, findings: diagnosis.findings().iter().map(row).collect(), pack, cells: cells.collect() }
 }
 
-fn text(diagnosis: &Diagnosis, page: &Page) -> String {
+fn text(diagnosis: &Diagnosis, pack: Vec<(String, String)>, page: &Page) -> String {
     let mut text = String::new();
     if diagnosis.findings().is_empty() {
         text += "nothing found\n";
@@ -165,6 +179,8 @@ fn text(diagnosis: &Diagnosis, page: &Page) -> String {
     for found in diagnosis.findings() {
         text += &format!("{found}, since {}\n    {}\n", format_utc(found.since), found.kind.advice());
     }
+    text += "\npack\n";
+    text += &table::<&str>(&[], pack.into_iter().map(|(name, value)| vec![name, value]), 2);
     text += "\ndifference from the middle of the pack\n";
     let shown = |value: Option<Value>, scale: f64, digits: usize| {
         value.map_or_else(|| "-".to_owned(), |it| with_deviation(scale * it.mean, scale * it.std, digits))

@@ -71,6 +71,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         model: cell_model(snapshot.as_ref(), config.as_ref())?,
         config_text: config_text?,
         diagnosis: snapshot.as_ref().and_then(Snapshot::diagnosis),
+        imbalance: snapshot.as_ref().and_then(Snapshot::imbalance),
         reference: reference.unwrap_or_default(),
         provenance,
     };
@@ -107,7 +108,10 @@ impl Args {
 }
 
 /// The cells' model at the end: learned, else that of the configuration.
-fn cell_model(snapshot: Option<&Snapshot>, config: Option<&Config>) -> Result<Option<SourcedModel>, Failure> {
+pub(super) fn cell_model(
+    snapshot: Option<&Snapshot>,
+    config: Option<&Config>,
+) -> Result<Option<SourcedModel>, Failure> {
     let label = config.and_then(|config| config.monitor.label);
     let view = snapshot.map(|snapshot| snapshot.model(label)).transpose().map_err(failure)?.flatten();
     let configured = || {

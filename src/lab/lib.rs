@@ -17,6 +17,7 @@ pub mod ident;
 pub mod import;
 pub mod measured;
 pub mod model_pictures;
+pub mod pack_view;
 pub mod report;
 pub mod rul;
 pub mod score;

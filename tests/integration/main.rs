@@ -21,6 +21,7 @@ mod check_cli;
 mod contactor;
 mod contract;
 mod dbc_vectors;
+mod diagnose_cli;
 mod diagnostic;
 #[cfg(feature = "lab")]
 mod discover_cli;

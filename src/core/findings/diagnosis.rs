@@ -27,7 +27,7 @@ const HOLE_S: f64 = 60.0;
 /// Current of rest, part of the capacity per hour.
 const REST_PER_H: f64 = 0.02;
 /// Fewest cells with a middle.
-const LEAST_CELLS: usize = 3;
+pub(super) const LEAST_CELLS: usize = 3;
 /// Errors of a row: of the voltage, V; of the drop, fraction; of the SOC on the curve.
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
@@ -173,6 +173,11 @@ impl Diagnosis {
     #[inline]
     pub fn middle(&self) -> usize {
         self.middle
+    }
+
+    /// SOC of the mean cell in the last row, and that row's time; `None` = no row yet.
+    pub(super) fn middle_soc(&self) -> Option<(Timestamp, f64)> {
+        self.last_row.map(|(time, soc, _)| (time, soc))
     }
 
     /// Takes a sample of a cell; `None` = no current is known, and the row ends.

@@ -11,10 +11,12 @@
 //! | `row` | samples of some minutes, summed per cell |
 //! | `channels` | channels that are frozen or doubled |
 //! | `temperature` | temperature sensors that do not follow the load |
+//! | [`imbalance`] | what the differences cost the pack, and its limiting cells |
 //! | [`finding`] | kinds of findings, and from when on one is reported |
 pub mod diagnosis;
 pub mod difference;
 pub mod finding;
+pub mod imbalance;
 
 mod channels;
 mod row;
@@ -23,3 +25,4 @@ mod temperature;
 pub use diagnosis::{Diagnosis, MeanCell};
 pub use difference::Difference;
 pub use finding::{Finding, FindingKind};
+pub use imbalance::{Imbalance, UnknownImbalance};

@@ -22,7 +22,7 @@ use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, St
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
 use crate::filter::ScalarGaussian;
-use crate::findings::Diagnosis;
+use crate::findings::{Diagnosis, Imbalance, UnknownImbalance};
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp, bounds};
 use crate::sample::{CellSample, SampleConfig, SamplerState};
@@ -395,6 +395,15 @@ impl Snapshot {
     /// What is known of single cells; `None` = the pack is too small for a comparison, or the state is of an earlier program.
     pub fn diagnosis(&self) -> Option<&Diagnosis> {
         self.diagnosis.as_ref()
+    }
+
+    /// What the differences between the cells cost the pack; `None` = without a diagnosis.
+    pub fn imbalance(&self) -> Option<Result<Imbalance, UnknownImbalance>> {
+        let mut capacities: Vec<ScalarGaussian> =
+            (0..self.cells.len()).map(|cell| self.learning.learner.capacity(cell)).collect();
+        capacities.sort_by(|a, b| a.mean.total_cmp(&b.mean));
+        let middle = *capacities.get(capacities.len() / 2)?;
+        Some(self.diagnosis.as_ref()?.imbalance(middle))
     }
 
     /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a

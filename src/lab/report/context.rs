@@ -3,7 +3,7 @@
 use super::reference::Reference;
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
-use crate::findings::Diagnosis;
+use crate::findings::{Diagnosis, Imbalance, UnknownImbalance};
 
 /// Content of a page in addition to the data.
 #[derive(Debug, Default)]
@@ -18,6 +18,8 @@ pub struct PageContext<'a> {
     pub model: Option<SourcedModel>,
     /// What is found of single cells; `None` = they were not compared.
     pub diagnosis: Option<&'a Diagnosis>,
+    /// What the differences between the cells cost the pack; `None` = they were not compared.
+    pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
     /// Measured or true values.
     pub reference: Reference,
     /// Lines of the provenance: name and value.

@@ -8,8 +8,8 @@ use super::pictures::{self, NOT_STORED};
 use super::{forecast, model, raised, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
-use crate::finding_pictures;
 use crate::io::stamp::format_utc;
+use crate::{finding_pictures, pack_view};
 
 /// Most rows of a table; the pictures and `packwatch history` show all.
 const MAX_ROWS: usize = 200;
@@ -357,6 +357,10 @@ fn findings(context: &PageContext<'_>) -> Markup {
                     li { (found.to_string()) ", since " (format_utc(found.since)) ": " (found.kind.advice()) }
                 }
             }
+        }
+        @if let Some(imbalance) = &context.imbalance {
+            h3 { "What the differences between the cells cost the pack" }
+            (pairs(&pack_view::lines(imbalance, context.model.as_ref().map(|sourced| &sourced.model))))
         }
     }
 }

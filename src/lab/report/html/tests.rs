@@ -3,7 +3,7 @@
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
-use crate::findings::Diagnosis;
+use crate::findings::{Diagnosis, UnknownImbalance};
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
@@ -125,7 +125,9 @@ fn alarm(half: u16, active: bool) -> EventKind {
 fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
     let model = crate::config::of_label(&Label::usual(Chemistry::Nmc811Graphite, 2.6));
     let diagnosis = Diagnosis::new(96);
-    let context = PageContext { title: "pack".into(), model, diagnosis: Some(&diagnosis), ..PageContext::default() };
+    let imbalance = Some(Err(UnknownImbalance::NotCompared));
+    let title = "pack".into();
+    let context = PageContext { title, model, diagnosis: Some(&diagnosis), imbalance, ..PageContext::default() };
     let page = page(&life(), &context);
     println!("{} bytes", page.len());
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
@@ -136,6 +138,7 @@ fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everythin
         "Recharge period",
         "Innovation",
         "What would help most",
+        "unknown: the cells were not compared yet",
     ] {
         assert!(page.contains(part), "no {part}");
     }

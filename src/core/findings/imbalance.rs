@@ -1,0 +1,438 @@
+//! What the differences between the cells cost their pack: charge lost by imbalance and by the weakest cell, and the limiting cells.
+//!
+//! In: each cell's difference from the middle of the pack in SOC, capacity and resistance, the middle cell's SOC and capacity. Out:
+//! [`Imbalance`], in fractions of the mean cell's capacity. A charge ends when the first cell is full, a discharge when the first one
+//! is empty. With a cell's SOC s and capacity C:
+//!
+//! ```text
+//! usable            = min s C + min (1 - s) C
+//! lost by imbalance = min C - usable            what balancing gives back
+//! lost by weakest   = mean C - min C
+//! ```
+//!
+//! Standard deviations are to first order, by the states of the limiting cells. Assumptions: the errors of two cells, and those of a
+//! cell's SOC and capacity, are independent; the middle cell's SOC is exact (its error moves `usable` by its product with the
+//! difference of the two limiting cells' capacities). The smallest of many uncertain values is below the smallest true one: the
+//! losses of a pack whose cells differ by no more than their deviations are too high.
+//!
+//! A cell with a faulty channel, and one whose difference is not known yet, is left out.
+//! Fewer than three cells, or than half of them: unknown.
+
+use serde::Serialize;
+
+use super::diagnosis::{Diagnosis, LEAST_CELLS};
+use super::difference::{CAPACITY, RESISTANCE, SOC};
+use super::finding::FindingKind;
+use crate::cell::CellModel;
+use crate::filter::ScalarGaussian;
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Standard deviations from which on a cell's SOC and capacity are not known: half of those before the first row, or less.
+const UNKNOWN_SOC_STD: f64 = 0.025;
+const UNKNOWN_CAPACITY_STD: f64 = 0.05;
+/// Temperature of the open-circuit curve, degrees C, and its parts for the mean voltage.
+const OCV_C: f64 = 25.0;
+const OCV_PARTS: u32 = 100;
+
+/// What the differences between the cells cost. Fractions are of the mean cell's capacity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Imbalance {
+    /// Time of the last comparison.
+    pub time: Timestamp,
+    /// Number of cells that are compared.
+    pub cells: usize,
+    /// Mean of the cells' capacities, Ah.
+    pub mean_ah: ScalarGaussian,
+    /// Charge between the first full cell and the first empty cell, fraction.
+    pub usable: ScalarGaussian,
+    /// Charge that balancing gives back, fraction.
+    pub lost_by_imbalance: ScalarGaussian,
+    /// Charge that a pack of mean cells has more than this one balanced, fraction.
+    pub lost_by_weakest: ScalarGaussian,
+    /// The cell with the least capacity.
+    pub weakest: CellIndex,
+    /// The cell that ends a discharge.
+    pub discharge_limit: LimitingCell,
+    /// The cell that ends a charge.
+    pub charge_limit: LimitingCell,
+    /// Differences of SOC, fraction.
+    pub soc: CellSpread,
+    /// Differences of capacity, fraction of the middle cell's.
+    pub capacity: CellSpread,
+    /// Differences of resistance, fraction of the middle cell's.
+    pub resistance: CellSpread,
+    /// Cells that are not compared.
+    pub left_out: Vec<(CellIndex, LeftOut)>,
+}
+
+/// A cell that ends a charge or a discharge.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LimitingCell {
+    /// Which.
+    pub cell: CellIndex,
+    /// Its larger cause.
+    pub reason: LimitReason,
+    /// What it takes or gives less than the mean cell because of its charge, fraction of the mean cell's capacity.
+    pub by_charge: f64,
+    /// The same because of its capacity.
+    pub by_capacity: f64,
+}
+
+/// Why a cell is the limiting one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LimitReason {
+    /// It has less charge than the others when the pack is full.
+    LeastCharge,
+    /// It has more charge than the others when the pack is empty.
+    MostCharge,
+    /// It has less capacity than the others.
+    LeastCapacity,
+    /// It loses charge by itself: a finding.
+    Leak,
+    /// Its capacity is below that of the others: a finding.
+    WeakCell,
+}
+
+impl LimitReason {
+    /// In words.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::LeastCharge => "least charge",
+            Self::MostCharge => "most charge",
+            Self::LeastCapacity => "least capacity",
+            Self::Leak => "leak",
+            Self::WeakCell => "weak cell",
+        }
+    }
+}
+
+/// How far the cells differ in one state.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellSpread {
+    /// Standard deviation of the cells' estimates.
+    pub std: f64,
+    /// Root mean square of the estimates' own standard deviations: a `std` that is not above it says nothing.
+    pub error: f64,
+    /// Cell with the lowest value, and its difference from the middle.
+    pub lowest: (CellIndex, f64),
+    /// Cell with the highest value, and its difference from the middle.
+    pub highest: (CellIndex, f64),
+}
+
+/// Why a cell is not compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LeftOut {
+    /// What is read as its voltage is not that.
+    FaultyChannel,
+    /// Its SOC or capacity beside the others is not known yet.
+    NotKnown,
+}
+
+/// Why nothing is known of a pack's imbalance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum UnknownImbalance {
+    /// No row has ended since the start, or since a time of unknown length.
+    #[error("the cells were not compared yet")]
+    NotCompared,
+    /// Too few cells can be compared.
+    #[error("{known} of {cells} cells can be compared, must be at least {least}")]
+    TooFewCells {
+        /// Cells that can be compared.
+        known: usize,
+        /// Cells of the pack.
+        cells: usize,
+        /// Fewest that must be.
+        least: usize,
+    },
+}
+
+impl Imbalance {
+    /// A fraction of the mean cell's capacity in Ah.
+    pub fn ah(&self, part: ScalarGaussian) -> ScalarGaussian {
+        let mean = part.mean * self.mean_ah.mean;
+        let variance = part.variance * self.mean_ah.mean * self.mean_ah.mean
+            + part.mean * part.mean * self.mean_ah.variance
+            + part.variance * self.mean_ah.variance;
+        ScalarGaussian { mean, variance }
+    }
+}
+
+impl Diagnosis {
+    /// What the differences between the cells cost. `middle_ah`: capacity of the middle cell, Ah.
+    ///
+    /// # Errors
+    /// Why it is not known.
+    pub fn imbalance(&self, middle_ah: ScalarGaussian) -> Result<Imbalance, UnknownImbalance> {
+        let (time, middle_soc) = self.middle_soc().ok_or(UnknownImbalance::NotCompared)?;
+        let (mut known, mut left_out) = (Vec::new(), Vec::new());
+        for cell in (0..).map(CellIndex) {
+            let Some(states) = self.relative(cell) else { break };
+            let (Some(soc), Some(capacity), Some(resistance)) = (states[SOC], states[CAPACITY], states[RESISTANCE])
+            else {
+                continue;
+            };
+            if self.has_channel_fault(cell) == Some(true) {
+                left_out.push((cell, LeftOut::FaultyChannel));
+            } else if soc.std() >= UNKNOWN_SOC_STD || capacity.std() >= UNKNOWN_CAPACITY_STD {
+                left_out.push((cell, LeftOut::NotKnown));
+            } else {
+                let has = |kind| self.findings().iter().any(|found| found.kind == kind && found.is_of(cell));
+                let (leaks, is_weak) = (has(FindingKind::Leak), has(FindingKind::WeakCell));
+                known.push(ComparedCell { cell, soc, capacity, resistance, middle_soc, leaks, is_weak });
+            }
+        }
+        let cells = known.len() + left_out.len();
+        let least = LEAST_CELLS.max(cells.div_ceil(2));
+        if known.len() < least {
+            return Err(UnknownImbalance::TooFewCells { known: known.len(), cells, least });
+        }
+        Ok(Imbalance { left_out, ..imbalance(time, &known, middle_ah) })
+    }
+}
+
+/// Mean open-circuit voltage from empty to full of a cell that has aged to a capacity, V.
+pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
+    let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
+    let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), OCV_C), capacity_ah);
+    (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
+}
+
+/// A cell beside the middle one.
+#[derive(Debug, Clone, Copy)]
+struct ComparedCell {
+    cell: CellIndex,
+    /// Differences: of SOC; of capacity and resistance, fractions of the middle cell's.
+    soc: ScalarGaussian,
+    capacity: ScalarGaussian,
+    resistance: ScalarGaussian,
+    /// SOC of the middle cell.
+    middle_soc: f64,
+    leaks: bool,
+    is_weak: bool,
+}
+
+impl ComparedCell {
+    /// Capacity, fraction of the middle cell's.
+    fn capacity(&self) -> f64 {
+        1.0 + self.capacity.mean
+    }
+
+    fn own_soc(&self) -> f64 {
+        self.middle_soc + self.soc.mean
+    }
+
+    /// Charge down to empty, fraction of the middle cell's capacity.
+    fn dischargeable(&self) -> f64 {
+        self.own_soc() * self.capacity()
+    }
+
+    /// Charge up to full, fraction of the middle cell's capacity.
+    fn chargeable(&self) -> f64 {
+        (1.0 - self.own_soc()) * self.capacity()
+    }
+
+    /// The reason by the larger cause.
+    fn reason(&self, by_charge: f64, by_capacity: f64, charge: LimitReason) -> LimitReason {
+        match (by_capacity > by_charge, charge) {
+            (true, _) if self.is_weak => LimitReason::WeakCell,
+            (true, _) => LimitReason::LeastCapacity,
+            (false, LimitReason::LeastCharge) if self.leaks => LimitReason::Leak,
+            (false, charge) => charge,
+        }
+    }
+}
+
+/// Of some cells, at least one.
+fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian) -> Imbalance {
+    let mean = |value: fn(&ComparedCell) -> f64| cells.iter().map(value).sum::<f64>() / cells.len() as f64;
+    let (mean_capacity, each) = (mean(ComparedCell::capacity), 1.0 / cells.len() as f64);
+    let weakest = least(cells, ComparedCell::capacity);
+    let (first_empty, first_full) = (least(cells, ComparedCell::dischargeable), least(cells, ComparedCell::chargeable));
+    let usable = first_empty.dischargeable() + first_full.chargeable();
+    // Slopes by a cell's SOC and capacity.
+    let usable_slopes = |it: &ComparedCell| {
+        let (empty, full) = (is(it, first_empty), is(it, first_full));
+        [(empty - full) * it.capacity(), empty * it.own_soc() + full * (1.0 - it.own_soc())]
+    };
+    let lost_slopes = |it: &ComparedCell| {
+        let [by_soc, by_capacity] = usable_slopes(it);
+        [-by_soc, is(it, weakest) - by_capacity]
+    };
+    let part = |mean: f64, variance: f64| ScalarGaussian {
+        mean: mean / mean_capacity,
+        variance: variance / (mean_capacity * mean_capacity),
+    };
+    // What a cell takes or gives less = its capacity less + what the other end has more.
+    let less = |it: &ComparedCell, other_end: fn(&ComparedCell) -> f64, charge| {
+        let by_capacity = (mean_capacity - it.capacity()) / mean_capacity;
+        let by_charge = (other_end(it) - mean(other_end)) / mean_capacity;
+        LimitingCell { cell: it.cell, reason: it.reason(by_charge, by_capacity, charge), by_charge, by_capacity }
+    };
+    Imbalance {
+        time,
+        cells: cells.len(),
+        mean_ah: ScalarGaussian {
+            mean: middle_ah.mean * mean_capacity,
+            variance: middle_ah.variance * mean_capacity * mean_capacity,
+        },
+        usable: part(usable, variance(cells, usable_slopes)),
+        lost_by_imbalance: part(weakest.capacity() - usable, variance(cells, lost_slopes)),
+        lost_by_weakest: part(mean_capacity - weakest.capacity(), variance(cells, |it| [0.0, each - is(it, weakest)])),
+        weakest: weakest.cell,
+        discharge_limit: less(first_empty, ComparedCell::chargeable, LimitReason::LeastCharge),
+        charge_limit: less(first_full, ComparedCell::dischargeable, LimitReason::MostCharge),
+        soc: spread(cells, |it| it.soc),
+        capacity: spread(cells, |it| it.capacity),
+        resistance: spread(cells, |it| it.resistance),
+        left_out: Vec::new(),
+    }
+}
+
+/// The first cell with the least value.
+fn least(cells: &[ComparedCell], value: fn(&ComparedCell) -> f64) -> &ComparedCell {
+    cells.iter().fold(&cells[0], |least, it| if value(it) < value(least) { it } else { least })
+}
+
+/// 1 for the same cell, else 0.
+fn is(a: &ComparedCell, b: &ComparedCell) -> f64 {
+    f64::from(u8::from(a.cell == b.cell))
+}
+
+fn variance(cells: &[ComparedCell], slopes: impl Fn(&ComparedCell) -> [f64; 2]) -> f64 {
+    let of_cell = |it: &ComparedCell| {
+        let [by_soc, by_capacity] = slopes(it);
+        by_soc * by_soc * it.soc.variance + by_capacity * by_capacity * it.capacity.variance
+    };
+    cells.iter().map(of_cell).sum()
+}
+
+fn spread(cells: &[ComparedCell], state: fn(&ComparedCell) -> ScalarGaussian) -> CellSpread {
+    let count = cells.len() as f64;
+    let mean = cells.iter().map(|it| state(it).mean).sum::<f64>() / count;
+    let squares: f64 = cells.iter().map(|it| (state(it).mean - mean).powi(2)).sum();
+    let errors: f64 = cells.iter().map(|it| state(it).variance).sum();
+    let by_value = |a: &&ComparedCell, b: &&ComparedCell| state(a).mean.total_cmp(&state(b).mean);
+    let shown = |it: Option<&ComparedCell>| it.map_or((CellIndex(0), mean), |it| (it.cell, state(it).mean));
+    CellSpread {
+        std: (squares / (count - 1.0).max(1.0)).sqrt(),
+        error: (errors / count).sqrt(),
+        lowest: shown(cells.iter().min_by(by_value)),
+        highest: shown(cells.iter().max_by(by_value)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::model::tests::small_model;
+
+    const MIDDLE_AH: ScalarGaussian = ScalarGaussian { mean: 50.0, variance: 1.0 };
+
+    /// Ten cells, the middle one at 60 %, of which some have another SOC (difference) and capacity (fraction).
+    fn pack(others: &[(u16, f64, f64)]) -> Vec<ComparedCell> {
+        let known = |mean, std| ScalarGaussian::from_std(mean, std);
+        let cell = |cell| {
+            let (_, soc, capacity) = others.iter().copied().find(|it| it.0 == cell).unwrap_or((cell, 0.0, 0.0));
+            ComparedCell {
+                cell: CellIndex(cell),
+                soc: known(soc, 0.003),
+                capacity: known(capacity, 0.006),
+                resistance: known(0.0, 0.04),
+                middle_soc: 0.6,
+                leaks: false,
+                is_weak: false,
+            }
+        };
+        (0..10).map(cell).collect()
+    }
+
+    fn of(cells: &[ComparedCell]) -> Imbalance {
+        imbalance(Timestamp::ZERO, cells, MIDDLE_AH)
+    }
+
+    fn assert_near(found: f64, expected: f64) {
+        assert!((found - expected).abs() < 1e-12, "{found}, not {expected}");
+    }
+
+    #[test]
+    fn a_balanced_pack_of_equal_cells_loses_nothing() {
+        let found = of(&pack(&[]));
+        assert_near(found.usable.mean, 1.0);
+        assert_near(found.lost_by_imbalance.mean, 0.0);
+        assert_near(found.lost_by_weakest.mean, 0.0);
+        assert_eq!((found.cells, found.soc.std), (10, 0.0));
+        assert_near(found.soc.error, 0.003);
+    }
+
+    #[test]
+    fn a_cell_with_less_charge_ends_the_discharge_and_balancing_gives_it_back() {
+        // 0.55 down to its end, 0.4 up to that of the others.
+        let found = of(&pack(&[(3, -0.05, 0.0)]));
+        assert_near(found.usable.mean, 0.95);
+        assert_near(found.lost_by_imbalance.mean, 0.05);
+        assert_near(found.lost_by_weakest.mean, 0.0);
+        // Its SOC and that of the first full cell, with their capacities 0.55 and 0.4 of the way.
+        let expected: f64 = 2.0 * 0.003f64.powi(2) + (0.55f64.powi(2) + 0.4f64.powi(2)) * 0.006f64.powi(2);
+        assert_near(found.usable.variance, expected);
+        let LimitingCell { cell, reason, by_charge, by_capacity } = found.discharge_limit;
+        assert_eq!((cell, reason), (CellIndex(3), LimitReason::LeastCharge));
+        assert_near(by_charge, 0.05 - 0.005);
+        assert_near(by_capacity, 0.0);
+        assert_eq!(found.soc.lowest, (CellIndex(3), -0.05));
+    }
+
+    #[test]
+    fn a_weak_cell_that_is_full_with_the_others_loses_nothing_by_imbalance() {
+        // 40 % of a mean cell up to full: 0.4 of 0.9, so at SOC 5 / 9.
+        let found = of(&pack(&[(3, 5.0 / 9.0 - 0.6, -0.1)]));
+        assert_near(found.usable.mean, 0.9 / 0.99);
+        assert_near(found.lost_by_imbalance.mean, 0.0);
+        assert_near(found.lost_by_weakest.mean, 0.09 / 0.99);
+        assert_eq!((found.weakest, found.discharge_limit.cell), (CellIndex(3), CellIndex(3)));
+        assert_eq!(found.discharge_limit.reason, LimitReason::LeastCapacity);
+    }
+
+    #[test]
+    fn the_larger_of_two_causes_is_the_reason_unless_a_finding_names_it() {
+        // A tenth weak and 5 points below its place: 0.9 * (5/9 - 0.05) down, 0.4 up.
+        let mut cells = pack(&[(3, 5.0 / 9.0 - 0.6 - 0.05, -0.1)]);
+        let found = of(&cells);
+        assert_near(found.usable.mean, (0.5 - 0.045 + 0.4) / 0.99);
+        assert_near(found.lost_by_imbalance.mean, 0.045 / 0.99);
+        assert_eq!(found.discharge_limit.reason, LimitReason::LeastCapacity);
+        cells[3].is_weak = true;
+        assert_eq!(of(&cells).discharge_limit.reason, LimitReason::WeakCell);
+        let mut cells = pack(&[(3, -0.2, -0.05)]);
+        assert_eq!(of(&cells).discharge_limit.reason, LimitReason::LeastCharge);
+        cells[3].leaks = true;
+        assert_eq!(of(&cells).discharge_limit.reason, LimitReason::Leak);
+    }
+
+    #[test]
+    fn a_cell_with_more_charge_ends_the_charge() {
+        let found = of(&pack(&[(7, 0.04, 0.0)]));
+        assert_near(found.lost_by_imbalance.mean, 0.04);
+        assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::MostCharge));
+        // Empty with the others, a weak cell is full first.
+        let found = of(&pack(&[(7, 0.6 / 0.9 - 0.6, -0.1)]));
+        assert_near(found.lost_by_imbalance.mean, 0.0);
+        assert_eq!((found.charge_limit.cell, found.charge_limit.reason), (CellIndex(7), LimitReason::LeastCapacity));
+    }
+
+    #[test]
+    fn charge_in_ah_has_the_deviation_of_the_capacity_too() {
+        let found = of(&pack(&[(3, -0.05, 0.0)]));
+        let lost = found.ah(found.lost_by_imbalance);
+        assert_near(lost.mean, 2.5);
+        assert!(lost.std() > 50.0 * found.lost_by_imbalance.std());
+        assert!((mean_ocv_v(&small_model(), 2.0) - 3.6).abs() < 0.1, "{}", mean_ocv_v(&small_model(), 2.0));
+    }
+
+    #[test]
+    fn cells_of_which_nothing_is_known_are_no_healthy_pack() {
+        assert_eq!(Diagnosis::new(2).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
+        assert_eq!(Diagnosis::new(12).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
+    }
+}
