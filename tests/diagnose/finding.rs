@@ -12,7 +12,7 @@ pub(crate) fn kind_of(fault: &FaultKind) -> Option<FindingKind> {
         FaultKind::Resistance { .. } => Some(FindingKind::HighResistance),
         FaultKind::Module { .. } => Some(FindingKind::Module),
         FaultKind::CurrentOffset(_) => Some(FindingKind::CurrentOffset),
-        FaultKind::CurrentGain(_) => None,
+        FaultKind::CurrentGain(_) => Some(FindingKind::CurrentGain),
         FaultKind::CurrentStuck => Some(FindingKind::CurrentFrozen),
         FaultKind::VoltageOffset { .. } => Some(FindingKind::VoltageChannel),
         FaultKind::VoltageStuck { .. } => Some(FindingKind::VoltageFrozen),

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::channels::{Channel, compare};
 use super::difference::{CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{Finding, FindingKind};
+use super::gain::{Gain, Learned};
 use super::row::{CellSums, PackSums};
 use super::temperature::Following;
 use crate::cell::CellModel;
@@ -53,6 +54,9 @@ const SWAP_V: f64 = 0.008;
 /// SOC at which a BMS bleeds: near the end of a charge.
 const BLED_SOC: f64 = 0.9;
 const DAY_S: f64 = 86_400.0;
+/// Kinds up to the last one that a cell may have.
+const CELL_KINDS: usize = FindingKind::TemperatureSensor as usize;
+
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
@@ -81,7 +85,7 @@ struct Watched {
     channel: Channel,
     temperature: Following,
     /// Since when each kind is likelier than not.
-    suspected: [Option<Timestamp>; FindingKind::ALL.len()],
+    suspected: [Option<Timestamp>; CELL_KINDS],
     /// When it last changed at once.
     jumped: Option<Timestamp>,
 }
@@ -112,6 +116,8 @@ pub struct Diagnosis {
     is_balanced: bool,
     /// The cell that shows the least charge, where there is no doubt.
     lowest: Option<usize>,
+    #[serde(default)]
+    gain: Gain,
     findings: Vec<Finding>,
 }
 
@@ -125,7 +131,7 @@ impl Diagnosis {
             sums: CellSums::default(),
             channel: Channel::default(),
             temperature: Following::default(),
-            suspected: [None; FindingKind::ALL.len()],
+            suspected: [None; CELL_KINDS],
             jumped: None,
         };
         Self {
@@ -137,6 +143,7 @@ impl Diagnosis {
             middle: 0,
             is_balanced: false,
             lowest: None,
+            gain: Gain::default(),
             findings: Vec::new(),
         }
     }
@@ -237,6 +244,20 @@ impl Diagnosis {
         let was_known = find(&self.findings).is_some();
         self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
         find(&self.findings).filter(|_| !was_known)
+    }
+
+    /// Takes what is known of all cells, once a day; the finding when the gain of the current's sensor has newly risen.
+    pub fn note_day(
+        &mut self,
+        time: Timestamp,
+        temperature_c: f64,
+        cells: impl Iterator<Item = Learned>,
+    ) -> Option<Finding> {
+        if !self.gain.is_due(time) {
+            return None;
+        }
+        let (probability, size) = self.gain.take(time, temperature_c, &cells.collect::<Vec<_>>());
+        self.note_sensor(time, FindingKind::CurrentGain, probability, size)
     }
 
     /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
@@ -472,6 +493,7 @@ impl Diagnosis {
             moved(&mut found.reported);
         });
         self.last_row.iter_mut().for_each(|(time, ..)| moved(time));
+        self.gain.rebase(by_nanos);
         for cell in &mut self.cells {
             cell.suspected.iter_mut().flatten().chain(&mut cell.jumped).for_each(moved);
         }
@@ -503,6 +525,7 @@ impl Diagnosis {
         let last = self.last_row.map_or([0.0; 2], |(_, soc, charge_ah)| [soc, charge_ah]);
         let numbers = [current_a, drop_v, soc, temperature_c, charge_ah, first_ah, self.rest_s, self.ohm];
         InvalidState::unless_numbers("a number of the diagnosis", numbers.into_iter().chain(last))?;
+        self.gain.check()?;
         for found in &self.findings {
             let (first, last) = found.cells.unwrap_or((CellIndex(0), CellIndex(0)));
             let is_there = first <= last && last.index() < cells;

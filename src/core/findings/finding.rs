@@ -38,11 +38,13 @@ pub enum FindingKind {
     CurrentFrozen = 12,
     /// The temperature sensor of these cells does not follow the load; the value is 1.
     TemperatureSensor = 13,
+    /// The gain of the current's sensor has risen; fraction.
+    CurrentGain = 14,
 }
 
 impl FindingKind {
     /// Every kind, in the order of the wire.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Leak,
         Self::Contact,
         Self::WeakCell,
@@ -56,6 +58,7 @@ impl FindingKind {
         Self::CurrentOffset,
         Self::CurrentFrozen,
         Self::TemperatureSensor,
+        Self::CurrentGain,
     ];
 
     /// As written in events, status and reports.
@@ -74,6 +77,7 @@ impl FindingKind {
             Self::CurrentOffset => "current_offset",
             Self::CurrentFrozen => "current_frozen",
             Self::TemperatureSensor => "temperature_sensor",
+            Self::CurrentGain => "current_gain",
         }
     }
 
@@ -93,6 +97,7 @@ impl FindingKind {
             Self::CurrentOffset => "current sensor off",
             Self::CurrentFrozen => "current frozen",
             Self::TemperatureSensor => "temperature sensor does not follow the load",
+            Self::CurrentGain => "current sensor shows too much",
         }
     }
 
@@ -114,6 +119,9 @@ impl FindingKind {
             Self::SwappedChannels => "the sense wires or the signals of the two channels are exchanged",
             Self::CurrentOffset => "compare the sensor at rest with an ammeter, and zero it",
             Self::CurrentFrozen => "the reading is no current: check sensor and sender",
+            Self::CurrentGain => {
+                "compare the sensor under load with an ammeter: all capacities and resistances have changed by its gain"
+            }
             Self::TemperatureSensor => "the sensor has fallen off or shows one value: check where it sits",
         }
     }
@@ -149,6 +157,7 @@ impl FindingKind {
             Self::WeakCell | Self::ForeignCell | Self::Module => CAPACITY,
             Self::HighResistance => RESISTANCE,
             Self::VoltageChannel => CHANNEL_V,
+            Self::CurrentGain => GAIN,
             _ => 0.5,
         }
     }
@@ -218,9 +227,17 @@ pub const CHANNEL_V: f64 = 0.015;
 /// Offset of the current beyond which its sensor is faulty, part of the rated capacity per hour: SOC runs away by a quarter in a day.
 pub const OFFSET_PER_H: f64 = 0.01;
 
+/// Rise of the current's gain beyond which its sensor is faulty, fraction.
+pub const GAIN: f64 = 0.02;
+
 /// Probability from which on a finding is reported, and below which it is withdrawn.
 pub(super) const REPORTED: f64 = 0.999;
 pub(super) const WITHDRAWN: f64 = 0.5;
 
 /// Least distance from the middle of the pack in robust standard deviations of its cells: cells of one kind differ.
 pub(super) const OUTLIER: f64 = 3.5;
+
+/// Probability that a standard normal value is below.
+pub(super) fn normal_cdf(value: f64) -> f64 {
+    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
+}

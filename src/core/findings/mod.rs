@@ -9,6 +9,7 @@
 //! | [`diagnosis`] | all cells: rows in, findings out |
 //! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
 //! | `row` | samples of some minutes, summed per cell |
+//! | [`gain`] | the current sensor's gain, by what all cells have in common |
 //! | `channels` | channels that are frozen or doubled |
 //! | `temperature` | temperature sensors that do not follow the load |
 //! | [`imbalance`] | what the differences cost the pack, and its limiting cells |
@@ -16,6 +17,7 @@
 pub mod diagnosis;
 pub mod difference;
 pub mod finding;
+pub mod gain;
 pub mod imbalance;
 
 mod channels;

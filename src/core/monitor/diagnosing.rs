@@ -12,6 +12,7 @@ use super::{Event, EventKind, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::findings::finding::OFFSET_PER_H;
+use crate::findings::gain::Learned;
 use crate::findings::{Diagnosis, FindingKind, MeanCell};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
@@ -108,6 +109,11 @@ impl Diagnosing {
             let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
+            let cell = |index: usize| Learned {
+                capacity_ah: learning.capacity(index),
+                log_resistance: bank.log_resistance(index).mean,
+            };
+            reported.extend(self.diagnosis.note_day(now, temperature_c, (0..self.cells).map(cell)));
             out.events
                 .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }

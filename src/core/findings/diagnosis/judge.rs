@@ -3,7 +3,7 @@
 use super::Diagnosis;
 use crate::filter::ScalarGaussian;
 use crate::findings::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
-use crate::findings::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN};
+use crate::findings::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// Time within which the cells of a module are found to have more capacity than the others.
@@ -25,11 +25,6 @@ struct Judged {
     probability: f64,
     /// Whether the cell is near enough to the others for it.
     is_comparable: bool,
-}
-
-/// Probability that a standard normal value is below.
-fn normal_cdf(value: f64) -> f64 {
-    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
 }
 
 /// Middle and robust standard deviation (median of the absolute deviations) of the cells.

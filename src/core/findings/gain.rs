@@ -1,0 +1,182 @@
+//! A gain of the current sensor that has risen, which all cells share.
+//!
+//! In: once a day, what the estimators know of the middle of the cells. Out: by how much the gain has risen.
+//!
+//! A sensor that shows `g` times the current makes every resistance `1/g` times as large at once, and every capacity `g` times as large
+//! as it is learned anew. No battery gains capacity while its resistance falls. A gain that falls looks like age: nothing is said.
+
+use serde::{Deserialize, Serialize};
+
+use super::finding::{GAIN, REPORTED, normal_cdf};
+use crate::filter::ScalarGaussian;
+use crate::quantity::{InvalidState, Timestamp};
+
+/// Days that are compared: what takes longer is a season or age.
+const DAYS: usize = 10;
+const DAY_S: f64 = 86_400.0;
+/// Most time between two days, s, and most difference of their temperatures, K.
+const APART_S: f64 = 3.0 * DAY_S;
+const APART_K: f64 = 5.0;
+/// Error of a change within these days, fraction.
+const ERROR: f64 = 0.005;
+/// Deviation above which a capacity is not known yet, fraction: what it learns would be a change.
+const KNOWN: f64 = 0.03;
+
+/// The middle of the cells on one day.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Day {
+    time: Timestamp,
+    /// Logarithms of the capacity in Ah and of the resistance to the model's.
+    log_capacity: f64,
+    log_resistance: f64,
+    /// Degrees C.
+    temperature_c: f64,
+}
+
+/// What is known of one cell's capacity and resistance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Learned {
+    /// Ah.
+    pub capacity_ah: ScalarGaussian,
+    /// Logarithm of the resistance to the model's.
+    pub log_resistance: f64,
+}
+
+/// The last days.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Gain {
+    /// When the last day was looked at.
+    last: Option<Timestamp>,
+    days: Vec<Day>,
+}
+
+/// Middle of some values, 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or_default()
+}
+
+impl Gain {
+    /// Whether a day has passed since the last one.
+    pub(super) fn is_due(&self, now: Timestamp) -> bool {
+        self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
+    }
+
+    /// Takes the cells of a day; probability that the gain has risen beyond [`GAIN`], and by how much, fraction. The days before a
+    /// rise are kept for as long as it is there.
+    pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[Learned]) -> (f64, ScalarGaussian) {
+        let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
+        let part = |cell: &Learned| cell.capacity_ah.std() / cell.capacity_ah.mean;
+        let is_known = median(cells.iter().map(part).collect()) <= KNOWN;
+        let now = Day {
+            time,
+            log_capacity: median(cells.iter().map(|cell| libm::log(cell.capacity_ah.mean)).collect()),
+            log_resistance: median(cells.iter().map(|cell| cell.log_resistance).collect()),
+            temperature_c,
+        };
+        let is_possible = [now.log_capacity, now.log_resistance, temperature_c].iter().all(|it| it.is_finite());
+        let is_later = self.last.replace(time).is_none_or(|last| time.since(last) >= 0.0);
+        if !is_known || !is_possible || !is_later {
+            self.days.clear();
+            return none;
+        }
+        self.days.push(now);
+        let rises = self.days.windows(2).filter_map(|pair| rise(&pair[0], &pair[1], &now));
+        let size = ScalarGaussian { mean: rises.fold(0.0, f64::max), ..none.1 };
+        let probability = normal_cdf((size.mean - GAIN) / ERROR);
+        if probability >= REPORTED {
+            self.days.pop();
+        } else if self.days.len() > DAYS {
+            self.days.remove(0);
+        }
+        (probability, size)
+    }
+
+    /// Moves every stamp by `by_nanos`, onto another clock.
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        let stamps = self.days.iter_mut().map(|day| &mut day.time).chain(&mut self.last);
+        stamps.for_each(|stamp| *stamp = stamp.plus_nanos(by_nanos));
+    }
+
+    /// Checks the numbers of stored days.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        let numbers = self.days.iter().flat_map(|day| [day.log_capacity, day.log_resistance, day.temperature_c]);
+        InvalidState::unless_numbers("a day of the current's gain", numbers)?;
+        let count = self.days.len();
+        InvalidState::unless(count <= DAYS, "the days of the current's gain", count as f64, "10 at most")
+    }
+}
+
+/// Rise of the gain between two days that `now` still shows, fraction: of the fall of the resistance and the rise of the capacity
+/// the smaller one. `None` = the days cannot be compared.
+fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
+    let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= APART_K;
+    let is_next = after.time.since(before.time) <= APART_S;
+    let fell = before.log_resistance - after.log_resistance.max(now.log_resistance);
+    (is_next && is_near(after) && is_near(now)).then(|| fell.min(now.log_capacity - before.log_capacity))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Probability and size after each day; the gain is this much on it, and the capacity follows by a third a day.
+    fn after_days(gains: &[f64], temperatures_c: impl Fn(usize) -> f64) -> Vec<(f64, f64)> {
+        let (mut watch, mut capacity_ah) = (Gain::default(), 60.0);
+        gains
+            .iter()
+            .enumerate()
+            .map(|(day, gain)| {
+                let time = Timestamp::from_secs(day as f64 * DAY_S + 60.0 * (day % 2) as f64);
+                capacity_ah += (60.0 * gain - capacity_ah) / 3.0;
+                let capacity_ah = ScalarGaussian::from_std(capacity_ah, 1.0);
+                let cell = Learned { capacity_ah, log_resistance: 0.1 - libm::log(*gain) };
+                let (probability, size) = watch.take(time, temperatures_c(day), &[cell; 5]);
+                (probability, size.mean)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_gain_that_rises_is_found_and_stays_until_it_falls() {
+        let gains: Vec<f64> = (0..60).map(|day| if (8..45).contains(&day) { 1.05 } else { 1.0 }).collect();
+        let found = after_days(&gains, |_| 25.0);
+        let since = found.iter().position(|(probability, _)| *probability >= REPORTED);
+        assert!(since.is_some_and(|day| (9..14).contains(&day)), "{found:?}");
+        assert!(found[14..45].iter().all(|(probability, _)| *probability >= REPORTED), "{found:?}");
+        assert!((found[44].1 - 0.05).abs() < 0.005 && found[50].0 < 0.5, "{found:?}");
+    }
+
+    #[test]
+    fn age_and_seasons_and_a_capacity_that_is_being_learned_are_none() {
+        let falls: Vec<f64> = (0..40).map(|day| if day < 8 { 1.0 } else { 0.9 }).collect();
+        assert!(after_days(&falls, |_| 25.0).iter().all(|(probability, _)| *probability < 0.01));
+        let slowly: Vec<f64> = (0..60).map(|day| 1.0 + 0.003 * f64::from(day)).collect();
+        assert!(after_days(&slowly, |_| 25.0).iter().all(|(probability, _)| *probability < 0.01));
+        let rises: Vec<f64> = (0..40).map(|day| if day < 8 { 1.0 } else { 1.05 }).collect();
+        let warmer = |day: usize| if day < 8 { 10.0 } else { 20.0 };
+        assert!(after_days(&rises, warmer).iter().all(|(probability, _)| *probability < 0.01));
+        let mut watch = Gain::default();
+        for (day, capacity_ah) in [(0, 60.0), (1, 66.0), (2, 66.0)] {
+            let cell = Learned {
+                capacity_ah: ScalarGaussian::from_std(capacity_ah, 3.0),
+                log_resistance: -0.1 * f64::from(day),
+            };
+            let (probability, _) = watch.take(Timestamp::from_secs(f64::from(day) * DAY_S), 25.0, &[cell; 3]);
+            assert!(probability < 0.01);
+        }
+    }
+
+    #[test]
+    fn numbers_that_no_cell_has_leave_a_state_that_is_accepted() {
+        let mut watch = Gain::default();
+        for (day, number) in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e300, 60.0].into_iter().enumerate() {
+            let cell = Learned { capacity_ah: ScalarGaussian::from_std(number, 0.001), log_resistance: number };
+            watch.take(Timestamp::from_secs(-(day as f64) * 1e6), number, &[cell; 3]);
+            assert_eq!(watch.check(), Ok(()), "{number}");
+        }
+        assert!(watch.take(Timestamp::ZERO, 25.0, &[]).0 < 0.5);
+    }
+}
