@@ -14,8 +14,9 @@ use crate::quantity::{InvalidState, Timestamp};
 /// Days that are compared: what takes longer is a season or age.
 const DAYS: usize = 10;
 const DAY_S: f64 = 86_400.0;
-/// Most time between two days, s, and most difference of their temperatures, K.
-const APART_S: f64 = 3.0 * DAY_S;
+/// Time within which the resistances fall, s: what is known of them follows for hours, so that a look may fall in between. And the
+/// most difference of the temperatures then and now, K.
+const APART_S: f64 = 2.5 * DAY_S;
 const APART_K: f64 = 5.0;
 /// Error of a change within these days, fraction.
 const ERROR: f64 = 0.005;
@@ -83,7 +84,12 @@ impl Gain {
             return none;
         }
         self.days.push(now);
-        let rises = self.days.windows(2).filter_map(|pair| rise(&pair[0], &pair[1], &now));
+        let pairs = self
+            .days
+            .iter()
+            .enumerate()
+            .flat_map(|(i, before)| self.days[i + 1..].iter().map(move |after| (before, after)));
+        let rises = pairs.filter_map(|(before, after)| rise(before, after, &now));
         let size = ScalarGaussian { mean: rises.fold(0.0, f64::max), ..none.1 };
         let probability = normal_cdf((size.mean - GAIN) / ERROR);
         if probability >= REPORTED {
