@@ -17,6 +17,8 @@ const MAX_LISTED: usize = 16;
 const OUTLYING: f64 = 3.0;
 /// Most outliers listed of more cells.
 const MAX_OUTLIERS: usize = 8;
+/// Most findings that are listed.
+const MOST_FOUND: usize = 8;
 
 /// Formats the document as a table; `all` = every cell.
 pub(super) fn table(document: &StatusDocument, all: bool) -> String {
@@ -63,8 +65,11 @@ fn pack(text: &mut String, document: &StatusDocument) {
     if document.current_frozen {
         let _ = writeln!(text, "current    frozen: its reading does not change, and the voltages show another load");
     }
-    for found in &document.findings {
+    for found in document.findings.iter().take(MOST_FOUND) {
         let _ = writeln!(text, "found      {found}, for {}", duration(document.time.since(found.since)));
+    }
+    if let more @ 1.. = document.findings.len().saturating_sub(MOST_FOUND) {
+        let _ = writeln!(text, "           and {more} more: `packwatch status --json` lists all");
     }
     let band = match (pack.soc_low, pack.soc_high) {
         (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),

@@ -156,6 +156,13 @@ mod tests {
     }
 
     #[test]
+    fn a_fall_of_resistance_that_is_seen_in_two_steps_is_one() {
+        let gains: Vec<f64> = [1.0; 6].into_iter().chain([1.015]).chain([1.05; 10]).collect();
+        let found = after_days(&gains, |_| 25.0);
+        assert!(found.last().is_some_and(|(probability, _)| *probability >= REPORTED), "{found:?}");
+    }
+
+    #[test]
     fn age_and_seasons_and_a_capacity_that_is_being_learned_are_none() {
         let falls: Vec<f64> = (0..40).map(|day| if day < 8 { 1.0 } else { 0.9 }).collect();
         assert!(after_days(&falls, |_| 25.0).iter().all(|(probability, _)| *probability < 0.01));

@@ -35,6 +35,15 @@ cell  voltage    temp.           SOC          capacity   resistance  trusted
 }
 
 #[test]
+fn many_findings_are_counted() {
+    let mut document = sample(3);
+    document.findings = vec![document.findings[0]; 11];
+    let text = table(&document, false);
+    assert_eq!(text.lines().filter(|line| line.starts_with("found ")).count(), 8);
+    assert!(text.contains("\n           and 3 more: `packwatch status --json` lists all\n"), "{text}");
+}
+
+#[test]
 fn a_stated_vehicle_is_the_second_line() {
     let mut document = sample(1);
     document.vehicle.name = Some("Bus 12".to_owned());
