@@ -43,11 +43,11 @@ const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Deviations that are added when a cell has changed at once, alone: its contact, its channel, or itself; but charge goes nowhere
-/// without a current, and what ages does so over weeks: a resistance that jumps is a contact.
-const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.01, 0.5, 0.04, 0.01];
+/// without a current.
+const ALONE_STD: [f64; STATES] = [0.005, 0.05, 0.2, 0.5, 0.04, 0.01];
 /// The same of a cell that is another one: its module has been replaced.
 const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
-/// The same when only its resistance has changed.
+/// The same when only its resistance has changed: what ages does so over weeks, so it is a contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
 /// Usual loss of a cell that a BMS may bleed, standard deviation, fraction of the capacity in a day, and the time without a row from
 /// which on it may have lost much more, days (`open_charge`). With 0.01 a day, exchanged channels and modules drown in it.

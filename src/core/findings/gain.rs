@@ -3,7 +3,7 @@
 //! In: once a day, what the estimators know of the middle of the cells. Out: by how much the gain has risen.
 //!
 //! A sensor that shows `g` times the current makes every resistance `1/g` times as large at once, and every capacity `g` times as large
-//! as it is learned anew. No battery gains capacity while its resistance falls. A gain that falls looks like age: nothing is said.
+//! as they are learned from the new readings. No battery gains capacity while its resistance falls. A gain that falls looks like age: nothing is said.
 
 use serde::{Deserialize, Serialize};
 
