@@ -377,14 +377,19 @@ impl Diagnosis {
         let (now_ohm, contact_ohm) = (row.ohm(), row.contact_ohm());
         let mut slope = [0.0; STATES];
         (slope[RESISTANCE], slope[CONTACT]) = (now_ohm, contact_ohm);
+        let innovation_ohm = |cell: &Watched, ohm: f64| {
+            let mean = cell.difference.mean();
+            ohm - middle_ohm - slope[RESISTANCE] * mean[RESISTANCE] - slope[CONTACT] * mean[CONTACT]
+        };
+        // Cells scatter as their channels' noise makes them: coarse channels by much.
+        let innovations =
+            self.cells.iter().zip(&ohms).filter_map(|(cell, ohm)| Some(innovation_ohm(cell, ohm.as_ref()?.0)));
+        let scatter_ohm = Population::of(innovations).std;
         for (cell, ohm) in self.cells.iter_mut().zip(ohms) {
             let Some((ohm, steps_a2)) = ohm else { continue };
-            let mean = cell.difference.mean();
-            let expected = slope[RESISTANCE] * mean[RESISTANCE] + slope[CONTACT] * mean[CONTACT];
             let (part, noise) = (STEP_PART * now_ohm, STEP_V / steps_a2.sqrt());
-            let observed =
-                Observation { innovation: ohm - middle_ohm - expected, slope, variance: part * part + noise * noise };
-            cell.difference.observe_steps(&observed);
+            let variance = (part * part + noise * noise).max(scatter_ohm * scatter_ohm);
+            cell.difference.observe_steps(&Observation { innovation: innovation_ohm(cell, ohm), slope, variance });
         }
     }
 

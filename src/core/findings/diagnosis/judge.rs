@@ -30,7 +30,7 @@ struct Judged {
 /// Middle and robust standard deviation (median of the absolute deviations) of the cells.
 pub(super) struct Population {
     pub(super) middle: f64,
-    std: f64,
+    pub(super) std: f64,
 }
 
 impl Population {
