@@ -34,8 +34,10 @@ pub(super) struct Population {
 }
 
 impl Population {
-    pub(super) fn of(values: impl Iterator<Item = f64>) -> Self {
-        let mut values: Vec<f64> = values.collect();
+    pub(super) fn of(of_cells: impl Iterator<Item = f64>) -> Self {
+        // As many as may come, at once: of an iterator that leaves some out, `collect` knows only that it may be none.
+        let mut values: Vec<f64> = Vec::with_capacity(of_cells.size_hint().1.unwrap_or_default());
+        values.extend(of_cells);
         values.sort_by(f64::total_cmp);
         let median = |sorted: &[f64]| {
             if sorted.is_empty() { 0.0 } else { 0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2]) }
