@@ -102,7 +102,7 @@ pub(super) struct FaultArgs {
     /// swap:CELL:CELL, double:CELL:CELL (the second shows the first), temperature-stuck:SENSOR, temperature-off:SENSOR.
     #[arg(long = "fault", value_name = "KIND:...[@WHEN]", value_parser = str::parse::<Fault>)]
     faults: Vec<Fault>,
-    /// Balance the cells near the end of a charge and in the rest after it, by a thousandth of the capacity per hour
+    /// Balance the cells near the end of a charge and in the rest after it, by bleed_a of [input.balancing] or a thousandth of the capacity per hour
     #[arg(long)]
     balancing: bool,
 }
@@ -113,18 +113,22 @@ impl FaultArgs {
         self.balancing || !self.faults.is_empty()
     }
 
-    /// Adds them to `sim`.
+    /// Adds them to `sim`. `bleed_a`: current of a balancing resistor, A, where the configuration has bits of them.
     pub(super) fn apply(
         &self,
         sim: Simulation,
         cells: u16,
         sensors: u16,
         capacity_ah: f64,
+        bleed_a: Option<f64>,
     ) -> Result<Simulation, Failure> {
         let check = |fault: &Fault| fault.kind.check(cells, sensors);
         self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
         let sim = sim.with_faults(&self.faults);
-        Ok(if self.balancing { sim.with_balancing(Balancing::usual(capacity_ah)) } else { sim })
+        let sim = if bleed_a.is_some() { sim.with_balancing_bits() } else { sim };
+        let usual = Balancing::usual(capacity_ah);
+        let balancing = Balancing { bleed_a: bleed_a.unwrap_or(usual.bleed_a), ..usual };
+        Ok(if self.balancing { sim.with_balancing(balancing) } else { sim })
     }
 }
 

@@ -7,6 +7,7 @@ mod judge;
 
 use serde::{Deserialize, Serialize};
 
+use super::bleeding::{BledTime, Bleeding};
 use super::channels::{Channel, compare};
 use super::difference::{CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{Finding, FindingKind};
@@ -52,6 +53,8 @@ const SAME_EVENT_S: f64 = 1800.0;
 const SWAP_V: f64 = 0.008;
 /// SOC at which a BMS bleeds: near the end of a charge.
 const BLED_SOC: f64 = 0.9;
+/// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
+const BLED_PART: f64 = 0.2;
 const DAY_S: f64 = 86_400.0;
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,6 +82,8 @@ struct Watched {
     before_jump: [f64; STATES],
     sums: CellSums,
     channel: Channel,
+    #[serde(default)]
+    bleeding: Bleeding,
     temperature: Following,
     /// Since when each kind is likelier than not.
     suspected: [Option<Timestamp>; FindingKind::ALL.len()],
@@ -91,6 +96,7 @@ impl Watched {
     fn interrupt(&mut self) {
         self.sums.interrupt();
         self.channel.interrupt();
+        self.bleeding.interrupt();
     }
 }
 
@@ -124,6 +130,7 @@ impl Diagnosis {
             before_jump: [0.0; STATES],
             sums: CellSums::default(),
             channel: Channel::default(),
+            bleeding: Bleeding::default(),
             temperature: Following::default(),
             suspected: [None; FindingKind::ALL.len()],
             jumped: None,
@@ -192,6 +199,14 @@ impl Diagnosis {
         }
     }
 
+    /// Takes a bit of the BMS: whether it bleeds a cell. It holds until `holds_until`, or the next one.
+    pub fn take_bit(&mut self, cell: usize, time: Timestamp, is_bled: bool, holds_until: Timestamp) {
+        let sampled = self.pack.last;
+        if let Some(cell) = self.cells.get_mut(cell) {
+            cell.bleeding.take(time, is_bled, holds_until, sampled);
+        }
+    }
+
     /// Takes the mean cell after the samples of a moment; whether the row is complete: [`Self::close_row`] then ends it.
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
@@ -200,6 +215,9 @@ impl Diagnosis {
             return false;
         }
         let pack = &mut self.pack;
+        if pack.last.is_none_or(|last| time.since(last) > HOLE_S) {
+            self.cells.iter_mut().for_each(|cell| cell.bleeding.note_sleep(pack.last));
+        }
         if pack.last.is_some_and(|last| time.since(last) > HOLE_S) {
             *pack = PackSums::default();
             self.rest_s = 0.0;
@@ -235,13 +253,15 @@ impl Diagnosis {
     }
 
     /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
-    /// after a charge. Returns the findings that are new.
+    /// after a charge. `bleed_a`: current of a balancing resistor, A, where bits
+    /// show which cells are bled. Returns the findings that are new.
     pub fn close_row(
         &mut self,
         model: &CellModel,
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
         is_balanced: bool,
+        bleed_a: Option<f64>,
     ) -> Vec<Finding> {
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
@@ -260,6 +280,7 @@ impl Diagnosis {
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
+        self.pass_bled(time, &row, bleed_a);
         let before = self.findings.clone();
         if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
@@ -284,6 +305,46 @@ impl Diagnosis {
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
+    /// Takes out what was bled since the last row, against what was bled of the middle cells. `bleed_a`: current of a resistor, A;
+    /// `None` = nothing is known of it.
+    fn pass_bled(&mut self, time: Timestamp, row: &Row<'_>, bleed_a: Option<f64>) {
+        let Some(bleed_a) = bleed_a else {
+            return self.cells.iter_mut().for_each(|cell| cell.bleeding = Bleeding::default());
+        };
+        let bled: Vec<BledTime> = (0..self.cells.len()).map(|cell| self.end_bled_row(cell, time)).collect();
+        let middle = self.bled_in_middle(&bled);
+        let soc_per_s = bleed_a / (3600.0 * row.capacity_ah);
+        for (cell, bled) in self.cells.iter_mut().zip(&bled) {
+            let soc = soc_per_s * (bled.seconds - middle.seconds);
+            let unknown = soc_per_s * soc_per_s * (bled.variance_s2 + middle.variance_s2);
+            cell.difference.take_out(soc, (BLED_PART * soc) * (BLED_PART * soc) + unknown);
+        }
+    }
+
+    /// Ends a cell's row of bits. Of a cell whose bits begin to come, the leak is learned from now on.
+    fn end_bled_row(&mut self, cell: usize, time: Timestamp) -> BledTime {
+        let may_be_bled = self.may_be_bled(cell);
+        let bled = self.cells[cell].bleeding.end_row(time);
+        if may_be_bled && !self.may_be_bled(cell) {
+            self.cells[cell].difference.watch_leak();
+        }
+        bled
+    }
+
+    /// Mean over the cells whose voltages are in the middle half.
+    fn bled_in_middle(&self, bled: &[BledTime]) -> BledTime {
+        let by_voltage = self.cells.iter().zip(bled).filter_map(|(cell, bled)| Some((cell.sums.mean_v()?, *bled)));
+        let mut by_voltage: Vec<(f64, BledTime)> = by_voltage.collect();
+        by_voltage.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let cut = by_voltage.len() / 4;
+        let inner = &by_voltage[cut..by_voltage.len() - cut];
+        let mean =
+            |of: fn(&BledTime) -> f64| inner.iter().map(|(_, bled)| of(bled)).sum::<f64>() / inner.len().max(1) as f64;
+        // What is not known of one cell says nothing of another.
+        let variance_s2 = mean(|bled| bled.variance_s2) / inner.len().max(1) as f64;
+        BledTime { seconds: mean(|bled| bled.seconds), variance_s2 }
+    }
+
     /// Compares every cell with the middle ones, `seconds` after the row before; whether there was something to compare.
     fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>) -> bool {
         let voltages_v: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_v()).collect();
@@ -296,12 +357,12 @@ impl Diagnosis {
         compare(&mut channels, &sums);
         self.cells.iter_mut().zip(channels).for_each(|(cell, channel)| cell.channel = channel);
         let mut jumped: Vec<(usize, Observation)> = Vec::new();
-        let may_be_bled: Vec<bool> = (0..self.cells.len()).map(|cell| self.may_be_bled(cell)).collect();
+        let may_lose: Vec<bool> = (0..self.cells.len()).map(|cell| self.may_lose_unseen(cell)).collect();
         for (index, voltage_v) in voltages_v.iter().enumerate() {
             let cell = &mut self.cells[index];
             let Some(voltage_v) = voltage_v.filter(|_| !cell.channel.is_frozen) else { continue };
             let observed = row.observation(cell.difference.mean(), voltage_v - middle_v);
-            if may_be_bled[index] {
+            if may_lose[index] {
                 cell.difference.open_charge(seconds / DAY_S, &observed);
             }
             if cell.difference.is_settled() {
@@ -449,7 +510,10 @@ impl Diagnosis {
     pub fn forget_charge(&mut self) {
         self.interrupt();
         self.last_row = None;
-        self.cells.iter_mut().for_each(|cell| cell.difference.forget_charge());
+        for cell in &mut self.cells {
+            cell.difference.forget_charge();
+            cell.bleeding = Bleeding::default();
+        }
     }
 
     /// What follows does not hang together with the samples so far.
@@ -469,6 +533,7 @@ impl Diagnosis {
         self.last_row.iter_mut().for_each(|(time, ..)| moved(time));
         for cell in &mut self.cells {
             cell.suspected.iter_mut().flatten().chain(&mut cell.jumped).for_each(moved);
+            cell.bleeding.rebase(by_nanos);
         }
     }
 
@@ -485,6 +550,7 @@ impl Diagnosis {
         for cell in &self.cells {
             cell.difference.check()?;
             cell.channel.check(cells)?;
+            cell.bleeding.check()?;
             let numbers = cell
                 .sums
                 .numbers()

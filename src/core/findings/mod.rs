@@ -8,6 +8,7 @@
 //! | --- | --- |
 //! | [`diagnosis`] | all cells: rows in, findings out |
 //! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
+//! | `bleeding` | for how long a cell was bled, by the bits of its BMS |
 //! | `row` | samples of some minutes, summed per cell |
 //! | `channels` | channels that are frozen or doubled |
 //! | `temperature` | temperature sensors that do not follow the load |
@@ -16,6 +17,7 @@ pub mod diagnosis;
 pub mod difference;
 pub mod finding;
 
+mod bleeding;
 mod channels;
 mod row;
 mod temperature;

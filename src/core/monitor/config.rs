@@ -49,6 +49,8 @@ pub struct MonitorConfig {
     pub label: Option<Label>,
     /// Whether the BMS lets fuller cells lose charge after a charge.
     pub is_balanced: bool,
+    /// Current that a balancing resistor takes out of one cell, A, where bits among `input` show which cells are bled; `None` = there are none.
+    pub bleed_a: Option<f64>,
     /// Estimator.
     pub estimator: EstimatorConfig,
     /// Learning at transitions.
@@ -203,6 +205,7 @@ impl MonitorConfig {
                     && self.guards == new.guards
                     && self.cycle_times_s == new.cycle_times_s
                     && self.asleep_after_s == new.asleep_after_s
+                    && self.bleed_a == new.bleed_a
                     && old_sample.contactor == new_sample.contactor,
             ),
             ("[limits]", limits(old_sample) == limits(new_sample)),

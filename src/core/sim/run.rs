@@ -90,6 +90,7 @@ pub struct Simulation {
     coming: Vec<Fault>,
     sensor_faults: SensorFaults,
     balancer: Option<Balancer>,
+    has_bits: bool,
     /// Voltages at the taps, then at the channels, V.
     sensed_v: Vec<f64>,
 }
@@ -110,6 +111,7 @@ impl Simulation {
             coming: Vec::new(),
             sensor_faults: SensorFaults::default(),
             balancer: None,
+            has_bits: false,
             sensed_v: Vec::new(),
             settings,
             wiring,
@@ -128,6 +130,13 @@ impl Simulation {
     #[must_use]
     pub fn with_balancing(mut self, balancing: Balancing) -> Self {
         self.balancer = Some(Balancer::new(balancing));
+        self
+    }
+
+    /// Lets the BMS report which cells it bleeds, with the voltages: 1 = it does.
+    #[must_use]
+    pub fn with_balancing_bits(mut self) -> Self {
+        self.has_bits = true;
         self
     }
 
@@ -230,6 +239,11 @@ impl Simulation {
         if cells {
             self.measure_temperatures();
             self.measure_voltages();
+            if self.has_bits {
+                let bits = (0..).map(CellIndex).zip(self.pack.cells());
+                let bits = bits.map(|(cell, truth)| (cell, if truth.bleed_a > 0.0 { 1.0 } else { 0.0 }));
+                self.readings.extend(bits.map(|(cell, bit)| (Channel::Balancing(cell), Some(bit))));
+            }
         }
         self.sensor_faults.distort_readings(&mut self.readings);
     }

@@ -75,6 +75,7 @@ pub(super) fn monitor(
         model,
         label: super::label::label(pack).filter(|_| pack.learn_model),
         is_balanced: pack.balancing,
+        bleed_a: raw.balancing.as_ref().map(|keys| keys.bleed_a / f64::from(pack.strings)),
     })
 }
 

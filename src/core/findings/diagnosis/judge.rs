@@ -61,7 +61,7 @@ impl Diagnosis {
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
-        if let Some(cell) = lowest.filter(|_| self.lowest != lowest) {
+        if let Some(cell) = lowest.filter(|cell| self.lowest != lowest && !self.cells[*cell].bleeding.is_known) {
             self.cells[cell].difference.watch_leak();
         }
         self.lowest = lowest;
@@ -134,11 +134,19 @@ impl Diagnosis {
         (next.mean - shown.mean > BEYOND_DOUBT * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may take charge out of the cell: where one balances, out of all but the lowest one. A leak that was found is still
+    /// Whether a BMS may take charge out of the cell: where one balances, out of all but the lowest one; not where
+    /// its bits show what it takes. A leak that was found is still
     /// there when the others are bled.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
-        self.is_balanced && self.lowest != Some(index) && !self.findings.iter().any(is_found)
+        let is_shown = self.cells[index].bleeding.is_known;
+        self.is_balanced && !is_shown && self.lowest != Some(index) && !self.findings.iter().any(is_found)
+    }
+
+    /// Whether a BMS may take charge out of the cell while the buses sleep, where no bit shows it.
+    pub(super) fn may_lose_unseen(&self, index: usize) -> bool {
+        let is_shown = self.is_balanced && self.cells[index].bleeding.is_known;
+        self.may_be_bled(index) || is_shown && self.lowest != Some(index)
     }
 
     /// What one cell may have.
