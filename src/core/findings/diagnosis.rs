@@ -314,9 +314,11 @@ impl Diagnosis {
         let bled: Vec<BledTime> = (0..self.cells.len()).map(|cell| self.end_bled_row(cell, time)).collect();
         let middle = self.bled_in_middle(&bled);
         let soc_per_s = bleed_a / (3600.0 * row.capacity_ah);
-        for (cell, bled) in self.cells.iter_mut().zip(&bled) {
+        for (index, (cell, bled)) in self.cells.iter_mut().zip(&bled).enumerate() {
             let soc = soc_per_s * (bled.seconds - middle.seconds);
-            let unknown = soc_per_s * soc_per_s * (bled.variance_s2 + middle.variance_s2);
+            // The cell that shows the least is never bled.
+            let unseen_s2 = cell.bleeding.take_unseen() * if self.lowest == Some(index) { 0.0 } else { 1.0 };
+            let unknown = soc_per_s * soc_per_s * (bled.variance_s2 + middle.variance_s2 + unseen_s2);
             cell.difference.take_out(soc, (BLED_PART * soc) * (BLED_PART * soc) + unknown);
         }
     }
