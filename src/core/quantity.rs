@@ -176,6 +176,8 @@ pub enum Channel {
     ReportedSoh,
     /// Voltage of the vehicle's 12 V (or 24 V) supply, V: without enough of it nothing is asked. Never used by an estimate.
     SupplyVoltage,
+    /// Whether the BMS bleeds a cell: 0 = it does not. Only the diagnosis uses it.
+    Balancing(CellIndex),
     /// Serial number of the pack, or another number that identifies it.
     PackIdentity,
 }

@@ -3,11 +3,11 @@
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
 //! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); cells have spread. Every kind of fault is
-//! injected in packs with good, usual and poor sensors, with and without balancing, at a random cell on a random day of the first
-//! third. `--packs` are distributed over the rows, each at least one. `--quick` simulates one pack per fault with usual sensors and
-//! balancing. `--only WORD` takes the faults whose name has the word: `--only healthy --packs 3000` for the rate of false findings.
-//! `--list` prints each finding that was not asked for, with its pack. `--write` writes `tests/diagnose.md`. Needs the repository's
-//! cell model and nothing else.
+//! injected in packs with good, usual and poor sensors, without balancing, with it, and with bits that show which cells are bled, at a
+//! random cell on a random day of the first third. `--packs` are distributed over the rows, each at least one. `--quick` simulates
+//! one pack per fault with usual sensors and balancing. `--only WORD` takes the faults whose name has the word: `--only healthy
+//! --packs 3000` for the rate of false findings. `--list` prints each finding that was not asked for, with its pack. `--write` writes
+//! `tests/diagnose.md`. Needs the repository's cell model and nothing else.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
 
 mod finding;
@@ -21,7 +21,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use pack::{Case, PackSize, Seen};
+use pack::{Case, PackBalancing, PackSize, Seen};
 use packwatch::monitor::MonitorConfig;
 use packwatch::sim::{Fault, FaultKind, SensorQuality};
 use rand::{Rng, SeedableRng};
@@ -145,26 +145,26 @@ fn cpu_s() -> Option<f64> {
 }
 
 /// A row of the table, in its order.
-type Row = (usize, usize, bool);
+type Row = (usize, usize, PackBalancing);
 
 fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     let mut rows = Vec::new();
     for f in (0..FAULTS.len()).filter(|f| FAULTS[*f].0.contains(&options.only)) {
-        let all = (0..QUALITIES.len()).flat_map(|q| [(f, q, false), (f, q, true)]);
-        let is_wanted = |row: &Row| !options.is_quick || *row == (f, QUICK_QUALITY, true);
+        let all = (0..QUALITIES.len()).flat_map(|q| PackBalancing::ALL.map(|balancing| (f, q, balancing)));
+        let is_wanted = |row: &Row| !options.is_quick || *row == (f, QUICK_QUALITY, PackBalancing::On);
         rows.extend(all.filter(is_wanted));
     }
     let each = options.packs.div_ceil(rows.len().max(1)).max(1);
     let mut cases = Vec::new();
     for i in 0..each {
-        for row @ (f, q, is_balancing) in rows.iter().copied() {
+        for row @ (f, q, balancing) in rows.iter().copied() {
             let (name, size, text) = FAULTS[f];
             // The same pack in every row: rows differ by their fault and sensors alone.
             let seed = options.seed + i as u64;
             let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
             let fault = fault_of(text, size, seed, days)?;
             let faults = if name.ends_with(SLOWLY) { slowly(fault) } else { fault.into_iter().collect() };
-            cases.push((row, Case { size, quality, is_balancing, faults, seed, days, period_ms: options.period_ms }));
+            cases.push((row, Case { size, quality, balancing, faults, seed, days, period_ms: options.period_ms }));
         }
     }
     Ok(cases)
@@ -219,14 +219,15 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
 }
 
 /// Prints the findings that are not the fault's.
-fn list((f, q, is_balancing): Row, case: &Case, seen: &[Seen]) {
+fn list((f, q, balancing): Row, case: &Case, seen: &[Seen]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
     for Seen { at_s, found, .. } in seen.iter().filter(|it| it.at_s < from_s || Some(it.found.kind) != kind) {
         let (name, size, quality) = (FAULTS[f].0, SIZES[FAULTS[f].1].cells, QUALITIES[q].0);
         let (day, fault_day) = (at_s / 86_400.0, from_s / 86_400.0);
         eprintln!(
-            "{name} (day {fault_day:.2}), {size} cells, {quality}, balancing {is_balancing}, seed {}, day {day:.2}: {found}",
+            "{name} (day {fault_day:.2}), {size} cells, {quality}, balancing {}, seed {}, day {day:.2}: {found}",
+            balancing.name(),
             case.seed
         );
     }
@@ -245,10 +246,10 @@ fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {
          | fault | pack | sensors | balancing | packs | found | in one drive | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
          | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
     );
-    for ((f, q, is_balancing), score) in scores {
+    for ((f, q, balancing), score) in scores {
         let (name, size, _) = FAULTS[*f];
         let PackSize { cells, capacity_ah } = SIZES[size];
-        let (quality, balancing) = (QUALITIES[*q].0, if *is_balancing { "on" } else { "off" });
+        let (quality, balancing) = (QUALITIES[*q].0, balancing.name());
         let _ = writeln!(text, "| {name} | {cells} x {capacity_ah} Ah | {quality} | {balancing} | {} |", score.row());
     }
     text

@@ -34,12 +34,33 @@ pub(crate) struct PackSize {
     pub(crate) capacity_ah: f64,
 }
 
+/// Whether a BMS balances, and whether it shows which cells it bleeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum PackBalancing {
+    Off,
+    On,
+    Bits,
+}
+
+impl PackBalancing {
+    pub(crate) const ALL: [Self; 3] = [Self::Off, Self::On, Self::Bits];
+
+    /// As the table has it.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Off => "off",
+            Self::On => "on",
+            Self::Bits => "bits",
+        }
+    }
+}
+
 /// One pack to simulate.
 #[derive(Debug, Clone)]
 pub(crate) struct Case {
     pub(crate) size: PackSize,
     pub(crate) quality: SensorQuality,
-    pub(crate) is_balancing: bool,
+    pub(crate) balancing: PackBalancing,
     /// The fault; one that grows is several.
     pub(crate) faults: Vec<Fault>,
     pub(crate) seed: u64,
@@ -57,7 +78,7 @@ pub(crate) struct Seen {
     pub(crate) found: Finding,
 }
 
-/// The configuration of a pack, written into `folder`.
+/// The configuration of a pack whose BMS shows which cells it bleeds, written into `folder`.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -75,6 +96,10 @@ fn dbc(cells: u16, sensors: u16) -> String {
     for i in 0..cells {
         let (page, bit) = (i / 3, 16 + 16 * (i % 3));
         let _ = writeln!(text, " SG_ Voltage{} m{page} : {bit}|16@1+ (0.0001,0) [0|6.5] \"V\" BMS", i + 1);
+    }
+    text += "\nBO_ 304 Balancing: 8 BMS\n";
+    for i in 0..cells {
+        let _ = writeln!(text, " SG_ Bleed{} : {i}|1@1+ (1,0) [0|1] \"\" BMS", i + 1);
     }
     text += "\nBO_ 288 Temperatures: 8 BMS\n";
     for i in 0..sensors {
@@ -126,10 +151,13 @@ fn multiply(value: &mut toml::Value, factor: f64) {
 fn pack(size: PackSize, sensors: u16) -> String {
     let PackSize { cells, capacity_ah } = size;
     let (discharge_a, dead_band_a) = (5.0 * capacity_ah, 0.02 * capacity_ah);
+    let Balancing { bleed_a, .. } = Balancing::usual(capacity_ah);
     let mut text = format!(
         "[pack]\ncells = {cells}\ncell_model = \"cell.toml\"\nambient_c = 25.0\n\n[[interface]]\nname = \"can0\"\n\n\
          [input]\ndbc = [\"pack.dbc\"]\n\n[input.current]\nsignal = \"Pack.Current\"\npositive = \"discharge\"\n\n\
-         [input.cell_voltage]\nsignal = \"Cells.Voltage{{n}}\"\n\n"
+         [input.cell_voltage]\nsignal = \"Cells.Voltage{{n}}\"\n\n\
+         [input.balancing]\nsignal = \"Balancing.Bleed{{n}}\"\nbleed_a = {bleed_a:?}\nmax_age_s = 90.0\n\
+         only_while_sent = true\n\n"
     );
     for i in 0..sensors {
         let (first, last) = (i * CELLS_PER_SENSOR + 1, ((i + 1) * CELLS_PER_SENSOR).min(cells));
@@ -170,14 +198,21 @@ impl Case {
         let temperature_at = (0..sensors).map(|i| Some(CellIndex(i * CELLS_PER_SENSOR))).collect();
         let sim = Simulation::new(config.model.clone(), settings, Wiring { strings: 1, temperature_at });
         let sim = sim.with_faults(&self.faults);
-        if self.is_balancing { sim.with_balancing(Balancing::usual(self.size.capacity_ah)) } else { sim }
+        let usual = Balancing::usual(self.size.capacity_ah);
+        match self.balancing {
+            PackBalancing::Off => sim,
+            PackBalancing::On => sim.with_balancing(usual),
+            PackBalancing::Bits => sim.with_balancing(usual).with_balancing_bits(),
+        }
     }
 
     /// Runs the pack; the findings in the order in which they were there first, without those that are true of the sensors' own errors.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<Seen> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
-        let mut monitor = Monitor::new(MonitorConfig { is_balanced: self.is_balancing, ..config.clone() });
+        let is_balanced = self.balancing != PackBalancing::Off;
+        let balancing_bits = config.balancing_bits.filter(|_| self.balancing == PackBalancing::Bits);
+        let mut monitor = Monitor::new(MonitorConfig { is_balanced, balancing_bits, ..config.clone() });
         let (mut ticks, mut out, mut frames) =
             (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
         let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);

@@ -2,6 +2,7 @@
 
 use crate::cli::Failure;
 use crate::cli::numbers::{NamedValue, between, finite, one_of, share, within};
+use crate::findings::BalancingBits;
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 
 /// Scenarios by name.
@@ -102,7 +103,8 @@ pub(super) struct FaultArgs {
     /// swap:CELL:CELL, double:CELL:CELL (the second shows the first), temperature-stuck:SENSOR, temperature-off:SENSOR.
     #[arg(long = "fault", value_name = "KIND:...[@WHEN]", value_parser = str::parse::<Fault>)]
     faults: Vec<Fault>,
-    /// Balance the cells near the end of a charge and in the rest after it, by a thousandth of the capacity per hour
+    /// Balance the cells near the end of a charge and in the rest after it, by a thousandth of the capacity per hour or
+    /// `input.balancing.bleed_a`
     #[arg(long)]
     balancing: bool,
 }
@@ -113,18 +115,22 @@ impl FaultArgs {
         self.balancing || !self.faults.is_empty()
     }
 
-    /// Adds them to `sim`.
+    /// Adds them to `sim`. `bits`: those of the configuration.
     pub(super) fn apply(
         &self,
         sim: Simulation,
         cells: u16,
         sensors: u16,
         capacity_ah: f64,
+        bits: Option<BalancingBits>,
     ) -> Result<Simulation, Failure> {
         let check = |fault: &Fault| fault.kind.check(cells, sensors);
         self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
         let sim = sim.with_faults(&self.faults);
-        Ok(if self.balancing { sim.with_balancing(Balancing::usual(capacity_ah)) } else { sim })
+        let sim = if bits.is_some() { sim.with_balancing_bits() } else { sim };
+        let usual = Balancing::usual(capacity_ah);
+        let balancing = Balancing { bleed_a: bits.map_or(usual.bleed_a, |bits| bits.bleed_a), ..usual };
+        Ok(if self.balancing { sim.with_balancing(balancing) } else { sim })
     }
 }
 

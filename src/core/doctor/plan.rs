@@ -166,6 +166,7 @@ impl Kind {
             Channel::ReportedSoc
             | Channel::ReportedSoh
             | Channel::SupplyVoltage
+            | Channel::Balancing(_)
             | Channel::PackIdentity
             | Channel::Contactor => Self::Reported,
         }

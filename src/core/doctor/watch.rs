@@ -244,6 +244,7 @@ impl Doctor {
                 | Channel::ReportedSoc
                 | Channel::ReportedSoh
                 | Channel::SupplyVoltage
+                | Channel::Balancing(_)
                 | Channel::PackIdentity
                 | Channel::Contactor => continue,
             };

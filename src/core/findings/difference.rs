@@ -155,6 +155,13 @@ impl Difference {
         self.keep_possible();
     }
 
+    /// Charge was taken out beside the current: SOC, and its variance.
+    pub(super) fn take_out(&mut self, soc: f64, variance: f64) {
+        self.mean[SOC] -= soc;
+        self.covariance[pair(SOC, SOC)] += variance;
+        self.keep_possible();
+    }
+
     /// The charge is not known any more.
     pub(super) fn forget_charge(&mut self) {
         for j in 0..STATES {

@@ -14,6 +14,7 @@ use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
 use crate::cell::{CellModel, EstimatorConfig, Label};
+use crate::findings::BalancingBits;
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
 use crate::sample::SampleConfig;
@@ -49,6 +50,8 @@ pub struct MonitorConfig {
     pub label: Option<Label>,
     /// Whether the BMS lets fuller cells lose charge after a charge.
     pub is_balanced: bool,
+    /// What the bits among `input` mean that show which cells are bled; `None` = there are none.
+    pub balancing_bits: Option<BalancingBits>,
     /// Estimator.
     pub estimator: EstimatorConfig,
     /// Learning at transitions.
@@ -203,6 +206,7 @@ impl MonitorConfig {
                     && self.guards == new.guards
                     && self.cycle_times_s == new.cycle_times_s
                     && self.asleep_after_s == new.asleep_after_s
+                    && self.balancing_bits == new.balancing_bits
                     && old_sample.contactor == new_sample.contactor,
             ),
             ("[limits]", limits(old_sample) == limits(new_sample)),

@@ -13,8 +13,8 @@ use crate::alarm::{Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::findings::finding::OFFSET_PER_H;
 use crate::findings::gain::Learned;
-use crate::findings::{Diagnosis, FindingKind, MeanCell};
-use crate::quantity::{CellIndex, Timestamp};
+use crate::findings::{BalancingBits, Diagnosis, FindingKind, MeanCell};
+use crate::quantity::{CellIndex, Fault, Timestamp};
 use crate::sample::CellSample;
 
 /// The diagnosis stage.
@@ -24,17 +24,20 @@ pub(super) struct Diagnosing {
     cells: usize,
     /// The BMS lets fuller cells lose charge.
     is_balanced: bool,
+    /// Where bits show which cells are bled.
+    bits: Option<BalancingBits>,
 }
 
 impl Diagnosing {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
-        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced: config.is_balanced }
+        let (is_balanced, bits) = (config.is_balanced, config.balancing_bits);
+        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced, bits }
     }
 
     /// Other settings for the same cells.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
-        self.is_balanced = config.is_balanced;
+        (self.is_balanced, self.bits) = (config.is_balanced, config.balancing_bits);
     }
 
     /// Forgets everything: another pack is connected.
@@ -60,6 +63,13 @@ impl Diagnosing {
     pub(super) fn faulty_channels(&self) -> Vec<CellIndex> {
         let is_faulty = |cell: &CellIndex| self.diagnosis.has_channel_fault(*cell) == Some(true);
         (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
+    }
+
+    /// Takes a bit that shows whether a cell is bled; a bad reading shows nothing, and the bit before holds for its time.
+    pub(super) fn take_bit(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
+        if let (Ok(value), Some(bits)) = (reading, &self.bits) {
+            self.diagnosis.take_bit(cell.index(), now, value != 0.0, now.plus_secs(bits.max_age_s));
+        }
     }
 
     /// Takes whether the reading of the current is frozen. No row ends without a current: the finding does not wait for one.
@@ -106,7 +116,7 @@ impl Diagnosing {
         let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
         if is_complete {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
-            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced);
+            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.bits.as_ref());
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
             let cell = |index: usize| Learned {

@@ -82,8 +82,8 @@ impl Stages {
     }
 
     /// Whether a reading is one of an input that wakes the buses: any but the supply voltage, which the computer may
-    /// measure itself.
+    /// measure itself, and the bits of a BMS that balances while the vehicle is parked.
     pub(super) fn wakes(channel: Channel) -> bool {
-        channel != Channel::SupplyVoltage
+        !matches!(channel, Channel::SupplyVoltage | Channel::Balancing(_))
     }
 }

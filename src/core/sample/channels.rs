@@ -9,9 +9,11 @@ pub(super) fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
     match channel {
         Channel::Current => &config.current,
         Channel::Temperature(_) => &config.temperature,
-        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage | Channel::PackIdentity => {
-            &config.voltage
-        }
+        Channel::PackVoltage
+        | Channel::CellVoltage(_)
+        | Channel::SupplyVoltage
+        | Channel::Balancing(_)
+        | Channel::PackIdentity => &config.voltage,
         Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
         Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
         Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
@@ -43,6 +45,7 @@ pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
         Channel::ReportedSoc
         | Channel::ReportedSoh
         | Channel::SupplyVoltage
+        | Channel::Balancing(_)
         | Channel::PackIdentity
         | Channel::Contactor => 0.0,
     }

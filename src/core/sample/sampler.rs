@@ -199,7 +199,11 @@ impl Sampler {
                 self.shared.sensor = None;
                 None
             }
-            Channel::ReportedSoc | Channel::ReportedSoh | Channel::SupplyVoltage | Channel::PackIdentity => None,
+            Channel::ReportedSoc
+            | Channel::ReportedSoh
+            | Channel::SupplyVoltage
+            | Channel::Balancing(_)
+            | Channel::PackIdentity => None,
             Channel::PackVoltage => {
                 self.state.frozen.handle_voltage(time, 0, value, self.step_v);
                 Some(self.sample(CellIndex(0), value))
@@ -560,7 +564,7 @@ impl Sampler {
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
             // Used by the monitor, not sampled.
-            | (Channel::SupplyVoltage | Channel::PackIdentity, _) => None,
+            | (Channel::SupplyVoltage | Channel::Balancing(_) | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;

@@ -71,6 +71,21 @@ impl PackSensors {
     }
 }
 
+/// A sleep of the buses, in steps.
+#[derive(Debug, Clone, Copy)]
+struct Asleep {
+    from: Timestamp,
+    duration_s: f64,
+    step: u32,
+    steps: u32,
+}
+
+impl Asleep {
+    fn time(&self) -> Timestamp {
+        self.from.plus_secs(f64::from(self.step) * self.duration_s / f64::from(self.steps))
+    }
+}
+
 /// A running simulation.
 #[derive(Debug, Clone)]
 pub struct Simulation {
@@ -90,6 +105,8 @@ pub struct Simulation {
     coming: Vec<Fault>,
     sensor_faults: SensorFaults,
     balancer: Option<Balancer>,
+    has_bits: bool,
+    asleep: Option<Asleep>,
     /// Voltages at the taps, then at the channels, V.
     sensed_v: Vec<f64>,
 }
@@ -110,6 +127,8 @@ impl Simulation {
             coming: Vec::new(),
             sensor_faults: SensorFaults::default(),
             balancer: None,
+            has_bits: false,
+            asleep: None,
             sensed_v: Vec::new(),
             settings,
             wiring,
@@ -131,21 +150,32 @@ impl Simulation {
         self
     }
 
+    /// Lets the BMS report which cells it bleeds: 1 = it does. It reports them with the voltages, and every minute while it bleeds cells
+    /// of a vehicle that sleeps, up to the first time when none is bled.
+    #[must_use]
+    pub fn with_balancing_bits(mut self) -> Self {
+        self.has_bits = true;
+        self
+    }
+
     /// Advances to the next sampling moment; `None` = the scenario is over.
     pub fn advance(&mut self) -> Option<Moment> {
-        if self.started {
+        if self.started && self.asleep.is_none() {
             self.pass_period();
         }
         self.started = true;
         let dt_s = self.settings.current_period_ns as f64 * 1e-9;
         self.begin_faults(self.time);
         loop {
+            if self.sleep() {
+                return Some(Moment { time: self.time, current_a: 0.0, cells_sampled: false });
+            }
             if self.settings.duration_s.is_some_and(|end_s| self.time.secs() + 0.5 * dt_s >= end_s) {
                 return None;
             }
             match self.course.next(&mut self.pack, dt_s) {
                 Demand::Finished => return None,
-                Demand::Asleep { duration_s } => self.sleep(duration_s),
+                Demand::Asleep { duration_s } => self.fall_asleep(duration_s),
                 Demand::Current(current_a) => {
                     self.current_a = current_a;
                     break;
@@ -196,15 +226,42 @@ impl Simulation {
         self.cells_due = true;
     }
 
-    fn sleep(&mut self, duration_s: f64) {
+    fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
-        let steps = (duration_s / ASLEEP_STEP_S).ceil().max(1.0);
-        for step in 0..steps as u32 {
-            self.begin_faults(self.time.plus_secs(f64::from(step) * duration_s / steps));
-            self.step_cells(0.0, duration_s / steps);
+        let steps = (duration_s / ASLEEP_STEP_S).ceil().max(1.0) as u32;
+        self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
+    }
+
+    /// Sleeps on; whether there are bits to report before the sleep is over.
+    fn sleep(&mut self) -> bool {
+        while let Some(asleep) = &mut self.asleep {
+            let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));
+            asleep.step += 1;
+            let (end, is_over) = (asleep.time(), asleep.step == asleep.steps);
+            let was_bleeding = self.is_bleeding();
+            self.begin_faults(now);
+            self.step_cells(0.0, step_s);
+            self.time = end;
+            if is_over {
+                self.asleep = None;
+                self.begin_faults(end);
+            } else if self.has_bits && (was_bleeding || self.is_bleeding()) {
+                self.readings.clear();
+                self.report_bits();
+                return true;
+            }
         }
-        self.time = self.time.plus_secs(duration_s);
-        self.begin_faults(self.time);
+        false
+    }
+
+    fn is_bleeding(&self) -> bool {
+        self.pack.cells().iter().any(|cell| cell.bleed_a > 0.0)
+    }
+
+    fn report_bits(&mut self) {
+        let bits = (0..).map(CellIndex).zip(self.pack.cells());
+        let bits = bits.map(|(cell, truth)| (cell, if truth.bleed_a > 0.0 { 1.0 } else { 0.0 }));
+        self.readings.extend(bits.map(|(cell, bit)| (Channel::Balancing(cell), Some(bit))));
     }
 
     /// `current_a` flows for `dt_s` seconds; then the BMS switches its resistors.
@@ -230,6 +287,9 @@ impl Simulation {
         if cells {
             self.measure_temperatures();
             self.measure_voltages();
+            if self.has_bits {
+                self.report_bits();
+            }
         }
         self.sensor_faults.distort_readings(&mut self.readings);
     }

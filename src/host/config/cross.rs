@@ -11,6 +11,8 @@ use crate::cell::{CapacityState, CellModel};
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
+/// Largest current of a balancing resistor, part of the rated capacity per hour: passive ones take a hundredth of it at most.
+const MAX_BLEED_PER_H: f64 = 0.2;
 /// Longest name of a vehicle or pack, characters: a line of the status shows all three.
 const MAX_VEHICLE_TEXT: usize = 64;
 
@@ -20,6 +22,7 @@ pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Fau
     interfaces(raw, faults);
     sources(raw, faults);
     voltages(raw, faults);
+    balancing(raw, model, faults);
     if let Some(pack) = &raw.pack {
         temperatures(pack, raw, faults);
         label::check(pack, faults);
@@ -82,6 +85,25 @@ fn voltages(raw: &RawTables, faults: &mut Faults) {
             note_at(raw.pack_voltage.as_ref().map(|input| &input.place), text, raw, faults);
         }
         (true, false) | (false, true) => {}
+    }
+}
+
+/// Bits of single cells, of a BMS that balances, and a current that a resistor can take.
+fn balancing(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    let (Some(keys), Some(pack)) = (&raw.balancing, &raw.pack) else { return };
+    if raw.is_pack_total() {
+        let text =
+            "input.balancing stands beside [input.pack_voltage], must be without it: the pack is estimated as one cell";
+        faults.add_at(&keys.place.at, text);
+    }
+    if !pack.balancing {
+        pack.place.fault(faults, "balancing", "must be true where there is [input.balancing]");
+    }
+    let rated_ah = pack.rated_capacity_ah.or(model.map(|model| model.rated_capacity_ah));
+    let most_a = rated_ah.map(|rated_ah| MAX_BLEED_PER_H * rated_ah * f64::from(pack.strings));
+    if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
+        let what = format!("must be at most {most_a:?} A, a fifth of the pack's rated capacity in an hour");
+        keys.place.fault(faults, "bleed_a", &what);
     }
 }
 

@@ -243,6 +243,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
             | Channel::ReportedSoc
             | Channel::ReportedSoh
             | Channel::SupplyVoltage
+            | Channel::Balancing(_)
             | Channel::PackIdentity
             | Channel::Contactor => None,
         },

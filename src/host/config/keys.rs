@@ -25,9 +25,9 @@ use crate::quantity::{MAX_CELLS, bounds};
 
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
 pub(crate) use input::{
-    AnswerSignalKeys, CellVoltageInput, ContactorInput, CurrentInput, DiagnosticInput, Input, PackIdentityInput,
-    PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource, SupplyVoltageInput,
-    TemperatureInput,
+    AnswerSignalKeys, BalancingInput, CellVoltageInput, ContactorInput, CurrentInput, DiagnosticInput, Input,
+    PackIdentityInput, PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource,
+    SupplyVoltageInput, TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};
 pub(crate) use traffic::{
@@ -138,7 +138,7 @@ section! {
         chemistry: Option<Chemistry>, "", Any, Optional;
         /// Whether the model of a cell without a model file is learned on board from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
-        /// Whether the BMS balances: lets the fuller cells lose charge towards and after the end of a charge. Then only the cell with the least charge is one that may leak.
+        /// Whether the BMS balances: lets the fuller cells lose charge towards and after the end of a charge. Then only the cell with the least charge is one that may leak, unless `[input.balancing]` shows which cells are bled.
         balancing: bool, "", Any, Default("true");
         /// Lowest voltage of a cell without a model file: empty. Without it: usual of the chemistry (NMC, NCA and LFP 2.5 V, else 3.0 V).
         voltage_min_v: Option<f64>, "V", Above(0.0, 100.0), Optional;

@@ -134,7 +134,15 @@ pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
     let mut search = Search { raw, databases, faults, found: Vec::new() };
     for (channel, source) in raw.sources() {
         match channel {
-            Channel::CellVoltage(_) => search.cells(&source),
+            Channel::CellVoltage(_) => {
+                let first = raw.cell_voltage.as_ref().map_or(1, |keys| keys.first);
+                search.cells(&source, first, Channel::CellVoltage);
+            }
+            Channel::Balancing(_) => {
+                let first = raw.balancing.as_ref().map_or(1, |keys| keys.first);
+                search.cells(&source, first, Channel::Balancing);
+                search.bits(&source);
+            }
             Channel::Current => search.one(channel, &source, current_sign(raw)),
             _ => search.one(channel, &source, 1.0),
         }
@@ -186,10 +194,9 @@ impl<'d> Search<'_, 'd> {
         source.place.fault(self.faults, "signal", &(what + &hint));
     }
 
-    /// The signals of all cells, by their pattern.
-    fn cells(&mut self, source: &SignalSource<'_>) {
-        let raw = self.raw;
-        let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return };
+    /// The signals of all cells, by their pattern; `first`: the first cell's number in it.
+    fn cells(&mut self, source: &SignalSource<'_>, first: u16, channel: fn(CellIndex) -> Channel) {
+        let Some(pack) = &self.raw.pack else { return };
         let cells = pack.cells;
         let pattern = match Pattern::parse(source.signal) {
             Ok(pattern) => pattern,
@@ -201,17 +208,17 @@ impl<'d> Search<'_, 'd> {
         let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
             if let Some(number) = pattern.fits(&hit.full_name()) {
-                hits.entry(number.unwrap_or(u32::from(keys.first))).or_default().push(hit);
+                hits.entry(number.unwrap_or(u32::from(first))).or_default().push(hit);
             }
         }
         if hits.is_empty() {
             return self.not_found(source);
         }
         let mut missing = Vec::new();
-        for (index, number) in (0..cells).zip(u32::from(keys.first)..) {
+        for (index, number) in (0..cells).zip(u32::from(first)..) {
             match hits.get(&number).map(Vec::as_slice) {
                 None | Some([]) => missing.push(number),
-                Some([hit]) => self.add(Channel::CellVoltage(CellIndex(index)), source, 1.0, *hit),
+                Some([hit]) => self.add(channel(CellIndex(index)), source, 1.0, *hit),
                 Some([a, .., b]) => {
                     let what =
                         format!("must give each cell one signal, {number} is {} and {}", a.full_name(), b.full_name());
@@ -221,6 +228,18 @@ impl<'d> Search<'_, 'd> {
         }
         if !missing.is_empty() {
             let what = format!("must give every cell a signal, none for number {}", list(&missing));
+            source.place.fault(self.faults, "signal", &what);
+        }
+    }
+
+    /// Notes a balancing signal that is no bit.
+    fn bits(&mut self, source: &SignalSource<'_>) {
+        let is_long = |resolved: &&ResolvedSignal<'_>| {
+            matches!(resolved.channel, Channel::Balancing(_)) && resolved.signal.layout.length_bits != 1
+        };
+        if let Some(ResolvedSignal { message, signal, .. }) = self.found.iter().find(is_long) {
+            let (message, signal, bits) = (&message.name, &signal.name, signal.layout.length_bits);
+            let what = format!("{message}.{signal} has {bits} bits, must have 1");
             source.place.fault(self.faults, "signal", &what);
         }
     }
@@ -273,6 +292,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::Balancing(cell) => format!("cell {} balancing", cell.0 + 1),
         Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
         Channel::Contactor => "contactors".to_owned(),

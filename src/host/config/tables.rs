@@ -2,10 +2,10 @@
 
 use super::document::{Faults, TablePlace};
 use super::keys::{
-    Alarm, AnswerSignalKeys, Authentication, Capacity, CellVoltageInput, Commands, ContactorInput, CurrentInput,
-    CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm, OutputDigest,
-    OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, Poll,
-    ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, SupplyVoltageInput,
+    Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
+    CurrentInput, CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
+    OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackVoltageInput,
+    Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, SupplyVoltageInput,
     TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::schema::tables;
@@ -22,6 +22,7 @@ tables! {
         current: one CurrentInput,
         contactor: optional ContactorInput,
         cell_voltage: optional CellVoltageInput,
+        balancing: optional BalancingInput,
         pack_voltage: optional PackVoltageInput,
         temperatures: many TemperatureInput,
         reported_soc: optional ReportedSocInput,
@@ -99,6 +100,7 @@ impl RawTables {
             Channel::Temperature(sensor) => self.temperatures.get(usize::from(sensor.0)).map(|keys| keys.config()),
             Channel::PackVoltage => self.pack_voltage.as_ref().map(|keys| keys.config()),
             Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.config()),
+            Channel::Balancing(_) => self.balancing.as_ref().map(|keys| keys.config()),
             Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.config()),
             Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
             Channel::SupplyVoltage => self.supply_voltage.as_ref().map(|keys| keys.config()),
@@ -107,7 +109,7 @@ impl RawTables {
         }
     }
 
-    /// All configured signals, `[input.cell_voltage]` once, for the first cell.
+    /// All configured signals, `[input.cell_voltage]` and `[input.balancing]` once, for the first cell.
     pub(super) fn sources(&self) -> impl Iterator<Item = (Channel, SignalSource<'_>)> {
         let sensors = (0..).take(self.temperatures.len()).map(|index| Channel::Temperature(SensorIndex(index)));
         let others = [
@@ -118,6 +120,7 @@ impl RawTables {
             Channel::PackIdentity,
             Channel::Contactor,
             Channel::CellVoltage(CellIndex(0)),
+            Channel::Balancing(CellIndex(0)),
         ];
         let channels = [Channel::Current].into_iter().chain(sensors).chain(others);
         channels.filter_map(|channel| Some((channel, self.source(channel)?)))

@@ -8,6 +8,7 @@ use std::path::Path;
 use proptest::prelude::*;
 
 mod alarms;
+mod balancing;
 mod cell_model;
 mod diagnostic;
 mod drop_ins;

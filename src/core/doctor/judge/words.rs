@@ -76,6 +76,7 @@ pub(super) fn channel(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {}", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::Balancing(cell) => format!("balancing of cell {}", cell.0 + 1),
         Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
         Channel::Contactor => "contactors".to_owned(),

@@ -105,7 +105,7 @@ macro_rules! signal_section {
         section! {
             $(#[doc = $about])+
             $name at $path gives SignalSource<'_>, |keys| {
-                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer; in `[input.cell_voltage]` a pattern, see there.
+                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer; in `[input.cell_voltage]` and `[input.balancing]` a pattern, see there.
                 signal: String, "", NotEmpty, Required => signal: &keys.signal;
                 /// Interface that carries the signal. Needed when there are several.
                 interface: Option<String>, "", NotEmpty, Optional => interface: keys.interface.as_deref();
@@ -162,6 +162,20 @@ signal_section! {
     CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
         /// Number of the first cell in the names.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
+    }
+}
+
+signal_section! {
+    /// One bit per cell that shows whether the BMS bleeds the cell: with it the leaks of all cells are found, without it only that of the cell that is never bled. `signal` is a pattern as that of `[input.cell_voltage]`; every cell must have exactly one signal, of 1 bit. A value other than 0 means that the cell is bled. A bit holds until the next one, for at most `max_age_s`. Bits that come while all else is silent do not wake the buses. Not with `pack.balancing = false`.
+    BalancingInput at "input.balancing", "any unit" {
+        /// Number of the first cell in the names.
+        first: u16, "", Between(0.0, 60000.0), Default("1") =>;
+        /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances; parallel strings share it. At most a fifth of the pack's rated capacity in an hour.
+        bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
+        /// Longest time for which a bit holds.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
+        /// Whether the BMS bleeds no cell while it sends no bits. `false`: of that time nothing is known, and a leak is learned from the rest alone.
+        only_while_sent: bool, "", Any, Default("false") =>;
     }
 }
 

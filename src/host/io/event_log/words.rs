@@ -14,6 +14,7 @@ pub(super) fn channel(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell voltage {}", super::number(cell)),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::Balancing(cell) => format!("balancing of cell {}", super::number(cell)),
         Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
     }
