@@ -73,7 +73,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let sensors = u16::try_from(wiring.temperature_at.len()).unwrap_or(u16::MAX);
     let sim = Simulation::new(monitor.model.clone(), settings, wiring);
     let faults = &args.changes.faults;
-    let mut sim = faults.apply(sim, settings.pack.cells, sensors, settings.pack.capacity_ah, config.monitor.balancing_bits)?;
+    let mut sim =
+        faults.apply(sim, settings.pack.cells, sensors, settings.pack.capacity_ah, config.monitor.balancing_bits)?;
     let mut sink = Sink::open(args, &config)?;
     let mut truth = match &args.truth {
         Some(path) => {

@@ -354,7 +354,8 @@ impl Diagnosis {
 
     /// For how long the cells whose voltages are in the middle half were bled, mean, s.
     fn bled_in_middle_s(&self, bled: &[BledTime]) -> f64 {
-        let by_voltage = self.cells.iter().zip(bled).filter_map(|(cell, bled)| Some((cell.sums.mean_v()?, bled.bled_s)));
+        let by_voltage =
+            self.cells.iter().zip(bled).filter_map(|(cell, bled)| Some((cell.sums.mean_v()?, bled.bled_s)));
         let mut by_voltage: Vec<(f64, f64)> = by_voltage.collect();
         by_voltage.sort_by(|a, b| a.0.total_cmp(&b.0));
         let cut = by_voltage.len() / 4;
