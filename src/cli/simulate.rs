@@ -74,7 +74,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let sim = Simulation::new(monitor.model.clone(), settings, wiring);
     let faults = &args.changes.faults;
     let mut sim =
-        faults.apply(sim, settings.pack.cells, sensors, settings.pack.capacity_ah, config.monitor.balancing_bits)?;
+        faults.apply(sim, settings.pack.cells, sensors, settings.pack.capacity_ah, config.monitor.balancing)?;
     let mut sink = Sink::open(args, &config)?;
     let mut truth = match &args.truth {
         Some(path) => {

@@ -211,8 +211,8 @@ impl Case {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
         let is_balanced = self.balancing != PackBalancing::Off;
-        let balancing_bits = config.balancing_bits.filter(|_| self.balancing == PackBalancing::Bits);
-        let mut monitor = Monitor::new(MonitorConfig { is_balanced, balancing_bits, ..config.clone() });
+        let balancing = config.balancing.filter(|_| self.balancing == PackBalancing::Bits);
+        let mut monitor = Monitor::new(MonitorConfig { is_balanced, balancing, ..config.clone() });
         let (mut ticks, mut out, mut frames) =
             (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
         let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);

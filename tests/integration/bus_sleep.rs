@@ -1,9 +1,12 @@
 //! A parked vehicle: its buses fall silent as a whole, which is no fault; silence under load, or of one input, is one.
 
 use packwatch::alarm::{Change, Rule};
-use packwatch::monitor::{Downtime, Event, EventKind, Validity};
+use packwatch::can::{CanId, Frame};
+use packwatch::monitor::{Downtime, Event, EventKind, Input, Validity};
+use packwatch::quantity::BusIndex;
 
-use crate::support::rig::Rig;
+use crate::support::config_texts;
+use crate::support::rig::{DBC, PACK, Rig};
 
 const ALARMS: &str = "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nsevere = 5\n[[alarm]]\nrule = \"input_implausible\"\nwarning = 0.5\n\
                       [[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n";
@@ -11,7 +14,10 @@ const HOUR: i64 = 3600;
 
 /// A pack that drove and has stood for a minute.
 fn parked() -> Rig {
-    let mut rig = Rig::new(ALARMS);
+    park(Rig::new(ALARMS))
+}
+
+fn park(mut rig: Rig) -> Rig {
     rig.seconds(10);
     rig.current_a = Some(5.0);
     rig.seconds(30);
@@ -53,6 +59,24 @@ fn a_night_is_four_events_and_no_alarm() {
     let [(true, None), (false, Some(slept_s))] = sleeps(&rig.events)[..] else { panic!("{kinds:#?}") };
     assert!((f64::from(8 * 3600 - 10)..f64::from(8 * 3600)).contains(&slept_s), "{slept_s}");
     assert_eq!((rig.changes(Rule::InputMissing), rig.monitor.pack_view().validity), (vec![], Validity::Valid));
+}
+
+#[test]
+fn bits_of_a_bms_that_balances_at_night_wake_no_bus() {
+    let keys = "[input.balancing]\nsignal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n";
+    let bit = |n: u8| format!(" SG_ Bleed{n} : {}|1@1+ (1,0) [0|1] \"\" A\n", n - 1);
+    let dbc = format!("{DBC}BO_ 288 Bleeding: 1 A\n{}{}", bit(1), bit(2));
+    let mut rig = park(Rig::with(config_texts::load(&format!("{PACK}{keys}{ALARMS}"), &dbc).monitor));
+    fall_silent(&mut rig);
+    for _ in 0..60 {
+        rig.seconds(60);
+        let (time, frame) = (rig.now(), Frame::classic(CanId::Standard(288), &[0b10]).unwrap());
+        rig.give(Input::Frame { time, bus: BusIndex(0), frame: &frame });
+    }
+    assert!(rig.monitor.asleep_since().is_some());
+    let kinds: Vec<_> = rig.events.iter().map(|event| event.kind).collect();
+    assert_eq!(sleeps(&rig.events), [(true, None)], "{kinds:#?}");
+    assert_eq!(rig.changes(Rule::InputMissing), []);
 }
 
 #[test]

@@ -4,11 +4,12 @@ use std::fmt::Write as _;
 
 use crate::support::config_texts;
 use packwatch::alarm::{AlarmState, Change, Rule};
+use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::encode::InputEncoder;
-use packwatch::findings::{Finding, FindingKind};
+use packwatch::findings::{BalancingConfig, Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
-use packwatch::quantity::{CellIndex, Timestamp};
+use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
@@ -308,34 +309,56 @@ fn a_leak_is_found_although_a_bms_bleeds_the_others() {
     assert!(found(&pack).contains(&(FindingKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
 }
 
-/// Leaks found in a pack of 12 cells whose BMS bleeds the others for as long as cell 7 leaks, with its bits or without.
-fn leaks_of_balanced(fault: &str, has_bits: bool) -> Vec<Option<(CellIndex, CellIndex)>> {
+/// Findings of 14 days in a pack of 12 cells whose BMS balances with `Balancing::usual`; `configure` changes what the monitor knows of it.
+fn found_in_balanced(
+    fault: &str,
+    bleed: f64,
+    configure: impl Fn(MonitorConfig) -> MonitorConfig,
+) -> Vec<(FindingKind, Option<(CellIndex, CellIndex)>)> {
     let keys = "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nmax_age_s = 90.0\nonly_while_sent = true\n[output]\n";
-    let config = load(&PACK.replace("[output]\n", keys), "Temperature");
-    let balancing_bits = config.balancing_bits.filter(|_| has_bits);
+    let config = configure(load(&PACK.replace("[output]\n", keys), "Temperature"));
     let mut settings = settings();
     settings.pack.spread.soc = 0.005;
-    let config = MonitorConfig { balancing_bits, ..config };
     let mut pack = FaultyPack::simulated(config, settings, Wiring::single(), fault);
-    pack.sim = pack.sim.with_balancing(Balancing::usual(2.6)).with_balancing_bits();
+    let usual = Balancing::usual(2.6);
+    pack.sim = pack.sim.with_balancing(Balancing { bleed_a: bleed * usual.bleed_a, ..usual }).with_balancing_bits();
     pack.run_to(14.0);
-    let leak = |event: &Event| match event.kind {
-        EventKind::Finding(Finding { kind: FindingKind::Leak, cells, .. }) => Some(cells),
+    let finding = |event: &Event| match event.kind {
+        EventKind::Finding(Finding { kind, cells, .. }) => Some((kind, cells)),
         _ => None,
     };
-    pack.events.iter().filter_map(leak).collect()
+    let mut found: Vec<_> = pack.events.iter().filter_map(finding).collect();
+    found.sort();
+    found
+}
+
+/// Changes what the bits mean.
+fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(MonitorConfig) -> MonitorConfig {
+    move |config| MonitorConfig { balancing: config.balancing.map(change), ..config }
 }
 
 /// Without the bits only the lowest cell is one that may leak: what cell 3 loses may have been bled.
 #[test]
 fn leaks_beside_that_of_the_lowest_cell_are_found_by_the_bits_of_what_is_bled() {
-    let (cell_3, cell_7) = (Some((CellIndex(2), CellIndex(2))), Some((CellIndex(6), CellIndex(6))));
+    let leak_of = |cell| (FindingKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
     let faults = "leak:7:0.4mA@day3 leak:3:0.2mA@day3";
-    let mut found = leaks_of_balanced(faults, true);
-    found.sort();
-    assert_eq!(found, [cell_3, cell_7]);
-    assert_eq!(leaks_of_balanced(faults, false), [cell_7]);
-    assert_eq!(leaks_of_balanced("", true), []);
+    assert_eq!(found_in_balanced(faults, 1.0, |config| config), [leak_of(2), leak_of(6)]);
+    let without_bits = |config| MonitorConfig { balancing: None, ..config };
+    assert_eq!(found_in_balanced(faults, 1.0, without_bits), [leak_of(6)]);
+}
+
+/// What a cell loses while its bit does not come, or is not known, may have been bled.
+#[test]
+fn what_may_have_been_bled_is_no_leak() {
+    let unseen = with_balancing(|it| BalancingConfig { is_only_while_sent: false, max_age_s: 10.0, ..it });
+    assert_eq!(found_in_balanced("", 1.0, unseen), []);
+    assert_eq!(found_in_balanced("", 1.2, |config| config), [], "more than the bits are taken for");
+    let without_a_bit = |mut config: MonitorConfig| {
+        let is_kept = |binding: &Binding| binding.channel != Channel::Balancing(CellIndex(4));
+        config.input = InputMap::new(config.input.bindings().iter().filter(|it| is_kept(it)).cloned().collect());
+        config
+    };
+    assert_eq!(found_in_balanced("", 1.0, without_a_bit), []);
 }
 
 #[test]

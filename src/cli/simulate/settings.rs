@@ -2,7 +2,7 @@
 
 use crate::cli::Failure;
 use crate::cli::numbers::{NamedValue, between, finite, one_of, share, within};
-use crate::findings::BalancingBits;
+use crate::findings::BalancingConfig;
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 
 /// Scenarios by name.
@@ -115,22 +115,22 @@ impl FaultArgs {
         self.balancing || !self.faults.is_empty()
     }
 
-    /// Adds them to `sim`. `bits`: those of the configuration.
+    /// Adds them to `sim`. `balancing`: `[input.balancing]`, whose `bleed_a` replaces the usual one.
     pub(super) fn apply(
         &self,
         sim: Simulation,
         cells: u16,
         sensors: u16,
         capacity_ah: f64,
-        bits: Option<BalancingBits>,
+        balancing: Option<BalancingConfig>,
     ) -> Result<Simulation, Failure> {
         let check = |fault: &Fault| fault.kind.check(cells, sensors);
         self.faults.iter().try_for_each(check).map_err(|error| Failure::new(format!("--fault: {error}")))?;
         let sim = sim.with_faults(&self.faults);
-        let sim = if bits.is_some() { sim.with_balancing_bits() } else { sim };
+        let sim = if balancing.is_some() { sim.with_balancing_bits() } else { sim };
         let usual = Balancing::usual(capacity_ah);
-        let balancing = Balancing { bleed_a: bits.map_or(usual.bleed_a, |bits| bits.bleed_a), ..usual };
-        Ok(if self.balancing { sim.with_balancing(balancing) } else { sim })
+        let balancer = Balancing { bleed_a: balancing.map_or(usual.bleed_a, |it| it.bleed_a), ..usual };
+        Ok(if self.balancing { sim.with_balancing(balancer) } else { sim })
     }
 }
 

@@ -3,11 +3,12 @@
 //! The errors of a row are round numbers of a circuit model and a usual cell monitor. They were tried on the simulated pack of ten cells
 //! and on the simulator's packs; no measured pack had a part in them.
 
+mod balancing;
 mod judge;
 
 use serde::{Deserialize, Serialize};
 
-use super::bleeding::{BalancingBits, BledTime, Bleeding};
+use super::bleed_timer::BalancingConfig;
 use super::channels::{Channel, compare};
 use super::difference::{CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{Finding, FindingKind};
@@ -17,6 +18,7 @@ use super::temperature::Following;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState, Timestamp};
+use balancing::Bleed;
 use judge::Population;
 
 /// A row ends when this part of the charge has moved, or after this time, s; at rest after this part of the rest, because it says
@@ -54,10 +56,6 @@ const SAME_EVENT_S: f64 = 1800.0;
 const SWAP_V: f64 = 0.008;
 /// SOC at which a BMS bleeds: near the end of a charge.
 const BLED_SOC: f64 = 0.9;
-/// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
-const BLED_PART: f64 = 0.2;
-/// Mean square of what differs between two cells of which each may have been bled for no part of a time up to all of it.
-const UNIFORM: f64 = 1.0 / 3.0;
 const DAY_S: f64 = 86_400.0;
 /// Kinds up to the last one that a cell may have.
 const CELL_KINDS: usize = FindingKind::TemperatureSensor as usize;
@@ -89,7 +87,7 @@ struct Watched {
     sums: CellSums,
     channel: Channel,
     #[serde(default)]
-    bleeding: Bleeding,
+    bleed: Bleed,
     temperature: Following,
     /// Since when each kind is likelier than not.
     suspected: [Option<Timestamp>; CELL_KINDS],
@@ -137,7 +135,7 @@ impl Diagnosis {
             before_jump: [0.0; STATES],
             sums: CellSums::default(),
             channel: Channel::default(),
-            bleeding: Bleeding::default(),
+            bleed: Bleed::default(),
             temperature: Following::default(),
             suspected: [None; CELL_KINDS],
             jumped: None,
@@ -212,18 +210,6 @@ impl Diagnosis {
         }
     }
 
-    /// Takes a bit of the BMS: whether it bleeds a cell. It holds until `holds_until`, or the next one.
-    pub fn take_bit(&mut self, cell: usize, time: Timestamp, is_bled: bool, holds_until: Timestamp) {
-        let Some(watched) = self.cells.get(cell) else { return };
-        // What a cell loses beside what the bits show is a leak.
-        let begins = !watched.bleeding.has_bits() && self.may_be_bled(cell);
-        let watched = &mut self.cells[cell];
-        watched.bleeding.take(time, is_bled, holds_until);
-        if begins {
-            watched.difference.watch_leak();
-        }
-    }
-
     /// Takes the mean cell after the samples of a moment; whether the row is complete: [`Self::close_row`] then ends it.
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
@@ -239,7 +225,7 @@ impl Diagnosis {
         }
         let seconds = pack.last.replace(time).map_or(0.0, |last| time.since(last).max(0.0));
         if pack.begun.is_none() {
-            self.cells.iter_mut().for_each(|cell| cell.bleeding.begin_row(time));
+            self.cells.iter_mut().for_each(|cell| cell.bleed.timer.begin_row(time));
         }
         let begun = *pack.begun.get_or_insert(time);
         let first_ah = if pack.count == 0 { mean.charge_ah } else { pack.first_ah };
@@ -284,14 +270,14 @@ impl Diagnosis {
     }
 
     /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
-    /// after a charge. `bits`: what the bits mean where a BMS shows which cells it bleeds. Returns the findings that are new.
+    /// after a charge. `balancing`: what the bits mean where a BMS shows which cells it bleeds. Returns the findings that are new.
     pub fn close_row(
         &mut self,
         model: &CellModel,
         capacity_ah: f64,
         socs: impl Fn(usize) -> Option<f64>,
         is_balanced: bool,
-        bits: Option<&BalancingBits>,
+        balancing: Option<BalancingConfig>,
     ) -> Vec<Finding> {
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
@@ -310,7 +296,7 @@ impl Diagnosis {
         let middle_time = begun.plus_secs(0.5 * time.since(begun));
         let seconds = self.last_row.map_or(0.0, |(last, ..)| middle_time.since(last));
         self.pass(middle_time, &row);
-        self.pass_bled(time, &row, bits);
+        self.remove_bled_charge(time, capacity_ah, balancing);
         let before = self.findings.clone();
         if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
@@ -333,34 +319,6 @@ impl Diagnosis {
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
-    }
-
-    /// Takes out what was bled since the last row, against what was bled of the middle cells. `bits`: `None` = nothing is known of it.
-    fn pass_bled(&mut self, time: Timestamp, row: &Row<'_>, bits: Option<&BalancingBits>) {
-        let Some(bits) = bits else {
-            return self.cells.iter_mut().for_each(|cell| cell.bleeding = Bleeding::default());
-        };
-        let bled: Vec<BledTime> = self.cells.iter_mut().map(|cell| cell.bleeding.end_row(time)).collect();
-        let middle_s = self.bled_in_middle_s(&bled);
-        let soc_per_s = bits.bleed_a / (3600.0 * row.capacity_ah);
-        for (index, (cell, bled)) in self.cells.iter_mut().zip(&bled).enumerate() {
-            let soc = soc_per_s * (bled.bled_s - middle_s);
-            // The cell that shows the least is never bled.
-            let is_all_known = bits.is_only_while_sent || self.lowest == Some(index);
-            let unknown = if is_all_known { 0.0 } else { soc_per_s * bled.unknown_s };
-            cell.difference.take_out(soc, (BLED_PART * soc) * (BLED_PART * soc) + UNIFORM * unknown * unknown);
-        }
-    }
-
-    /// For how long the cells whose voltages are in the middle half were bled, mean, s.
-    fn bled_in_middle_s(&self, bled: &[BledTime]) -> f64 {
-        let by_voltage =
-            self.cells.iter().zip(bled).filter_map(|(cell, bled)| Some((cell.sums.mean_v()?, bled.bled_s)));
-        let mut by_voltage: Vec<(f64, f64)> = by_voltage.collect();
-        by_voltage.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let cut = by_voltage.len() / 4;
-        let inner = &by_voltage[cut..by_voltage.len() - cut];
-        inner.iter().map(|(_, bled_s)| bled_s).sum::<f64>() / inner.len().max(1) as f64
     }
 
     /// Compares every cell with the middle ones, `seconds` after the row before; whether there was something to compare.
@@ -535,7 +493,7 @@ impl Diagnosis {
         self.last_row = None;
         for cell in &mut self.cells {
             cell.difference.forget_charge();
-            cell.bleeding = Bleeding::default();
+            cell.bleed.forget_time();
         }
     }
 
@@ -557,7 +515,7 @@ impl Diagnosis {
         self.gain.rebase(by_nanos);
         for cell in &mut self.cells {
             cell.suspected.iter_mut().flatten().chain(&mut cell.jumped).for_each(moved);
-            cell.bleeding.rebase(by_nanos);
+            cell.bleed.timer.rebase(by_nanos);
         }
     }
 
@@ -574,7 +532,7 @@ impl Diagnosis {
         for cell in &self.cells {
             cell.difference.check()?;
             cell.channel.check(cells)?;
-            cell.bleeding.check()?;
+            cell.bleed.check()?;
             let numbers = cell
                 .sums
                 .numbers()
@@ -650,8 +608,13 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     if values.len() < LEAST_CELLS {
         return None;
     }
-    values.sort_by(f64::total_cmp);
-    let cut = values.len() / 4;
-    let inner = &values[cut..values.len() - cut];
+    let inner = inner_half(&mut values, |value| *value);
     Some(inner.iter().sum::<f64>() / inner.len() as f64)
+}
+
+/// Sorts values, and takes those that are neither in the lowest nor in the highest quarter.
+fn inner_half<T>(values: &mut [T], by: impl Fn(&T) -> f64) -> &[T] {
+    values.sort_by(|a, b| by(a).total_cmp(&by(b)));
+    let cut = values.len() / 4;
+    &values[cut..values.len() - cut]
 }

@@ -155,8 +155,8 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Charge was taken out beside the current: SOC, and its variance.
-    pub(super) fn take_out(&mut self, soc: f64, variance: f64) {
+    /// Removes charge that no sensor of the current sees: SOC, and its variance.
+    pub(super) fn remove_charge(&mut self, soc: f64, variance: f64) {
         self.mean[SOC] -= soc;
         self.covariance[pair(SOC, SOC)] += variance;
         self.keep_possible();

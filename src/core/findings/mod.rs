@@ -8,14 +8,14 @@
 //! | --- | --- |
 //! | [`diagnosis`] | all cells: rows in, findings out |
 //! | [`difference`] | the filter of one cell's difference: charge, capacity, resistance, contact, channel, leak |
-//! | [`bleeding`] | for how long a cell was bled, by the bits of its BMS |
+//! | [`bleed_timer`] | for how long a cell was bled, by the bits of its BMS |
 //! | `row` | samples of some minutes, summed per cell |
 //! | [`gain`] | the current sensor's gain, by what all cells have in common |
 //! | `channels` | channels that are frozen or doubled |
 //! | `temperature` | temperature sensors that do not follow the load |
 //! | [`imbalance`] | what the differences cost the pack, and its limiting cells |
 //! | [`finding`] | kinds of findings, and from when on one is reported |
-pub mod bleeding;
+pub mod bleed_timer;
 pub mod diagnosis;
 pub mod difference;
 pub mod finding;
@@ -26,7 +26,7 @@ mod channels;
 mod row;
 mod temperature;
 
-pub use bleeding::BalancingBits;
+pub use bleed_timer::BalancingConfig;
 pub use diagnosis::{Diagnosis, MeanCell};
 pub use difference::Difference;
 pub use finding::{Finding, FindingKind};

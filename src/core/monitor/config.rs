@@ -14,7 +14,7 @@ use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
 use crate::cell::{CellModel, EstimatorConfig, Label};
-use crate::findings::BalancingBits;
+use crate::findings::BalancingConfig;
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
 use crate::sample::SampleConfig;
@@ -51,7 +51,7 @@ pub struct MonitorConfig {
     /// Whether the BMS lets fuller cells lose charge after a charge.
     pub is_balanced: bool,
     /// What the bits among `input` mean that show which cells are bled; `None` = there are none.
-    pub balancing_bits: Option<BalancingBits>,
+    pub balancing: Option<BalancingConfig>,
     /// Estimator.
     pub estimator: EstimatorConfig,
     /// Learning at transitions.
@@ -206,7 +206,7 @@ impl MonitorConfig {
                     && self.guards == new.guards
                     && self.cycle_times_s == new.cycle_times_s
                     && self.asleep_after_s == new.asleep_after_s
-                    && self.balancing_bits == new.balancing_bits
+                    && self.balancing == new.balancing
                     && old_sample.contactor == new_sample.contactor,
             ),
             ("[limits]", limits(old_sample) == limits(new_sample)),

@@ -13,7 +13,7 @@ use crate::alarm::{Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::findings::finding::OFFSET_PER_H;
 use crate::findings::gain::Learned;
-use crate::findings::{BalancingBits, Diagnosis, FindingKind, MeanCell};
+use crate::findings::{BalancingConfig, Diagnosis, FindingKind, MeanCell};
 use crate::quantity::{CellIndex, Fault, Timestamp};
 use crate::sample::CellSample;
 
@@ -25,19 +25,19 @@ pub(super) struct Diagnosing {
     /// The BMS lets fuller cells lose charge.
     is_balanced: bool,
     /// Where bits show which cells are bled.
-    bits: Option<BalancingBits>,
+    balancing: Option<BalancingConfig>,
 }
 
 impl Diagnosing {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
-        let (is_balanced, bits) = (config.is_balanced, config.balancing_bits);
-        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced, bits }
+        let (is_balanced, balancing) = (config.is_balanced, config.balancing);
+        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced, balancing }
     }
 
     /// Other settings for the same cells.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
-        (self.is_balanced, self.bits) = (config.is_balanced, config.balancing_bits);
+        (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
     }
 
     /// Forgets everything: another pack is connected.
@@ -65,10 +65,11 @@ impl Diagnosing {
         (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
     }
 
-    /// Takes a bit that shows whether a cell is bled; a bad reading shows nothing, and the bit before holds for its time.
-    pub(super) fn take_bit(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
-        if let (Ok(value), Some(bits)) = (reading, &self.bits) {
-            self.diagnosis.take_bit(cell.index(), now, value != 0.0, now.plus_secs(bits.max_age_s));
+    /// Takes a bit that shows whether a cell is bled.
+    pub(super) fn handle_balancing(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
+        if let Some(balancing) = &self.balancing {
+            let is_bled = reading.ok().map(|value| value != 0.0);
+            self.diagnosis.handle_balancing(cell.index(), now, is_bled, now.plus_secs(balancing.max_age_s));
         }
     }
 
@@ -116,7 +117,7 @@ impl Diagnosing {
         let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
         if is_complete {
             let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
-            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.bits.as_ref());
+            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
             let cell = |index: usize| Learned {

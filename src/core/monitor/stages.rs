@@ -83,7 +83,7 @@ impl Stages {
     fn handle_other_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
             Channel::PackIdentity => return self.handle_identity(now, bus, reading, out),
-            Channel::Balancing(cell) => return self.diagnosing.take_bit(now, cell, reading.value),
+            Channel::Balancing(cell) => return self.diagnosing.handle_balancing(now, cell, reading.value),
             Channel::SupplyVoltage => return self.sender.handle_supply(now, reading.value),
             _ => {}
         }

@@ -228,6 +228,7 @@ impl Simulation {
 
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
+        self.current_a = 0.0;
         let steps = (duration_s / ASLEEP_STEP_S).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }

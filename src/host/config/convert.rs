@@ -12,7 +12,7 @@ use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::poll::PollConfig;
 use crate::cell::CellModel;
-use crate::findings::BalancingBits;
+use crate::findings::BalancingConfig;
 use crate::health::HealthConfig;
 use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig, SupplyConfig};
 use crate::quantity::{BusIndex, SensorIndex};
@@ -76,7 +76,7 @@ pub(super) fn monitor(
         model,
         label: super::label::label(pack).filter(|_| pack.learn_model),
         is_balanced: pack.balancing,
-        balancing_bits: raw.balancing.as_ref().map(|keys| BalancingBits {
+        balancing: raw.balancing.as_ref().map(|keys| BalancingConfig {
             bleed_a: keys.bleed_a / f64::from(pack.strings),
             max_age_s: keys.max_age_s,
             is_only_while_sent: keys.only_while_sent,

@@ -11,7 +11,7 @@ use crate::cell::{CapacityState, CellModel};
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
-/// Largest current of a balancing resistor, part of the rated capacity per hour: passive ones take a hundredth of it at most.
+/// Largest current of a balancing resistor, part of the rated capacity per hour: passive ones take a few hundredths.
 const MAX_BLEED_PER_H: f64 = 0.2;
 /// Longest name of a vehicle or pack, characters: a line of the status shows all three.
 const MAX_VEHICLE_TEXT: usize = 64;

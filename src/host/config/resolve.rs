@@ -141,7 +141,6 @@ pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
             Channel::Balancing(_) => {
                 let first = raw.balancing.as_ref().map_or(1, |keys| keys.first);
                 search.cells(&source, first, Channel::Balancing);
-                search.bits(&source);
             }
             Channel::Current => search.one(channel, &source, current_sign(raw)),
             _ => search.one(channel, &source, 1.0),
@@ -228,18 +227,6 @@ impl<'d> Search<'_, 'd> {
         }
         if !missing.is_empty() {
             let what = format!("must give every cell a signal, none for number {}", list(&missing));
-            source.place.fault(self.faults, "signal", &what);
-        }
-    }
-
-    /// Notes a balancing signal that is no bit.
-    fn bits(&mut self, source: &SignalSource<'_>) {
-        let is_long = |resolved: &&ResolvedSignal<'_>| {
-            matches!(resolved.channel, Channel::Balancing(_)) && resolved.signal.layout.length_bits != 1
-        };
-        if let Some(ResolvedSignal { message, signal, .. }) = self.found.iter().find(is_long) {
-            let (message, signal, bits) = (&message.name, &signal.name, signal.layout.length_bits);
-            let what = format!("{message}.{signal} has {bits} bits, must have 1");
             source.place.fault(self.faults, "signal", &what);
         }
     }

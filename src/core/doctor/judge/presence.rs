@@ -199,7 +199,9 @@ fn more_cells(judge: &mut Judge<'_>) {
 fn present(judge: &mut Judge<'_>) {
     for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
         let all = judge.signals(kind);
-        let present: Vec<&Series> = all.iter().map(|(_, series)| *series).filter(|s| s.count() > 0).collect();
+        // A bit is no value with a range.
+        let values = all.iter().filter(|(signal, _)| !matches!(signal.binding.channel, Channel::Balancing(_)));
+        let present: Vec<&Series> = values.map(|(_, series)| *series).filter(|s| s.count() > 0).collect();
         if present.is_empty() {
             continue;
         }

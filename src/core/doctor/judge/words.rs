@@ -85,15 +85,16 @@ pub(super) fn channel(channel: Channel) -> String {
 
 /// Several channels, cells and sensors as ranges.
 pub(super) fn channels(all: &[Channel]) -> String {
-    let (mut texts, mut cells, mut sensors) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut texts, mut cells, mut sensors, mut bled) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for one in all {
         match one {
             Channel::CellVoltage(cell) => cells.push(usize::from(cell.0) + 1),
             Channel::Temperature(sensor) => sensors.push(usize::from(sensor.0) + 1),
+            Channel::Balancing(cell) => bled.push(usize::from(cell.0) + 1),
             other => texts.push(channel(*other)),
         }
     }
-    for (name, numbers) in [("cell", cells), ("temperature", sensors)] {
+    for (name, numbers) in [("cell", cells), ("temperature", sensors), ("balancing of cell", bled)] {
         if !numbers.is_empty() {
             texts.push(format!("{name}{} {}", if numbers.len() == 1 { "" } else { "s" }, ranges(&numbers)));
         }

@@ -58,7 +58,7 @@ impl Diagnosis {
     pub(super) fn judge(&mut self, time: Timestamp, bled_slope_v: Option<f64>) {
         self.is_balanced = bled_slope_v.is_some();
         let lowest = bled_slope_v.and_then(|slope_v| self.clearly_lowest(slope_v));
-        if let Some(cell) = lowest.filter(|cell| self.lowest != lowest && !self.cells[*cell].bleeding.has_bits()) {
+        if let Some(cell) = lowest.filter(|cell| self.lowest != lowest && !self.cells[*cell].bleed.timer.has_bits) {
             self.cells[cell].difference.watch_leak();
         }
         self.lowest = lowest;
@@ -135,7 +135,7 @@ impl Diagnosis {
     /// was found is still there when the others are bled.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
-        let is_open = self.is_balanced && !self.cells[index].bleeding.has_bits();
+        let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
         is_open && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
 
@@ -166,7 +166,7 @@ impl Diagnosis {
         if self.may_be_bled(index) {
             // A leak makes it the lowest cell: until then there is none that matters.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
-        } else if !cell.bleeding.has_bits() && cell.difference.mean()[SOC] >= populations[SOC].middle {
+        } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
             // Above the others it is bled until it is like them, or it has been so far.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }

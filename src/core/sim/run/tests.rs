@@ -1,6 +1,8 @@
 //! Whole scenarios, run without any file.
 
+use super::super::balancing::Balancing;
 use super::super::scenario::Scenario;
+use super::super::truth::Spread;
 use super::super::truth::tests::plain_model;
 use super::*;
 
@@ -98,6 +100,33 @@ fn ev_day_drives_regenerates_sleeps_and_charges() {
     assert!(course.voltage_v.1 <= 4.2 + 1e-3);
     let awake_s = course.moments as f64 * 0.01;
     assert!((7500.0..12_000.0).contains(&awake_s), "{awake_s}");
+}
+
+#[test]
+fn a_bms_that_bleeds_asleep_sends_its_bits_every_minute_until_none_is_bled() {
+    let mut settings = Settings::of(Scenario::EvDay, 50.0);
+    settings.pack.cells = 3;
+    settings.pack.spread = Spread { soc: 0.01, ..Spread::default() };
+    let truth = |bits: bool| {
+        let sim = simulation(settings).with_balancing(Balancing { bleed_a: 0.5, ..Balancing::usual(50.0) });
+        let mut sim = if bits { sim.with_balancing_bits() } else { sim };
+        let mut asleep: Vec<(f64, f64, f64)> = Vec::new();
+        while let Some(moment) = sim.advance() {
+            if let [(Channel::Balancing(_), _), .., (Channel::Balancing(_), _)] = sim.readings() {
+                let bits = sim.readings().iter().map(|(_, bit)| bit.unwrap()).sum();
+                let drop_v = sim.pack().voltages_v(0.0).zip(sim.voltages_v()).map(|(rest_v, v)| rest_v - v).sum();
+                asleep.push((moment.time.secs(), bits, drop_v));
+            }
+        }
+        (asleep, sim.pack().cells().to_vec())
+    };
+    let ((asleep, with), (none, without)) = (truth(true), truth(false));
+    assert!(asleep.len() > 10 && none.is_empty(), "{asleep:?}");
+    let (last, bled) = asleep.split_last().unwrap();
+    assert!(last.1 == 0.0 && bled.iter().all(|(_, bits, _)| *bits > 0.0), "{asleep:?}");
+    assert!(asleep.windows(2).all(|pair| (pair[1].0 - pair[0].0 - 60.0).abs() < 1.0), "{asleep:?}");
+    assert!(asleep.iter().all(|(.., drop_v)| *drop_v == 0.0), "no current flows");
+    assert_eq!(with, without, "the bits change nothing");
 }
 
 #[test]

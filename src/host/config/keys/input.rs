@@ -166,15 +166,15 @@ signal_section! {
 }
 
 signal_section! {
-    /// One bit per cell that shows whether the BMS bleeds the cell: with it the leaks of all cells are found, without it only that of the cell that is never bled. `signal` is a pattern as that of `[input.cell_voltage]`; every cell must have exactly one signal, of 1 bit. A value other than 0 means that the cell is bled. A bit holds until the next one, for at most `max_age_s`. Bits that come while all else is silent do not wake the buses. Not with `pack.balancing = false`.
+    /// One signal per cell that shows whether the BMS bleeds the cell, so that the leaks of all cells can be learned. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means bled; for an inverted bit set `offset = -1.0`. A value holds until the next one, for at most `max_age_s`. Frames with nothing but these signals do not wake sleeping buses. Needs `pack.balancing = true`.
     BalancingInput at "input.balancing", "any unit" {
         /// Number of the first cell in the names.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
         /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances; parallel strings share it. At most a fifth of the pack's rated capacity in an hour.
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
-        /// Longest time for which a bit holds.
+        /// Longest time for which a value holds. Must be longer than the period at which the BMS sends it, also while the vehicle is parked: the rest of a longer period counts as one without values.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
-        /// Whether the BMS bleeds no cell while it sends no bits. `false`: of that time nothing is known, and a leak is learned from the rest alone.
+        /// Whether the BMS bleeds no cell while it sends no values. `false`: nothing is known of that time, and leaks are learned from the rest alone.
         only_while_sent: bool, "", Any, Default("false") =>;
     }
 }

@@ -2,11 +2,10 @@
 
 use super::*;
 use crate::can::encode::InputEncoder;
-use crate::findings::BalancingBits;
+use crate::findings::BalancingConfig;
 
 const BITS: &str = "BO_ 1300 Bleeding: 1 A\n SG_ Bleed1 : 0|1@1+ (1,0) [0|1] \"\" A\n SG_ Bleed2 : 1|1@1+ (1,0) [0|1] \"\" A\n \
-                    SG_ Bleed3 : 2|1@1+ (1,0) [0|1] \"\" A\n SG_ Bleed4 : 3|1@1+ (1,0) [0|1] \"\" A\n SG_ Wide1 : 4|1@1+ (1,0) [0|1] \"\" A\n \
-                    SG_ Wide2 : 5|2@1+ (1,0) [0|3] \"\" A\n SG_ Wide3 : 7|1@1+ (1,0) [0|1] \"\" A\n SG_ Wide4 : 3|1@1+ (1,0) [0|1] \"\" A\n";
+                    SG_ Bleed3 : 2|1@1+ (1,0) [0|1] \"\" A\n SG_ Bleed4 : 3|1@1+ (1,0) [0|1] \"\" A\n";
 
 fn read_with(pack: &str) -> Result<Config, Vec<String>> {
     read_texts(pack, CELL, &format!("{DBC}\n{BITS}")).map(|(config, _)| config)
@@ -22,8 +21,8 @@ fn every_cell_has_its_bit_and_strings_share_the_current() {
     let two_strings = pack_with("cells = 4", "cells = 4\nstrings = 2");
     let keys = "[input.balancing]\nsignal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.02\n";
     let monitor = read_with(&format!("{two_strings}{keys}")).unwrap().monitor;
-    let bits = BalancingBits { bleed_a: 0.01, max_age_s: 10.0, is_only_while_sent: false };
-    assert_eq!(monitor.balancing_bits, Some(bits));
+    let bits = BalancingConfig { bleed_a: 0.01, max_age_s: 10.0, is_only_while_sent: false };
+    assert_eq!(monitor.balancing, Some(bits));
     let (_, frame) = {
         let mut frames = Vec::new();
         let bits = (0..).map(CellIndex).zip([0.0, 1.0, 0.0, 1.0]);
@@ -32,7 +31,7 @@ fn every_cell_has_its_bit_and_strings_share_the_current() {
         frames.remove(0)
     };
     assert_eq!(frame.data(), [0b1010]);
-    assert_eq!(good(PACK).monitor.balancing_bits, None);
+    assert_eq!(good(PACK).monitor.balancing, None);
 }
 
 #[test]
@@ -57,10 +56,6 @@ fn faults_of_the_bits() {
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nfirst = 2\nbleed_a = 0.1\n"),
             "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must give every cell a signal, none for number 5",
-        ),
-        (
-            pack("signal = \"Bleeding.Wide{n}\"\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Wide{n}\", Bleeding.Wide2 has 2 bits, must have 1",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n").replacen(

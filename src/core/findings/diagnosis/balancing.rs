@@ -1,0 +1,118 @@
+//! Balancing taken out of the differences between the cells, where bits show which cells are bled.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Diagnosis, inner_half};
+use crate::findings::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
+use crate::quantity::{InvalidState, Timestamp};
+
+/// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
+const BLEED_PART: f64 = 0.2;
+/// Mean square of the part of an unseen time for which a cell was bled longer than the middle cells: uniform between -1 and 1.
+const UNSEEN_MEAN_SQUARE: f64 = 1.0 / 3.0;
+/// Most that a cell loses unseen beside the others, SOC: a BMS bleeds it down to the lowest.
+const MOST_UNSEEN: f64 = 0.1;
+
+/// Errors that lie to one side for as long as something lasts: their sum, not their squares, grows.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Lasting {
+    sum: f64,
+}
+
+impl Lasting {
+    /// What one more row adds to the square of the sum; nothing in a row ends it.
+    fn add(&mut self, part: f64) -> f64 {
+        let before = std::mem::take(&mut self.sum);
+        if part != 0.0 {
+            self.sum = before + part;
+        }
+        (self.sum * self.sum - before * before).max(0.0)
+    }
+}
+
+/// What is bled of one cell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Bleed {
+    pub(super) timer: BleedTimer,
+    /// Beside the middle cells, SOC, while it is bled or they are.
+    bled: Lasting,
+    /// At most, SOC, while it is not known.
+    unseen: Lasting,
+}
+
+impl Bleed {
+    /// The time so far does not count.
+    pub(super) fn forget_time(&mut self) {
+        self.timer.forget_time();
+        *self = Self { timer: self.timer, ..Self::default() };
+    }
+
+    /// Checks the numbers of a stored state.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        self.timer.check()?;
+        InvalidState::unless_natural("charge bled of a cell", self.bled.sum.abs())?;
+        InvalidState::unless_natural("charge bled unseen of a cell", self.unseen.sum)
+    }
+}
+
+impl Diagnosis {
+    /// Takes a bit of the BMS, which holds until `holds_until` or the next one: whether it bleeds a cell; `None` = it cannot be read.
+    pub fn handle_balancing(&mut self, cell: usize, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
+        let Some(watched) = self.cells.get(cell) else { return };
+        // What a cell loses beside what the bits show is a leak.
+        let begins = is_bled.is_some() && !watched.bleed.timer.has_bits && self.may_be_bled(cell);
+        let watched = &mut self.cells[cell];
+        watched.bleed.timer.take(time, is_bled, holds_until);
+        if begins {
+            watched.difference.watch_leak();
+        }
+    }
+
+    /// Removes the charge that was bled since the last row from each cell's difference, less that of the middle cells. `balancing`:
+    /// `None` forgets all bits.
+    pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
+        let Some(balancing) = balancing else {
+            return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());
+        };
+        let times: Vec<BleedTime> = self.cells.iter_mut().map(|cell| cell.bleed.timer.end_row(time)).collect();
+        let middle_s = self.bled_in_middle_s(&times);
+        let soc_per_s = balancing.bleed_a / (3600.0 * capacity_ah);
+        for (index, (cell, time)) in self.cells.iter_mut().zip(&times).enumerate() {
+            let has_bits = cell.bleed.timer.has_bits;
+            let soc = if has_bits { soc_per_s * (time.bled_s - middle_s) } else { 0.0 };
+            let silent_s = if balancing.is_only_while_sent { 0.0 } else { time.silent_s };
+            // As without bits: the lowest cell is never bled, and of a cell without bits what the others lost may be its own too.
+            let unseen_s = match has_bits {
+                _ if self.lowest == Some(index) => 0.0,
+                true => time.unknown_s + silent_s,
+                false => middle_s,
+            };
+            let unseen = (soc_per_s * unseen_s).min(MOST_UNSEEN);
+            let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
+                + UNSEEN_MEAN_SQUARE * cell.bleed.unseen.add(unseen).min(MOST_UNSEEN * MOST_UNSEEN);
+            cell.difference.remove_charge(soc, variance);
+        }
+    }
+
+    /// For how long the cells whose voltages are in the middle half were bled, mean, s.
+    fn bled_in_middle_s(&self, times: &[BleedTime]) -> f64 {
+        let known = self.cells.iter().zip(times).filter(|(cell, _)| cell.bleed.timer.has_bits);
+        let mut by_voltage: Vec<(f64, f64)> =
+            known.filter_map(|(cell, time)| Some((cell.sums.mean_v()?, time.bled_s))).collect();
+        let inner = inner_half(&mut by_voltage, |(voltage_v, _)| *voltage_v);
+        inner.iter().map(|(_, bled_s)| bled_s).sum::<f64>() / inner.len().max(1) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_to_one_side_add_up_until_nothing_is_added() {
+        let mut lasting = Lasting::default();
+        assert_eq!([1.0, 1.0, -1.0, 0.0, 2.0].map(|part| lasting.add(part)), [1.0, 3.0, 0.0, 0.0, 4.0]);
+    }
+}
