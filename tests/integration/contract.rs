@@ -12,6 +12,7 @@ use listener::{AlarmTable, Listener};
 use packwatch::alarm::{Rule, Selector};
 use packwatch::can::dbc::Database;
 use packwatch::can::encode::InputEncoder;
+use packwatch::can::{CanId, Frame};
 use packwatch::config::Config;
 use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Monitor, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
@@ -83,6 +84,41 @@ fn load() -> Config {
     config_texts::load(PACK, &dbc)
 }
 
+/// Periods of the digest after which a table is no longer confirmed.
+const DIGEST_TIMEOUT_PERIODS: i64 = 3;
+
+/// A listener with the time-out of the digest: rule 5 of the contract.
+struct TimedListener {
+    listener: Listener,
+    digest: CanId,
+    timeout_ms: i64,
+    digest_ms: Option<i64>,
+}
+
+impl TimedListener {
+    fn new(database: &Database) -> Self {
+        let digest = database.message("PACKWATCH_Digest").unwrap();
+        let timeout_ms = DIGEST_TIMEOUT_PERIODS * i64::from(digest.cycle_time_ms.unwrap());
+        Self { listener: Listener::new(database), digest: digest.id, timeout_ms, digest_ms: None }
+    }
+
+    fn handle(&mut self, now_ms: i64, frame: &Frame) {
+        if frame.id() == self.digest {
+            self.digest_ms = Some(now_ms);
+        }
+        self.listener.handle(now_ms, frame);
+    }
+
+    fn table(&mut self, now_ms: i64) -> AlarmTable {
+        self.listener.table(now_ms)
+    }
+
+    fn is_confirmed(&mut self, now_ms: i64) -> bool {
+        let is_recent = self.digest_ms.is_some_and(|digest_ms| now_ms - digest_ms < self.timeout_ms);
+        is_recent && self.listener.is_confirmed(now_ms)
+    }
+}
+
 /// The daemon with its bus, its disk, and what its inputs show now.
 struct Daemon<'a> {
     config: &'a Config,
@@ -93,7 +129,9 @@ struct Daemon<'a> {
     encoder: InputEncoder,
     out: Outputs,
     now_ms: i64,
-    listener: Option<Listener>,
+    listener: Option<TimedListener>,
+    /// Whether no digest reaches the listener.
+    is_digest_lost: bool,
     /// Per page of cells: 0 good, 1 missing, 2 out of range.
     pages: [u8; PAGES],
     temperature_c: Option<f64>,
@@ -111,6 +149,7 @@ impl<'a> Daemon<'a> {
             out: Outputs::default(),
             now_ms: 1_000_000,
             listener: None,
+            is_digest_lost: false,
             pages: [0; PAGES],
             temperature_c: Some(25.0),
         }
@@ -125,6 +164,7 @@ impl<'a> Daemon<'a> {
         for sent in &self.out.frames {
             if let Some(listener) = &mut self.listener
                 && !self.random.random_bool(LOSS)
+                && !(self.is_digest_lost && sent.frame.id() == listener.digest)
             {
                 listener.handle(self.now_ms, &sent.frame);
             }
@@ -232,7 +272,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
     let mut most = 0;
     for segment in 0..=RESTARTS {
         if segment == joins {
-            daemon.listener = Some(Listener::new(database));
+            daemon.listener = Some(TimedListener::new(database));
         }
         for _ in 0..daemon.random.random_range(1..5) {
             let wait_ms = daemon.random.random_range(1..100) * 10;
@@ -245,7 +285,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
         }
     }
     let (began_ms, mut state, mut since_ms) = (daemon.now_ms, (daemon.table(), daemon.rules()), daemon.now_ms);
-    let mut two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().cycle_ms();
+    let mut two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().listener.cycle_ms();
     while daemon.now_ms < since_ms + two_cycles_ms {
         daemon.run_for(STEP_MS);
         let now = (daemon.table(), daemon.rules());
@@ -253,7 +293,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
             (state, since_ms) = (now, daemon.now_ms);
         }
         // The listener's own idea of a cycle may be as late as its last digest.
-        two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().cycle_ms();
+        two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().listener.cycle_ms();
         assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms change for ever");
     }
     let (truth, rules) = (daemon.table(), daemon.rules());
@@ -261,7 +301,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
     let listener = daemon.listener.as_mut().unwrap();
     assert_eq!(listener.table(now_ms), truth, "seed {seed}");
     assert!(listener.is_confirmed(now_ms), "seed {seed}: the table is right, and the listener must know it");
-    assert_eq!(listener.rules(), &rules, "seed {seed}");
+    assert_eq!(listener.listener.rules(), &rules, "seed {seed}");
     (most.max(truth.len()), two_cycles_ms)
 }
 
@@ -287,7 +327,7 @@ fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
     let config = load();
     let database = config.output_layout.clone().unwrap();
     let mut daemon = Daemon::new(&config, 1);
-    daemon.listener = Some(Listener::new(&database));
+    daemon.listener = Some(TimedListener::new(&database));
     daemon.temperature_c = Some(55.0);
     daemon.run_for(3_000);
     let raised = daemon.listener.as_mut().unwrap().table(daemon.now_ms);
@@ -300,4 +340,51 @@ fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
     let listener = daemon.listener.as_mut().unwrap();
     assert!(!listener.table(now_ms).contains_key(&(9, 2, 2047)));
     assert!(listener.is_confirmed(now_ms));
+}
+
+#[test]
+fn a_right_table_is_not_confirmed_once_the_digest_has_stopped_for_its_time_out() {
+    let config = load();
+    let database = config.output_layout.clone().unwrap();
+    let mut daemon = Daemon::new(&config, 2);
+    daemon.listener = Some(TimedListener::new(&database));
+    let timeout_ms = daemon.listener.as_ref().unwrap().timeout_ms;
+    let manual = include_str!("../../docs/src/ecu/contract.md");
+    let row = manual.lines().find(|line| line.starts_with("| `PACKWATCH_Digest` |")).unwrap();
+    assert!(row.ends_with(&format!("| {timeout_ms} ms |")), "the manual has another time-out: {row}");
+    daemon.temperature_c = Some(55.0);
+    daemon.run_for(8_000);
+    let confirmed = |daemon: &mut Daemon<'_>| {
+        let (now_ms, truth) = (daemon.now_ms, daemon.table());
+        let listener = daemon.listener.as_mut().unwrap();
+        assert!(truth.contains_key(&(9, 2, 2047)), "{truth:?}");
+        assert_eq!(listener.table(now_ms), truth, "alarm frames keep the table right");
+        listener.is_confirmed(now_ms)
+    };
+    assert!(confirmed(&mut daemon));
+    daemon.is_digest_lost = true;
+    let last_ms = daemon.listener.as_ref().unwrap().digest_ms.unwrap();
+    while daemon.now_ms < last_ms + timeout_ms - 10 {
+        daemon.run_for(10);
+        assert!(confirmed(&mut daemon), "{} ms after the last digest", daemon.now_ms - last_ms);
+    }
+    for _ in 0..100 {
+        daemon.run_for(100);
+        assert!(!confirmed(&mut daemon), "{} ms after the last digest", daemon.now_ms - last_ms);
+    }
+    daemon.is_digest_lost = false;
+    daemon.run_for(2_000);
+    assert!(confirmed(&mut daemon), "the digest is back");
+}
+
+#[test]
+fn a_listener_that_never_received_a_digest_confirms_no_table() {
+    let config = load();
+    let database = config.output_layout.clone().unwrap();
+    let mut daemon = Daemon::new(&config, 3);
+    daemon.listener = Some(TimedListener::new(&database));
+    daemon.is_digest_lost = true;
+    daemon.run_for(8_000);
+    let now_ms = daemon.now_ms;
+    assert!(!daemon.listener.as_mut().unwrap().is_confirmed(now_ms));
 }

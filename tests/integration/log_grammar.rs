@@ -9,9 +9,11 @@ use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
 use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource, Record};
-use packwatch::monitor::{BusEvent, Downtime, Input};
+use packwatch::monitor::{BusEvent, Downtime, EventKind, Input};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
+
+use crate::support::rig::Rig;
 
 fn frame_of(line: &str) -> Frame {
     match parse_line(line.as_bytes()).unwrap_or_else(|e| panic!("{line}: {}", e.describe(line.as_bytes()))) {
@@ -370,6 +372,55 @@ fn a_journal_reads_back_as_written() {
     // Torn in the middle of its last line: that line is not taken for a shorter one.
     let (records, counts) = read(&[file(folder.path(), "t", &text[..text.len() - 2])], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
+}
+
+/// Two notes of the largest number of lost frames behind a frame, as candump writes them.
+const MOST_DROPPED: &str = "(1.000000) can0 123#11\n\
+    DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n\
+    DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n";
+
+#[test]
+fn numbers_of_lost_frames_add_up_to_the_largest_and_not_beyond() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let candump = file(folder.path(), "a.log", MOST_DROPPED.as_bytes());
+    let lost = Record::Bus {
+        time: Timestamp::from_nanos(1_000_000_000),
+        bus: BusIndex(0),
+        event: BusEvent::Dropped { frames: u64::MAX },
+    };
+    let one_by_one = read(std::slice::from_ref(&candump), true, |_| {}).expect("read");
+    assert_eq!(one_by_one.0[1..], [lost.clone(), lost.clone()], "each line is a record with its number");
+    assert_eq!((one_by_one.1.dropped_frames, one_by_one.1.bad_lines), (u64::MAX, 0));
+    assert_eq!(read_batches(&[candump], true, Batch::MAX).expect("read"), one_by_one);
+    let line = "BUS (1.000000000) can0 dropped 18446744073709551615\n";
+    let journal = file(folder.path(), "j", format!("PACKWATCH-JOURNAL 1\n{line}{line}").as_bytes());
+    let (records, counts) = read(&[journal], true, |_| {}).expect("read");
+    assert_eq!((records, counts.bad_lines), (vec![lost.clone(), lost], 0));
+    // One more than the largest is no number.
+    let beyond = MOST_DROPPED.replace("dropped 18446744073709551615", "dropped 18446744073709551616");
+    let (records, counts) = read(&[file(folder.path(), "b.log", beyond.as_bytes())], false, |_| {}).expect("read");
+    assert_eq!((records.len(), counts.dropped_frames, counts.ignored_lines), (1, 0, 2));
+}
+
+#[test]
+fn the_largest_numbers_of_lost_frames_are_events_and_leave_the_monitor_s_statistics_as_they_are() {
+    let mut rig = Rig::new("");
+    rig.seconds(1);
+    let before = rig.monitor.statistics().clone();
+    let notes = [BusEvent::Dropped { frames: u64::MAX }, BusEvent::SendFailed { frames: u64::MAX }];
+    rig.events.clear();
+    for event in [notes[0], notes[0], notes[1], notes[1]] {
+        let time = rig.now();
+        rig.give(Input::Bus { time, bus: BusIndex(0), event });
+    }
+    let noted = rig.events.iter().filter_map(|event| match event.kind {
+        EventKind::Bus { what, .. } => Some(what),
+        _ => None,
+    });
+    assert_eq!(noted.collect::<Vec<_>>(), [notes[0], notes[0], notes[1], notes[1]]);
+    assert_eq!(*rig.monitor.statistics(), before, "frames that were lost are counted by the interface");
+    rig.seconds(1);
+    assert_eq!(rig.monitor.statistics().buses[0].frames, before.buses[0].frames + 20, "and it goes on");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The DBC that is written, in `cantools`: it loads strictly, and every frame made by the same layout decodes with it
 //! to the values that went in, within one bit, for every kind of frame, protection, identifier and cell.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
 use crate::support::oracle::{ask, hex, python, values};
@@ -9,9 +9,11 @@ use packwatch::alarm::Rule;
 use packwatch::can::dbc::{Database, Repetition};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
-    AlarmFields, Command, CommandPlan, E2eSetting, HealthFields, LayoutBase, LayoutSettings, MessageSettings,
-    OutputPlan, SendCounters, StatusFields, layout,
+    AlarmFields, Command, CommandFields, CommandPlan, CommandRefusal, DigestFields, E2eSetting, HealthFields,
+    LayoutBase, LayoutSettings, MessageSettings, OutputPlan, ReplyFields, RuleState, SendCounters, StatusFields,
+    TableChecksum, ThresholdFields, layout,
 };
+use packwatch::can::secoc::{self, Authentication};
 use packwatch::can::{CanId, Frame, FrameKind};
 use packwatch::quantity::{CellIndex, Mode};
 use rand_chacha::ChaCha8Rng;
@@ -39,6 +41,20 @@ const RULES: [(&str, f64, f64); 17] = [
     ("CellLeak", 100.0, 0.4),
     ("ConnectionResistance", 100.0, 8.0),
     ("ChannelFaulty", 1.0, 1.0),
+];
+
+/// Rules on page `rules` of the digest; the others are on page `rules_2`.
+const RULES_ON_PAGE_1: usize = 14;
+
+const REFUSALS: [CommandRefusal; 8] = [
+    CommandRefusal::FirstFrame,
+    CommandRefusal::WrongChecksum,
+    CommandRefusal::RepeatedCounter,
+    CommandRefusal::WrongCounter,
+    CommandRefusal::NoMeaning,
+    CommandRefusal::NotAuthentic,
+    CommandRefusal::OldFreshness,
+    CommandRefusal::RepeatNeeded,
 ];
 
 /// A configuration of the matrix.
@@ -117,6 +133,14 @@ impl Maker {
     /// Half the step of a signal as the layout has it, so that what is compared is the layout's own promise.
     fn half_step(&self, name: &str) -> f64 {
         self.database.signal(name).unwrap().1.layout.factor / 2.0
+    }
+
+    /// A configured threshold of a rule, and what it reads.
+    fn threshold(&mut self, number: usize) -> (ThresholdFields, f64) {
+        let (_, scale, largest) = RULES[number - 1];
+        let (threshold, severity) = (self.below(largest), 1 + self.one_of(3));
+        let (rule, severity) = (u8::try_from(number).unwrap(), u8::try_from(severity).unwrap());
+        (ThresholdFields { rule, severity, threshold }, scale * threshold)
     }
 
     fn wanted(&self, message: &str, pairs: &[(&str, f64)]) -> Wanted {
@@ -242,10 +266,105 @@ impl Maker {
         );
         (self.plan.alarm(&fields, &mut self.counters), wanted)
     }
+
+    fn digest(&mut self, page: usize, threshold_rule: usize) -> (Frame, Wanted) {
+        const STATES: [RuleState; 6] = [
+            RuleState::None,
+            RuleState::Info,
+            RuleState::Warning,
+            RuleState::Severe,
+            RuleState::Unknown,
+            RuleState::NotWatched,
+        ];
+        let (raised, worst, pass_time_s) = (self.one_of(4095), self.one_of(4), self.below(204.0));
+        let codes = RULES.map(|_| self.one_of(6));
+        let mut checksum = TableChecksum::default();
+        checksum.add(9, 2, None, u8::try_from(self.one_of(7)).unwrap(), self.one_of(2) == 1);
+        let (threshold, threshold_read) = self.threshold(threshold_rule);
+        let fields = DigestFields {
+            raised: raised as usize,
+            worst: u8::try_from(worst).unwrap(),
+            checksum,
+            pass_time_s,
+            rules: codes.map(|code| STATES[code as usize]),
+            threshold: Some(threshold),
+        };
+        let mut wanted = match page {
+            0 => self.wanted(
+                "Digest",
+                &[
+                    ("Raised", f64::from(raised)),
+                    ("Worst", f64::from(worst)),
+                    ("TableChecksum", f64::from(checksum.value())),
+                    ("PassTime", pass_time_s),
+                ],
+            ),
+            2 => {
+                let (rule, severity) = (f64::from(threshold.rule), f64::from(threshold.severity));
+                let mut wanted = self.wanted("Digest", &[("ThresholdRule", rule), ("ThresholdSeverity", severity)]);
+                // Unrounded: what a 32-bit float cannot hold is all that is lost.
+                wanted.push(("Threshold".to_owned(), threshold_read, threshold_read * f64::from(f32::EPSILON)));
+                wanted
+            }
+            _ => {
+                let rules = if page == 1 { 0..RULES_ON_PAGE_1 } else { RULES_ON_PAGE_1..RULES.len() };
+                let named: Vec<_> =
+                    rules.map(|rule| (format!("Rule_{}", RULES[rule].0), f64::from(codes[rule]))).collect();
+                let pairs: Vec<_> = named.iter().map(|(name, code)| (name.as_str(), *code)).collect();
+                self.wanted("Digest", &pairs)
+            }
+        };
+        wanted.push(("Page".to_owned(), f64::from(u8::try_from(page).unwrap()), 0.0));
+        (self.plan.digest(page, &fields, &mut self.counters).unwrap(), wanted)
+    }
+
+    /// An executed, a refused or an unreadable command, in turn.
+    fn reply(&mut self, turn: usize) -> (Frame, Wanted) {
+        const KINDS: [Command; 3] = [Command::Acknowledge, Command::Clear, Command::PackReplaced];
+        let (kind, rule) = (turn % KINDS.len(), 1 + turn % RULES.len());
+        let (severity, cell, counter) = (1 + self.one_of(3), self.one_of(1024), self.one_of(256));
+        let (changed, refused) = (1 + self.one_of(70), self.one_of(20));
+        let refusal = REFUSALS[turn % REFUSALS.len()];
+        let is_executed = turn % 2 == 0;
+        let is_read = is_executed || turn % 3 == 0;
+        let command = CommandFields {
+            command: KINDS[kind],
+            rule: u8::try_from(rule).ok(),
+            severity: u8::try_from(severity).ok(),
+            cell: u16::try_from(cell).ok().map(CellIndex),
+        };
+        let fields = ReplyFields {
+            outcome: if is_executed { Ok((changed, refused)) } else { Err(refusal) },
+            command: is_read.then_some(command),
+            counter_expected: u8::try_from(counter).ok(),
+        };
+        let reason = match (is_executed, refused) {
+            (false, _) => f64::from(refusal as u8),
+            (true, 0) => 0.0,
+            (true, _) => 6.0,
+        };
+        let read = |value: u32, code: f64| if is_read { f64::from(value) } else { code };
+        let counted = |count: u32, most: u32, code: f64| if is_executed { f64::from(count.min(most)) } else { code };
+        let wanted = self.wanted(
+            "Reply",
+            &[
+                ("Result", if is_executed { 1.0 } else { 2.0 }),
+                ("Reason", reason),
+                ("Command", read(u32::try_from(kind).unwrap() + 1, 15.0)),
+                ("Rule", read(u32::try_from(rule).unwrap(), 31.0)),
+                ("Severity", read(severity, 0.0)),
+                ("Cell", read(cell, 2047.0)),
+                ("CounterExpected", f64::from(counter)),
+                ("Changed", counted(changed, 62, 63.0)),
+                ("Refused", counted(refused, 14, 15.0)),
+            ],
+        );
+        (self.plan.reply(&fields, &mut self.counters).unwrap(), wanted)
+    }
 }
 
 /// The header as a consumer finds it with the DBC, against our own check of it.
-fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 4]) {
+fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 7]) {
     let Some(profile) = case.profile else {
         assert!(!read.contains_key("E2eCrc") && frame.data()[..2] == [0, 0], "{case:?}");
         return;
@@ -258,6 +377,15 @@ fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f
     if profile == Profile::P01C {
         assert_eq!(read["E2eDataIdNibble"], 10.0, "the low nibble of 0x0A");
     }
+}
+
+/// `Message.Signal` of all that is sent.
+fn sent_signals(database: &Database) -> BTreeSet<String> {
+    let sent = database.messages.iter().filter(|message| message.name != "PACKWATCH_Command");
+    let signals = |message: &packwatch::can::dbc::Message| -> Vec<String> {
+        message.signals.iter().map(|signal| format!("{}.{}", message.name, signal.name)).collect()
+    };
+    sent.flat_map(signals).collect()
 }
 
 #[test]
@@ -282,15 +410,22 @@ fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a
         for turn in 0..FRAMES {
             let (frame, wanted) = maker.status();
             made.push((1, "PACKWATCH_Status", frame, wanted));
-            let (frame, wanted) = maker.health(turn % 4);
+            let (frame, wanted) = maker.health(turn % maker.plan.health_pages());
             made.push((2, "PACKWATCH_Health", frame, wanted));
-            let (frame, wanted) = maker.alarm(turn % 14 + 1);
+            let (frame, wanted) = maker.alarm(turn % RULES.len() + 1);
             made.push((3, "PACKWATCH_Alarm", frame, wanted));
+            for page in 0..maker.plan.digest_pages() {
+                let (frame, wanted) = maker.digest(page, turn % RULES.len() + 1);
+                made.push((5, "PACKWATCH_Digest", frame, wanted));
+            }
+            let (frame, wanted) = maker.reply(turn);
+            made.push((6, "PACKWATCH_Reply", frame, wanted));
         }
         let lines: Vec<_> = made.iter().map(|(_, name, frame, _)| format!("{name} {}", hex(frame.data()))).collect();
         let answers = ask(&python, &path, &["decode", "strict"], &lines);
-        let mut expected = [0; 4];
-        for (((number, _, frame, wanted), line), answer) in made.iter().zip(&lines).zip(&answers) {
+        let mut expected = [0; 7];
+        let mut decoded = BTreeSet::new();
+        for (((number, message, frame, wanted), line), answer) in made.iter().zip(&lines).zip(&answers) {
             let read = values(line, answer);
             let kind = if case.fd { FrameKind::Fd { brs: true, esi: false } } else { FrameKind::Classic };
             assert_eq!((frame.kind(), frame.id()), (kind, case.message(*number).id.unwrap()));
@@ -302,9 +437,11 @@ fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a
                 if case.profile.is_some() { read.keys().filter(|name| name.starts_with("E2e")).count() } else { 0 };
             assert_eq!(read.len(), wanted.len() + header, "{case:?}: nothing but what was meant is read: {read:?}");
             check_header(*case, *number, frame, &read, &mut expected);
+            decoded.extend(read.into_keys().map(|signal| format!("{message}.{signal}")));
             frames += 1;
             compared += wanted.len() + header;
         }
+        assert_eq!(decoded, sent_signals(&maker.database), "{case:?}: every signal that is sent is compared");
     }
     assert_eq!(cases.len(), 28);
     eprintln!("{} configurations, {frames} frames, {compared} values compared", cases.len());
@@ -345,6 +482,48 @@ fn a_threshold_of_whole_seconds_is_sent_as_it_is() {
 }
 
 #[test]
+fn the_rules_tried_are_all_rules_in_the_order_of_their_numbers() {
+    assert_eq!(RULES.map(|(name, ..)| name.to_owned()), Rule::ALL.map(|rule| camel_case(rule.name())));
+}
+
+/// Word of a refusal in the value table of `Reason`.
+const fn reason_word(refusal: CommandRefusal) -> &'static str {
+    match refusal {
+        CommandRefusal::FirstFrame => "first frame",
+        CommandRefusal::WrongChecksum => "wrong checksum",
+        CommandRefusal::RepeatedCounter => "repeated counter",
+        CommandRefusal::WrongCounter => "wrong counter",
+        CommandRefusal::NoMeaning => "no meaning",
+        CommandRefusal::NotAuthentic => "not authentic",
+        CommandRefusal::OldFreshness => "old freshness",
+        CommandRefusal::RepeatNeeded => "repeat needed",
+    }
+}
+
+#[test]
+fn every_refusal_is_sent_as_the_code_that_the_dbc_names_and_the_dbc_names_no_other() {
+    let database = Case::all()[0].layout();
+    let plan = OutputPlan::new(&database).unwrap();
+    let reason = &database.signal("PACKWATCH_Reply.Reason").unwrap().1;
+    let mut table = vec![(0, "none"), (6, "not healthy"), (7, "nothing to do"), (15, "not available")];
+    for refusal in REFUSALS {
+        let fields = ReplyFields { outcome: Err(refusal), command: None, counter_expected: None };
+        let frame = plan.reply(&fields, &mut SendCounters::default()).unwrap();
+        let code = reason.layout.plan().unwrap().raw(frame.data()).unwrap();
+        assert_eq!(code, u64::from(refusal as u8), "{refusal:?}");
+        table.push((i64::try_from(code).unwrap(), reason_word(refusal)));
+    }
+    table.sort_unstable();
+    assert_eq!(words(&database, "PACKWATCH_Reply.Reason"), table);
+}
+
+/// The value table of a signal.
+fn words<'d>(database: &'d Database, signal: &str) -> Vec<(i64, &'d str)> {
+    let table = &database.signal(signal).unwrap().1.values;
+    table.iter().map(|(code, word)| (*code, word.as_str())).collect()
+}
+
+#[test]
 fn every_rule_is_named_in_the_value_tables_by_its_number() {
     let text = include_str!("../../config/packwatch.dbc");
     let dbc = Database::parse(text).unwrap();
@@ -360,8 +539,11 @@ fn every_rule_is_named_in_the_value_tables_by_its_number() {
 #[test]
 fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
     let base = LayoutBase::BuiltIn { rated_capacity_ah: 2.6 };
-    // A reply is sent where commands are accepted.
-    let settings = LayoutSettings { command: Some(MessageSettings::default()), ..LayoutSettings::default() };
+    // A reply is sent where commands are accepted, the freshness where they are authenticated.
+    let secoc = |profile, data_id| Some(Authentication { profile, data_id });
+    let command = MessageSettings { secoc: secoc(secoc::Profile::P1, 1), ..MessageSettings::default() };
+    let freshness = MessageSettings { secoc: secoc(secoc::Profile::Announcement, 2), ..MessageSettings::default() };
+    let settings = LayoutSettings { command: Some(command), freshness, ..LayoutSettings::default() };
     let database = Database::parse(&layout(base, &settings).unwrap().to_dbc()).unwrap();
     let stated = |name: &str| {
         let message = database.message(&format!("PACKWATCH_{name}")).unwrap();
@@ -373,18 +555,44 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
     assert_eq!(stated("Alarm"), (Some(1000), Some(3), Some(100), Some(10)), "3 times, 100 ms apart, 100 a second");
     assert_eq!(stated("Digest"), (Some(1000), None, None, None));
     assert_eq!(stated("Reply"), (None, None, None, Some(100)), "10 a second");
-    for (signal, words) in [
-        ("PACKWATCH_Health.Page", ["capacity", "recharge", "usable", "life", "losses"].as_slice()),
-        ("PACKWATCH_Digest.Page", &["alarms", "rules", "threshold"]),
-        (
-            "PACKWATCH_Alarm.State",
-            &["inactive", "active", "cleared", "pending", "latched", "suppressed", "unknown", "not available"],
-        ),
+    assert_eq!(stated("Freshness"), (Some(1000), None, None, None));
+    assert_eq!(stated("Command"), (None, None, None, None), "the sender's task");
+    const NOT_AVAILABLE: &str = "not available";
+    const RULE_STATES: [&str; 6] = ["none", "info", "warning", "severe", "unknown", "not watched"];
+    for (signal, named, last) in [
+        ("PACKWATCH_Health.Page", ["capacity", "recharge", "usable", "life", "losses"].as_slice(), 15),
+        ("PACKWATCH_Digest.Page", &["alarms", "rules", "threshold", "rules_2"], 15),
+        ("PACKWATCH_Alarm.State", &["inactive", "active", "cleared", "pending", "latched", "suppressed", "unknown"], 7),
     ] {
-        let table = &database.signal(signal).unwrap().1.values;
-        let named: Vec<_> = table.iter().map(|(_, word)| word.as_str()).take(words.len()).collect();
-        assert_eq!(named, words, "{signal}");
+        let wanted = (0..).zip(named.iter().copied()).chain([(last, NOT_AVAILABLE)]).collect::<Vec<_>>();
+        assert_eq!(words(&database, signal), wanted, "{signal}");
     }
+    for (number, (rule, ..)) in RULES.iter().enumerate() {
+        let name = format!("PACKWATCH_Digest.Rule_{rule}");
+        let wanted = (0..).zip(RULE_STATES).chain([(7, NOT_AVAILABLE)]).collect::<Vec<_>>();
+        assert_eq!(words(&database, &name), wanted, "{name}");
+        let page = if number < RULES_ON_PAGE_1 { 1 } else { 3 };
+        let conditions = &database.signal(&name).unwrap().1.conditions;
+        assert_eq!(conditions.iter().flat_map(|of| &of.ranges).collect::<Vec<_>>(), [&(page, page)], "{name}");
+    }
+    assert_eq!(words(&database, "PACKWATCH_Reply.Result"), [(1, "accepted"), (2, "refused"), (7, NOT_AVAILABLE)]);
+    assert_eq!(
+        words(&database, "PACKWATCH_Reply.Reason"),
+        [
+            (0, "none"),
+            (1, "first frame"),
+            (2, "wrong checksum"),
+            (3, "repeated counter"),
+            (4, "wrong counter"),
+            (5, "no meaning"),
+            (6, "not healthy"),
+            (7, "nothing to do"),
+            (8, "not authentic"),
+            (9, "old freshness"),
+            (10, "repeat needed"),
+            (15, NOT_AVAILABLE),
+        ]
+    );
 }
 
 #[test]

@@ -242,7 +242,7 @@ fn extremes_saturate_at_the_range_and_never_say_not_available() {
 #[test]
 fn every_rule_has_its_own_value_and_threshold() {
     // In the rule's inside unit and as read: the share of bad readings is a fraction inside and % on the wire.
-    let values = [
+    let values: [(f64, f64); RULES.len()] = [
         (1.4, 1.4),
         (1.38, 1.38),
         (3600.0, 3600.0),
@@ -257,6 +257,9 @@ fn every_rule_has_its_own_value_and_threshold() {
         (0.11, 11.0),
         (3600.0, 3600.0),
         (12.0, 12.0),
+        (0.0123, 1.23),
+        (0.37, 37.0),
+        (1.0, 1.0),
     ];
     for ((number, rule), (inside, wire)) in (1..).zip(RULES).zip(values) {
         let fields = AlarmFields {
