@@ -23,7 +23,7 @@ const LISTED: u32 = 100;
 pub(crate) struct Args {
     #[command(subcommand)]
     what: Option<HistoryCommand>,
-    /// Folder of state and history (default: $STATE_DIRECTORY, else /var/lib/packwatch)
+    /// Folder of state and history (default: $STATE_DIRECTORY, else /var/lib/packwatch, or where there is none, that of a daemon from a shell)
     #[arg(long, value_name = "DIR", global = true)]
     state: Option<PathBuf>,
     #[command(flatten)]

@@ -17,7 +17,7 @@ pub(crate) struct Args {
     /// Confirms it
     #[arg(long)]
     yes: bool,
-    /// Folder of state and history, for when no daemon runs (default: $STATE_DIRECTORY, else /var/lib/packwatch)
+    /// Folder of state and history, for when no daemon runs (default: $STATE_DIRECTORY, else /var/lib/packwatch, or where there is none, that of a daemon from a shell)
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     #[command(flatten)]

@@ -77,9 +77,11 @@ const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Period of checkpoints while no frame comes, s: the state only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// The service's state folder, in which clients look.
+/// The folder in which clients look: the service's, or where there is none, that of a daemon started from a shell.
 pub fn standard_folder() -> PathBuf {
-    first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+    let service = first_folder("STATE_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER));
+    let own = daemon_folder().0;
+    if !service.exists() && own.exists() { own } else { service }
 }
 
 /// Default folder of a daemon, and whether systemd created it. One that is started from a shell, as in a tutorial, keeps its state

@@ -154,6 +154,14 @@ fn drop_ins_are_merged_and_shown_with_the_place_of_each_part() {
 }
 
 #[test]
+fn commands_without_a_key_are_called_unauthenticated() {
+    let commands = "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 0x321\n";
+    let (_folder, file) = with_drop_ins(&[("commands.toml", commands)]);
+    let said = good(&["check", file.to_str().unwrap()]);
+    assert!(said.contains("commands of other ECUs are unauthenticated: every node of the bus can make one"), "{said}");
+}
+
+#[test]
 fn a_faulty_drop_in_is_refused_and_merged_shows_it_all_the_same() {
     let (_folder, file) = with_drop_ins(&[("a.toml", "[pack]\ncells = 0\n")]);
     let fault = format!("{}.d/a.toml:2: pack.cells = 0, must be 1 to 1024", file.display());

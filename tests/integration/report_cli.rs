@@ -54,6 +54,19 @@ impl Place {
     }
 }
 
+/// Whether the page says "-0", "-0.0", "-0.00" and so on between its tags.
+fn has_minus_zero(page: &str) -> bool {
+    let texts = page.split('<').filter_map(|part| part.split_once('>')).map(|(_, text)| text.replace('\u{2212}', "-"));
+    let mut words = texts.flat_map(|text| text.split([' ', ',', '(', ')']).map(str::to_owned).collect::<Vec<_>>());
+    words.any(|word| word.strip_prefix("-0").is_some_and(|rest| rest.chars().all(|c| c == '.' || c == '0')))
+}
+
+#[test]
+fn a_minus_in_front_of_nothing_is_seen() {
+    assert!(has_minus_zero("<p>SOC -0.0 %</p>") && has_minus_zero("<text>\u{2212}0</text>"));
+    assert!(!has_minus_zero("<path d=\"M-0.0 1\"/><p>-0.01 to -0.5, 10-0</p>"));
+}
+
 #[test]
 fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
     let place = Place::new();
@@ -64,6 +77,8 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
     {
         assert!(page.contains(part), "no {part:?}");
     }
+    assert_eq!(page.matches("Every \u{b1} is one standard deviation.").count(), 1, "one meaning, said once");
+    assert!(!has_minus_zero(&page), "-0 in the page");
     for foreign in ["NaN", "<script", "http:", "https:", "url("] {
         assert!(!page.contains(foreign), "{foreign} in the page");
     }
@@ -78,6 +93,7 @@ fn a_store_becomes_a_page_that_says_what_is_unknown() {
     good(&["replay", "-c", &config(), &log, "--state", &state]);
     let page = place.page("a.html", &["--state", &state]);
     assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
+    assert!(!has_minus_zero(&page), "-0 in the page");
     assert!(page.contains("unknown: the history keeps what was learned") && page.contains("all as they were written"));
     assert!(page.contains("rated capacity not known without -c"));
     assert!(page.contains("No forecast of the capacity: the record does not say which capacity is the end of life"));

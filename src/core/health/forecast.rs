@@ -162,7 +162,8 @@ pub enum InsufficientData {
     /// The fade is not significant against its deviation.
     #[error(
         "capacity lost is {:.1} +- {:.1} %, must be {MIN_FADE_DEVIATIONS} times its deviation",
-        100.0 * lost, 100.0 * std
+        // Adding zero makes 0 of -0.
+        (1000.0 * lost).round() / 10.0 + 0.0, 100.0 * std
     )]
     Fade {
         /// Capacity lost, part of the reference.

@@ -29,7 +29,7 @@ pub(super) fn commands(
             "must have a table [output] that is enabled: the outcome of a command is sent",
         );
     }
-    let bus = raw.bus_of(keys.interface.as_deref())?;
+    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place, checks.faults)?;
     let (output, database) = output?;
     let note = |error: &String, faults: &mut Faults| keys.place.fault(faults, "enabled", error);
     let plan = CommandPlan::new(database).map_err(|all| all.0.iter().for_each(|e| note(e, checks.faults))).ok()?;

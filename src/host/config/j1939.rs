@@ -31,7 +31,7 @@ pub(super) fn node(checks: &mut Checks<'_>, output: Option<&OutputConfig>) -> Op
         return None;
     };
     let alarms = codes(&raw.alarms, checks.faults);
-    let bus = bus(raw, keys, checks.faults);
+    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place, checks.faults);
     let node = NodeConfig { name: name(keys, checks.faults)?, address: address(keys, checks.faults)? };
     check_ids(keys, &node, bus?, output, checks);
     let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
@@ -60,17 +60,6 @@ fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
         identity_number: keys.identity_number,
     };
     Name::new(&fields).map_err(|error| keys.place.fault(faults, error.field, &error.to_string())).ok()
-}
-
-fn bus(raw: &RawTables, keys: &J1939, faults: &mut Faults) -> Option<BusIndex> {
-    let index = match &keys.interface {
-        Some(name) => raw.interfaces.iter().position(|interface| interface.name == *name),
-        None => (raw.interfaces.len() == 1).then_some(0),
-    };
-    if index.is_none() && raw.has_all_interfaces() && !raw.interfaces.is_empty() {
-        keys.place.fault(faults, "interface", &format!("must be {}", raw.interface_names()));
-    }
-    index.and_then(|index| u8::try_from(index).ok()).map(BusIndex)
 }
 
 /// The code of every threshold; `None` when one is faulty (noted).

@@ -79,6 +79,16 @@ impl RawTables {
         u8::try_from(index).ok().map(BusIndex)
     }
 
+    /// The interface of a table that belongs to one; `None` = it is not there, or must be named (noted).
+    pub(super) fn one_bus(&self, interface: Option<&str>, place: &TablePlace, faults: &mut Faults) -> Option<BusIndex> {
+        let is_clear = interface.is_some() || self.interfaces.len() <= 1;
+        let bus = self.bus_of(interface).filter(|_| is_clear);
+        if bus.is_none() && self.has_all_interfaces() && !self.interfaces.is_empty() {
+            place.fault(faults, "interface", &format!("must be {}", self.interface_names()));
+        }
+        bus
+    }
+
     /// Names of the interfaces, as a fault lists them.
     pub(super) fn interface_names(&self) -> String {
         let names: Vec<&str> = self.interfaces.iter().map(|interface| interface.name.as_str()).collect();

@@ -11,6 +11,7 @@ use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
 use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, daemon_path};
+use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::places::{Activity, PlaceLimits, Places};
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
@@ -140,8 +141,9 @@ async fn serve_connection(stream: UnixStream, peer: UCred, context: &ConnectionC
                 context.own_uid
             )),
             Ok(request) => {
-                if request.changes_something() {
-                    tracing::info!(uid = peer.uid(), pid = peer.pid(), ?request, "command over the control socket");
+                if let Request::Command(command) = &request {
+                    let command = command_words(command);
+                    tracing::info!(uid = peer.uid(), pid = peer.pid(), command, "command over the control socket");
                 }
                 activity.begin_request();
                 let answer = ask(context, request).await;

@@ -3,6 +3,8 @@
 
 mod words;
 
+pub use words::command as command_words;
+
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
@@ -129,15 +131,17 @@ impl EventLog {
             }
             EventKind::Poll(change) => log_poll(change),
             EventKind::BusAsleep { asleep: true, .. } => tracing::info!("the buses sleep"),
-            EventKind::BusAsleep { asleep: false, seconds } => tracing::info!(seconds, "the buses are awake"),
+            EventKind::BusAsleep { asleep: false, seconds } => {
+                tracing::info!(seconds = seconds.map(rounded), "the buses are awake");
+            }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::Model { .. } => log_model(&event.kind),
             EventKind::Finding(Finding { kind, cells, size, probability, .. }) => {
                 let (first, last) = cells.map(|(first, last)| (number(first), number(last))).unzip();
-                let (size, size_std) = (rounded(size.mean), rounded(size.std()));
+                let [size, size_std, probability] = [size.mean, size.std(), probability].map(rounded);
                 tracing::warn!(first, last, size, size_std, probability, "{}: {}", kind.words(), kind.advice());
             }
-            EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
+            EventKind::TimeBackwards { seconds } => tracing::warn!(seconds = rounded(seconds), "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
                 tracing::warn!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate not to be trusted");
             }
@@ -262,6 +266,8 @@ fn log_model(kind: &EventKind) {
         return;
     };
     let chemistry = chemistry.map(Chemistry::name);
+    let [capacity_ah, capacity_std_ah, residual_v] =
+        [capacity_ah, capacity_std_ah, residual_v].map(|value| value.map(rounded));
     match state {
         ModelState::Unfit => {
             tracing::warn!(fits_better = chemistry, "the voltages contradict the chemistry on the label")
@@ -295,8 +301,11 @@ fn log_alarm(kind: &EventKind) {
 }
 
 fn log_learned(kind: &EventKind) {
+    let known = |value: Option<f64>| value.map(rounded);
     match *kind {
         EventKind::HalfCycle { cell, mode, charge_ah, swing, swing_std, duration_s, .. } => {
+            let (charge_ah, duration_s) = (rounded(charge_ah), rounded(duration_s));
+            let (swing, swing_std) = (known(swing), known(swing_std));
             tracing::info!(cell = number(cell), ?mode, charge_ah, swing, swing_std, duration_s, "half-cycle");
         }
         EventKind::Capacity {
@@ -310,21 +319,25 @@ fn log_learned(kind: &EventKind) {
         } => {
             tracing::info!(
                 cell = number(cell),
-                measured_ah,
-                capacity_ah,
-                capacity_std_ah,
-                usable_capacity_ah,
-                resistance_ratio,
+                measured_ah = known(measured_ah),
+                capacity_ah = rounded(capacity_ah),
+                capacity_std_ah = rounded(capacity_std_ah),
+                usable_capacity_ah = known(usable_capacity_ah),
+                resistance_ratio = rounded(resistance_ratio),
                 "capacity"
             );
         }
         EventKind::LossModes { cell, lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std } => {
+            let [lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std] =
+                [lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std].map(rounded);
             tracing::info!(cell = number(cell), lli, lli_std, lam_ne, lam_ne_std, lam_pe, lam_pe_std, "loss modes");
         }
         EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, .. } => {
+            let [cycles, cycles_low, cycles_high, days] = [cycles, cycles_low, cycles_high, days].map(known);
             tracing::info!(cell = cell.map(number), cycles, cycles_low, cycles_high, days, "remaining life");
         }
         EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
+            let [seconds, normalised_s, normalised_std_s] = [seconds, normalised_s, normalised_std_s].map(known);
             tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");
         }
         _ => {}
@@ -334,6 +347,9 @@ fn log_learned(kind: &EventKind) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::filter::ScalarGaussian;
+    use crate::findings::FindingKind;
+    use crate::quantity::Mode;
 
     #[test]
     fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
@@ -353,6 +369,98 @@ mod tests {
             (45.0, -0.1, 1e-12, 123_456.789)
         );
         assert!(rounded(f64::NAN).is_nan());
+    }
+
+    /// Collects log lines.
+    #[derive(Clone, Default)]
+    struct Lines(std::sync::Arc<std::sync::Mutex<Vec<u8>>>);
+
+    impl Write for Lines {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().extend_from_slice(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn learned_values_are_logged_with_no_more_digits_than_they_have() {
+        let (x, known, cell) = (0.7 * 2.6, Some(0.7 * 2.6), CellIndex(72));
+        let (size, since) = (ScalarGaussian { mean: x, variance: x }, Timestamp::ZERO);
+        let finding = Finding {
+            kind: FindingKind::Leak,
+            cells: Some((cell, cell)),
+            since,
+            reported: since,
+            probability: x,
+            size,
+        };
+        let kinds = [
+            EventKind::HalfCycle {
+                cell,
+                mode: Mode::Discharge,
+                charge_ah: x,
+                swing: known,
+                swing_std: known,
+                duration_s: x,
+                mean_current_a: x,
+                mean_temperature_c: known,
+            },
+            EventKind::Capacity {
+                cell,
+                measured_ah: known,
+                measured_std_ah: known,
+                capacity_ah: x,
+                capacity_std_ah: x,
+                usable_capacity_ah: known,
+                usable_capacity_std_ah: known,
+                resistance_ratio: x,
+                resistance_ratio_std: x,
+            },
+            EventKind::LossModes { cell, lli: x, lli_std: x, lam_ne: x, lam_ne_std: x, lam_pe: x, lam_pe_std: x },
+            EventKind::RemainingLife {
+                cell: Some(cell),
+                cycles: known,
+                cycles_low: known,
+                cycles_high: known,
+                days: known,
+                days_low: known,
+                days_high: known,
+            },
+            EventKind::RechargePeriod { seconds: known, normalised_s: known, normalised_std_s: known },
+            EventKind::Model {
+                state: ModelState::Learned,
+                capacity_ah: known,
+                capacity_std_ah: known,
+                residual_v: known,
+                chemistry: None,
+                is_taken_back: false,
+            },
+            EventKind::Finding(finding),
+            EventKind::BusAsleep { asleep: false, seconds: known },
+            EventKind::TimeBackwards { seconds: x },
+            EventKind::Trust { cell, trusted: false, mean_nis: x },
+            EventKind::PackReplaced { capacity_ah: known, capacity_std_ah: known },
+            EventKind::Gap { seconds: known },
+        ];
+        let lines = Lines::default();
+        let writer = lines.clone();
+        let subscriber = tracing_subscriber::fmt().with_writer(move || writer.clone()).with_ansi(false).finish();
+        tracing::subscriber::with_default(subscriber, || {
+            let mut log = EventLog::new(vec!["can0".to_owned()]);
+            kinds.iter().for_each(|kind| log.log(&Event { time: Timestamp::ZERO, kind: *kind }));
+        });
+        let text = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
+        assert_eq!(text.lines().count(), kinds.len(), "{text}");
+        for line in text.lines() {
+            let word_of = |key: &str| line.split(' ').find_map(|word| word.strip_prefix(key)).map(str::to_owned);
+            assert!(line.contains("1.82"), "{line}");
+            assert!(!line.contains("1.81999") && !line.contains("1.82000"), "{line}");
+            assert!(!line.contains("Index(") && word_of("cell=").is_none_or(|number| number == "73"), "{line}");
+        }
     }
 
     #[test]

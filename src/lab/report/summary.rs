@@ -7,7 +7,7 @@ use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
 use super::raised::{ActiveAlarm, doubt, raised, value};
 use super::{forecast, series};
-use crate::alarm::{Rule, Severity, Unit};
+use crate::alarm::{Direction, Rule, Severity, Unit};
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
 
@@ -69,7 +69,7 @@ pub(super) struct Summary {
 pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
-    let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
+    let worst = worst(&battery, |alarm| value(alarm.row, data, context, outlook.as_ref().ok()));
     let unknown = unknown(data, context);
     let why = worst.or(measuring.first().copied()).map_or_else(String::new, |alarm| {
         match value(alarm.row, data, context, outlook.as_ref().ok()) {
@@ -93,6 +93,20 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
         what: what(verdict, worst, &measuring, knows_limits(data, context)),
         tiles: tiles(data, context, outlook, &raised),
     }
+}
+
+/// The worst of the alarms: of the cells for which a rule has raised the worst severity, the one with the worst value now.
+fn worst<'a>(
+    alarms: &[&'a ActiveAlarm<'a>],
+    value: impl Fn(&ActiveAlarm<'_>) -> Option<f64>,
+) -> Option<&'a ActiveAlarm<'a>> {
+    let first = *alarms.iter().max_by_key(|alarm| rank(&alarm.row.severity))?;
+    let is_below = rule(&first.row.rule).is_some_and(|rule| rule.spec().direction == Direction::Below);
+    let badness =
+        |alarm: &ActiveAlarm<'_>| value(alarm).map_or(f64::NEG_INFINITY, |value| if is_below { -value } else { value });
+    let is_like_first =
+        |alarm: &&&ActiveAlarm<'_>| (&alarm.row.rule, &alarm.row.severity) == (&first.row.rule, &first.row.severity);
+    alarms.iter().filter(is_like_first).copied().max_by(|a, b| badness(a).total_cmp(&badness(b)))
 }
 
 /// Whether the capacity is below the end of life, independent of the alarms.
@@ -483,6 +497,18 @@ mod tests {
         assert_eq!(doubted.doubt.as_deref(), Some("not trusted: cell 3"));
         let unmarked = of(&data).tiles.into_iter().filter(|tile| tile.doubt.is_none() && tile.value != "unknown");
         assert_eq!(unmarked.map(|tile| tile.name).collect::<Vec<_>>(), ["Use so far", "Alarms raised now"]);
+    }
+
+    #[test]
+    fn of_many_cells_the_headline_has_the_worst() {
+        let mut data = Data::new(Origin::Replay);
+        for (cell, usable_ah) in [1.1, 0.9, 1.0].into_iter().enumerate() {
+            data.alarms.push(AlarmRecord { cell: Some(cell), ..alarm(1.7e9, "usable_capacity_low", "severe", true) });
+            let usable_ah = Some((usable_ah, 0.01));
+            data.learned.push(CapacityRecord { usable_ah, ..learned(1.71e9, cell, Some(1.0)) });
+        }
+        let said = of(&data, &PageContext::default(), &Err("too little".into())).how;
+        assert!(said.ends_with("Now a cell's usable capacity is 0.9 Ah, limit 1.4 Ah (cell 2)."), "{said}");
     }
 
     #[test]

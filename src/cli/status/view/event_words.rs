@@ -3,6 +3,7 @@
 
 use serde_json::{Map, Value};
 
+use crate::findings::Finding;
 use crate::status::document::StatusDocument;
 
 /// Units at the end of a key.
@@ -21,9 +22,22 @@ const NUMBERED: [&str; 4] = ["cell", "cell_voltage", "temperature", "sensor"];
 /// Formats the event without its time.
 pub(super) fn words(event: &Map<String, Value>, document: &StatusDocument) -> String {
     let name = event.get("event").and_then(Value::as_str).unwrap_or("?").replace('_', " ");
+    if let Some(finding) = finding(event) {
+        return format!("{name}: {finding}");
+    }
     let keys = event.iter().filter(|(key, _)| !matches!(key.as_str(), "time" | "event"));
     let parts: Vec<String> = keys.filter_map(|(key, value)| part(event, key, value, document)).collect();
     if parts.is_empty() { name } else { format!("{name}: {}", parts.join(", ")) }
+}
+
+/// The finding that an event reports.
+fn finding(event: &Map<String, Value>) -> Option<Finding> {
+    if event.get("event")? != "finding" {
+        return None;
+    }
+    let keys = event.iter().filter(|(key, _)| !matches!(key.as_str(), "time" | "event"));
+    let keys = keys.map(|(key, value)| (key.clone(), value.clone())).collect();
+    serde_json::from_value(Value::Object(keys)).ok()
 }
 
 /// A key with its value; `None` = another key shows it.
@@ -103,6 +117,9 @@ mod tests {
         let bad =
             serde_json::json!({ "event": "signal_bad", "channel": { "cell_voltage": 72 }, "fault": "out_of_range" });
         assert_eq!(said(&bad), "signal bad: channel cell voltage 73, fault out of range");
+        let finding = serde_json::json!({ "time": 1, "event": "finding", "kind": "leak", "cells": [6, 6], "since": 1_700_000_000_000_000_000_u64,
+            "reported": 1_700_000_000_000_000_000_u64, "probability": 1.0, "size": { "mean": 0.1, "variance": 1e-6 } });
+        assert_eq!(said(&finding), "finding: cell 7: loses charge by itself, 10.00 ± 0.10 % of its capacity a day");
         let trust = serde_json::json!({ "event": "trust", "cell": 0, "trusted": false, "mean_nis": 3.25 });
         assert_eq!(said(&trust), "trust: cell 1, innovations over expected 3.25, not trusted");
         let bus = serde_json::json!({ "event": "bus", "bus": 0, "what": { "dropped": { "frames": 3 } } });

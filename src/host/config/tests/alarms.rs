@@ -112,6 +112,10 @@ fn faults_of_alarms_and_commands() {
              makes the message 12 bytes long; 1A and 1C fit classic frames",
         ),
         (
+            "[output]\n[commands]\nenabled = true\ninterface = \"can1\"\ne2e = \"1A\"\ndata_id = 1\n",
+            "pack.toml:18: commands.interface = \"can1\", must be can0",
+        ),
+        (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clear = 15 }\n",
             "pack.toml:17: alarm[1].warning = { set = 0.1, clear = 15 }, must leave a value that clears warning within 0 to \
              1, not 15",

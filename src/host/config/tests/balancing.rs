@@ -39,7 +39,7 @@ fn faults_of_the_bits() {
     let table = [
         (
             pack("signal = \"Bleeding.Bleed{n}\"\n"),
-            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000",
+            "pack.toml:15: input.balancing.bleed_a is missing, must be a number, above 0 and at most 1000000 (A)",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0\n"),

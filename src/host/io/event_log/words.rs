@@ -21,7 +21,7 @@ pub(super) fn channel(channel: Channel) -> String {
 }
 
 /// The command: `clear capacity_low of cell 73`.
-pub(super) fn command(command: &Command) -> String {
+pub fn command(command: &Command) -> String {
     match command {
         Command::Acknowledge(which) => format!("acknowledge {}", selected(which)),
         Command::Clear(which) => format!("clear {}", selected(which)),
