@@ -7,9 +7,12 @@ use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{Downtime, EventKind, Input, Monitor};
 use packwatch::quantity::BusIndex;
 
-use crate::support::rig::{Rig, command_frame, learned};
+use crate::support::config_texts;
+use crate::support::rig::{DBC, PACK, Rig, command_frame, learned};
 
 const STATUS: u32 = 0x6B0;
+const HEALTH: u32 = 0x6B1;
+const ALARM: u32 = 0x6B2;
 const DIGEST: u32 = 0x6B4;
 const REPLY: u32 = 0x6B5;
 const HOT: &str = "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n";
@@ -77,6 +80,45 @@ fn every_command_frame_has_a_reply_with_its_reason_and_the_counter_expected() {
 }
 
 #[test]
+fn the_reply_to_an_acknowledge_command_follows_the_alarm_frames_that_it_caused() {
+    let mut rig = learned();
+    rig.command(1, 31, 2047);
+    rig.seconds(2);
+    rig.frames.clear();
+    rig.command(1, 31, 2047);
+    let is_alarm = |frame: &Frame| frame.id() == CanId::standard(ALARM).unwrap();
+    let reply = rig.frames.iter().position(|frame| frame.id() == CanId::standard(REPLY).unwrap()).unwrap();
+    let last_alarm = rig.frames.iter().rposition(is_alarm).unwrap();
+    assert!(last_alarm < reply, "{:?}", rig.frames);
+    let acknowledged: Vec<_> = rig.wire().iter().filter(|wire| wire.acknowledged).map(|wire| wire.cell).collect();
+    assert_eq!(acknowledged, [0, 1], "one frame of each alarm that the command changed");
+    assert_eq!(rig.last_reply(), [1, 0, 1, 2, 2, 0], "two alarms changed");
+}
+
+#[test]
+fn the_first_tick_after_a_second_or_more_away_sends_all_cyclic_frames_and_each_period_after_it_one_more() {
+    for away in [Downtime::Seconds(1.0), Downtime::Seconds(2.3), Downtime::Seconds(60.0), Downtime::Unknown] {
+        // At other moments of the periods than their ends.
+        for more_deci in [0, 1, 6] {
+            let mut rig = Rig::new("");
+            rig.seconds(3);
+            (0..more_deci).for_each(|_| rig.tick_with_frames());
+            rig.restart(away);
+            rig.frames.clear();
+            let cyclic = |rig: &Rig| {
+                let pages = |id| rig.frames_with(id).iter().map(|frame| field(frame, 16, 4)).collect::<Vec<_>>();
+                (rig.frames_with(STATUS).len(), pages(HEALTH), pages(DIGEST))
+            };
+            rig.tick();
+            assert_eq!(cyclic(&rig), (1, (0..5).collect(), (0..4).collect()), "{away:?} {more_deci}");
+            (0..10).for_each(|_| rig.tick());
+            let twice = |pages: u64| (0..pages).chain(0..pages).collect();
+            assert_eq!(cyclic(&rig), (11, twice(5), twice(4)), "{away:?} {more_deci}");
+        }
+    }
+}
+
+#[test]
 fn a_flood_of_commands_has_few_replies() {
     let mut rig = learned();
     for _ in 0..30 {
@@ -124,39 +166,100 @@ fn leaving_unknown_is_announced_four_times_and_once_more_after_a_kill() {
     }
 }
 
+/// A protected message of the test of counters: identifier, data id, frames in each period, period in tenths of a second.
+const COUNTED: [(u32, u16, i64, i64); 4] =
+    [(STATUS, 1, 1, 1), (HEALTH, 2, 5, 10), (ALARM, 3, 1, 5), (DIGEST, 4, 4, 10)];
+
+/// A rig whose four messages are protected with `profile`, in FD frames, with a threshold for the temperature.
+fn protected_rig(profile: Profile) -> Rig {
+    let keys = |data_id: u32| format!("fd = true\ne2e = \"{}\"\ndata_id = {data_id}\n", profile.name());
+    let pack = PACK
+        .replace("name = \"can0\"\n", "name = \"can0\"\nfd = true\n")
+        .replace("period_ms = 500\n", &format!("period_ms = 500\n{}", keys(3)));
+    let more = [("status", 1), ("health", 2), ("digest", 4)].map(|(name, id)| format!("[output.{name}]\n{}", keys(id)));
+    Rig::with(config_texts::load(&format!("{pack}{}{HOT}", more.concat()), DBC).monitor)
+}
+
+/// Counters of the frames with an identifier, all of them intact.
+fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
+    let counter = |frame: &Frame| protection.verified_counter(frame.data()).unwrap().into();
+    rig.frames_with(id).iter().map(counter).collect()
+}
+
+/// Tenths of a second between the stored state and the kill, and until the first tick of the next run.
+const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
+
+/// Kills a daemon with one raised alarm. Returns, for each message of [`COUNTED`], the steps of its counter from the last frame
+/// before the kill to the first one after it, and the steps of a daemon that never stopped: the least and the most.
+fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
+    let mut rig = protected_rig(profile);
+    // Raised and repeated: from here on the alarm is sent in turn only.
+    rig.heat(60.0, 6);
+    let stored = rig.monitor.snapshot();
+    (0..unstored_deci).for_each(|_| rig.tick_with_frames());
+    let of = |data_id| Protection { profile, data_id };
+    let before = COUNTED.map(|(id, data_id, ..)| *counters(&rig, id, of(data_id)).last().unwrap());
+    rig.monitor = Monitor::new(rig.config.clone());
+    let age_s = (unstored_deci + away_deci) as f64 / 10.0;
+    rig.monitor.restore(stored, Downtime::Seconds(age_s)).unwrap();
+    rig.deci += away_deci;
+    rig.frames.clear();
+    rig.tick();
+    assert_eq!(rig.frames_with(STATUS).len(), 1, "{profile:?} {unstored_deci} {away_deci}: at the first tick");
+    // Each of the others comes within its period.
+    (0..9).for_each(|_| rig.tick());
+    let turn = i64::from(profile.max_counter()) + 1;
+    std::array::from_fn(|n| {
+        let (id, data_id, frames, period_deci) = COUNTED[n];
+        let first = counters(&rig, id, of(data_id))[0];
+        // Whole periods lie between the last frame before and the first one after.
+        let lost = away_deci / period_deci;
+        let allowed = [lost, lost + 1].map(|periods| (periods * frames + 1).rem_euclid(turn));
+        ((first - before[n]).rem_euclid(turn), allowed)
+    })
+}
+
 #[test]
 fn counters_after_a_kill_are_those_of_a_daemon_that_never_stopped() {
-    let status = Protection { profile: Profile::P01A, data_id: 1 };
-    let digest = Protection { profile: Profile::P01A, data_id: 2 };
-    let text = "[output.status]\ne2e = \"1A\"\ndata_id = 1\n[output.digest]\ne2e = \"1A\"\ndata_id = 2\n";
-    let last = |rig: &Rig, id, protection: Protection| {
-        protection.verified_counter(rig.frames_with(id).last().unwrap().data()).unwrap()
-    };
-    for (unstored_deci, away_deci) in [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)] {
-        let mut rig = Rig::new(text);
-        rig.seconds(4);
-        let stored = rig.monitor.snapshot();
-        (0..unstored_deci).for_each(|_| rig.tick_with_frames());
-        let before = [last(&rig, STATUS, status), last(&rig, DIGEST, digest)];
-        let passed = rig.frames_with(DIGEST).len();
-        rig.monitor = Monitor::new(rig.config.clone());
-        let age_s = (unstored_deci + away_deci) as f64 / 10.0;
-        rig.monitor.restore(stored, Downtime::Seconds(age_s)).unwrap();
-        rig.deci += away_deci;
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        for (unstored_deci, away_deci) in KILLS {
+            let steps = steps_over_a_kill(profile, unstored_deci, away_deci);
+            for ((id, ..), (steps, allowed)) in COUNTED.into_iter().zip(steps).filter(|((id, ..), _)| *id != ALARM) {
+                assert!(
+                    allowed.contains(&steps),
+                    "{profile:?} {id:X} {unstored_deci} {away_deci}: {steps} steps, must be one of {allowed:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn the_alarm_frame_s_counter_after_a_kill_is_beyond_those_of_the_frames_due_meanwhile() {
+    for (unstored_deci, away_deci) in KILLS {
+        let (steps, [least, _]) = steps_over_a_kill(Profile::P05, unstored_deci, away_deci)[2];
+        assert!(steps >= least, "{unstored_deci} {away_deci}: {steps} steps, must be {least} or more");
+    }
+}
+
+#[test]
+fn counters_after_an_unknown_time_continue_where_the_stored_state_ends_and_without_a_state_at_zero() {
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        let mut rig = protected_rig(profile);
+        rig.heat(60.0, 6);
+        let next = COUNTED.map(|(id, data_id, ..)| {
+            let last = *counters(&rig, id, Protection { profile, data_id }).last().unwrap();
+            (last + 1) % (i64::from(profile.max_counter()) + 1)
+        });
+        let firsts = |rig: &Rig| COUNTED.map(|(id, data_id, ..)| counters(rig, id, Protection { profile, data_id })[0]);
+        rig.restart(Downtime::Unknown);
         rig.frames.clear();
-        rig.tick();
-        let first = status.verified_counter(rig.frames_with(STATUS)[0].data()).unwrap();
-        let periods = (i64::from(first) - i64::from(before[0])).rem_euclid(15);
-        let wanted = (away_deci + 1).rem_euclid(15);
-        assert!(
-            (wanted..=wanted + 1).contains(&periods),
-            "{unstored_deci} {away_deci}: {periods} after {away_deci} lost periods"
-        );
-        assert!(passed > 0);
-        rig.seconds(2);
-        let first = digest.verified_counter(rig.frames_with(DIGEST)[0].data()).unwrap();
-        let pages = (i64::from(first) - i64::from(before[1])).rem_euclid(15);
-        assert!(pages % 4 == 1, "{unstored_deci} {away_deci}: whole periods of four pages: {pages}");
+        rig.seconds(1);
+        assert_eq!(firsts(&rig), next, "{profile:?}");
+        rig.monitor = Monitor::new(rig.config.clone());
+        rig.frames.clear();
+        rig.seconds(6);
+        assert_eq!(firsts(&rig), [0; 4], "{profile:?}");
     }
 }
 
