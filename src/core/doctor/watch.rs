@@ -311,7 +311,7 @@ impl Doctor {
             BusEvent::Up => (bus.is_missing, bus.is_down) = (false, false),
             BusEvent::Down => bus.is_down = true,
             BusEvent::Missing => bus.is_missing = true,
-            BusEvent::Dropped { frames } => bus.dropped += frames,
+            BusEvent::Dropped { frames } => bus.dropped = bus.dropped.saturating_add(frames),
             BusEvent::ErrorFrame { class } => {
                 bus.error_frames += 1;
                 bus.error_classes |= class;

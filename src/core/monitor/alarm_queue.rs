@@ -87,6 +87,11 @@ pub(super) struct AlarmQueue {
 }
 
 impl AlarmQueue {
+    /// Whether alarms are being announced as unknown.
+    pub(super) fn has_unknown(&self) -> bool {
+        !self.unknown.is_empty()
+    }
+
     /// Time between two frames of one raised alarm while nothing changes, s.
     pub(super) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);

@@ -232,7 +232,8 @@ impl Sender {
             periods.max(0.0) as u64
         };
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
-        let unknown = u64::from(engine.unknown().1 > 0) * periods(*alarm, config.alarm_period_s);
+        // After a restart all alarms are unknown; those that the earlier process announced as unknown are noted.
+        let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
         alarms.limit(now, config.alarm_period_s);
         for (message, frames) in [
             (LayoutMessage::Status, periods(*status, config.status_period_s)),

@@ -53,7 +53,7 @@ struct EventSum {
 impl EventSum {
     /// Adds frames; returns how many to log, when it is time.
     fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
-        self.unreported += frames;
+        self.unreported = self.unreported.saturating_add(frames);
         let since_s = self.reported.map_or(f64::INFINITY, |reported| time.since(reported));
         if since_s < self.period_s {
             return None;
@@ -359,6 +359,13 @@ mod tests {
         assert!((20..=45).contains(&logged.len()), "{} lines", logged.len());
         assert_eq!(logged[0], 2, "the first is logged at once");
         assert_eq!(logged.iter().sum::<u64>() + sum.unreported, 86_400 * 4 * 2);
+    }
+
+    #[test]
+    fn a_sum_of_the_largest_numbers_stays_the_largest() {
+        let mut sum = EventSum::default();
+        let sums = [0.0, 1.0, 2.0, 10.0].map(|at_s| sum.add(Timestamp::from_secs(at_s), u64::MAX));
+        assert_eq!(sums, [Some(u64::MAX), None, None, Some(u64::MAX)]);
     }
 
     #[test]
