@@ -389,13 +389,13 @@ fn numbers_of_lost_frames_add_up_to_the_largest_and_not_beyond() {
         event: BusEvent::Dropped { frames: u64::MAX },
     };
     let one_by_one = read(std::slice::from_ref(&candump), true, |_| {}).expect("read");
-    assert_eq!(one_by_one.0[1..], [lost.clone(), lost.clone()], "each line is a record with its number");
+    assert_eq!(one_by_one.0[1..], [lost, lost], "each line is a record with its number");
     assert_eq!((one_by_one.1.dropped_frames, one_by_one.1.bad_lines), (u64::MAX, 0));
     assert_eq!(read_batches(&[candump], true, Batch::MAX).expect("read"), one_by_one);
     let line = "BUS (1.000000000) can0 dropped 18446744073709551615\n";
     let journal = file(folder.path(), "j", format!("PACKWATCH-JOURNAL 1\n{line}{line}").as_bytes());
     let (records, counts) = read(&[journal], true, |_| {}).expect("read");
-    assert_eq!((records, counts.bad_lines), (vec![lost.clone(), lost], 0));
+    assert_eq!((records, counts.bad_lines), (vec![lost, lost], 0));
     // One more than the largest is no number.
     let beyond = MOST_DROPPED.replace("dropped 18446744073709551615", "dropped 18446744073709551616");
     let (records, counts) = read(&[file(folder.path(), "b.log", beyond.as_bytes())], false, |_| {}).expect("read");

@@ -325,8 +325,8 @@ impl Maker {
         let (severity, cell, counter) = (1 + self.one_of(3), self.one_of(1024), self.one_of(256));
         let (changed, refused) = (1 + self.one_of(70), self.one_of(20));
         let refusal = REFUSALS[turn % REFUSALS.len()];
-        let is_executed = turn % 2 == 0;
-        let is_read = is_executed || turn % 3 == 0;
+        let is_executed = turn.is_multiple_of(2);
+        let is_read = is_executed || turn.is_multiple_of(3);
         let command = CommandFields {
             command: KINDS[kind],
             rule: u8::try_from(rule).ok(),

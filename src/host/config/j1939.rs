@@ -6,7 +6,6 @@ use super::Config;
 use super::document::Faults;
 use super::keys::{Alarm, J1939};
 use super::resolve::Checks;
-use super::tables::RawTables;
 use crate::alarm::{Direction, Rule, Severity};
 use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
