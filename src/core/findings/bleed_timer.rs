@@ -135,6 +135,11 @@ mod tests {
         timer.take(at(seconds), is_bled.into(), at(seconds + AGE_S));
     }
 
+    fn assert_near(found: BleedTime, wanted: BleedTime) {
+        let all = |it: BleedTime| [it.bled_s, it.unknown_s, it.silent_s];
+        assert!(all(found).iter().zip(all(wanted)).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}, not {wanted:?}");
+    }
+
     fn bled(bled_s: f64) -> BleedTime {
         BleedTime { bled_s, ..BleedTime::default() }
     }
@@ -143,10 +148,10 @@ mod tests {
     fn half_of_what_is_bled_in_a_row_belongs_to_the_next() {
         let mut timer = BleedTimer::default();
         (0..100).for_each(|second| take(&mut timer, f64::from(second), second >= 40));
-        assert_eq!(timer.end_row(at(100.0)), bled(30.0));
+        assert_near(timer.end_row(at(100.0)), bled(30.0));
         timer.begin_row(at(100.0));
-        assert_eq!(timer.end_row(at(100.0)), bled(30.0));
-        assert_eq!(timer.end_row(at(100.0)), bled(0.0));
+        assert_near(timer.end_row(at(100.0)), bled(30.0));
+        assert_near(timer.end_row(at(100.0)), bled(0.0));
     }
 
     #[test]
@@ -158,25 +163,25 @@ mod tests {
         take(&mut timer, 50.0, false);
         timer.rebase(7_000_000_000);
         timer.begin_row(at(1007.0));
-        assert_eq!(timer.end_row(at(1007.0)), BleedTime { silent_s: 940.0, ..bled(40.0) });
+        assert_near(timer.end_row(at(1007.0)), BleedTime { silent_s: 940.0, ..bled(40.0) });
     }
 
     #[test]
     fn nothing_is_known_behind_the_time_for_which_a_bit_holds_and_of_one_that_cannot_be_read() {
         let mut timer = BleedTimer::default();
         timer.begin_row(at(0.0));
-        assert_eq!(timer.end_row(at(50.0)), BleedTime { silent_s: 25.0, ..bled(0.0) });
+        assert_near(timer.end_row(at(50.0)), BleedTime { silent_s: 25.0, ..bled(0.0) });
         assert!(!timer.has_bits, "none came");
         take(&mut timer, 50.0, true);
         timer.begin_row(at(110.0));
-        assert_eq!(timer.end_row(at(110.0)), BleedTime { silent_s: 75.0, ..bled(10.0) });
+        assert_near(timer.end_row(at(110.0)), BleedTime { silent_s: 75.0, ..bled(10.0) });
         take(&mut timer, 90.0, true);
-        assert_eq!(timer.end_row(at(110.0)), bled(0.0), "counted twice");
+        assert_near(timer.end_row(at(110.0)), bled(0.0));
         take(&mut timer, 110.0, None);
         timer.begin_row(at(125.0));
-        assert_eq!(timer.end_row(at(125.0)), BleedTime { unknown_s: 10.0, silent_s: 5.0, ..bled(0.0) });
+        assert_near(timer.end_row(at(125.0)), BleedTime { unknown_s: 10.0, silent_s: 5.0, ..bled(0.0) });
         timer.forget_time();
-        assert_eq!(timer.end_row(at(200.0)), bled(0.0));
+        assert_near(timer.end_row(at(200.0)), bled(0.0));
         assert!(timer.has_bits);
     }
 

@@ -76,7 +76,8 @@ fn reference_scenario_loses_1_ah_per_cycle_under_pulses_of_15_a_mean() {
 fn random_walk_stays_within_its_voltages_and_measures_by_two_reference_cycles() {
     let mut settings = Settings::of(Scenario::RandomWalk, 2.1);
     settings.walk_steps = 60;
-    settings.cycles = Some(2);
+    (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
+    (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
     let mut sim = simulation(settings);
     let course = run(&mut sim);
     assert_eq!(sim.pack().cycles(), 2);
@@ -106,27 +107,37 @@ fn ev_day_drives_regenerates_sleeps_and_charges() {
 fn a_bms_that_bleeds_asleep_sends_its_bits_every_minute_until_none_is_bled() {
     let mut settings = Settings::of(Scenario::EvDay, 50.0);
     settings.pack.cells = 3;
-    settings.pack.spread = Spread { soc: 0.01, ..Spread::default() };
-    let truth = |bits: bool| {
-        let sim = simulation(settings).with_balancing(Balancing { bleed_a: 0.5, ..Balancing::usual(50.0) });
-        let mut sim = if bits { sim.with_balancing_bits() } else { sim };
-        let mut asleep: Vec<(f64, f64, f64)> = Vec::new();
-        while let Some(moment) = sim.advance() {
-            if let [(Channel::Balancing(_), _), .., (Channel::Balancing(_), _)] = sim.readings() {
-                let bits = sim.readings().iter().map(|(_, bit)| bit.unwrap()).sum();
-                let drop_v = sim.pack().voltages_v(0.0).zip(sim.voltages_v()).map(|(rest_v, v)| rest_v - v).sum();
-                asleep.push((moment.time.secs(), bits, drop_v));
+    settings.pack.spread = Spread { soc: 0.05, ..Spread::default() };
+    (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
+    (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
+    let mut nights = 0;
+    // Not every drive home goes without a stop, which counts as the rest after the charge.
+    for seed in 1..=20 {
+        settings.seed = seed;
+        let run = |has_bits: bool| {
+            let sim = simulation(settings).with_balancing(Balancing { bleed_a: 0.5, ..Balancing::usual(50.0) });
+            let mut sim = if has_bits { sim.with_balancing_bits() } else { sim };
+            let mut asleep: Vec<(f64, bool)> = Vec::new();
+            while let Some(moment) = sim.advance() {
+                if let [(Channel::Balancing(_), _), .., (Channel::Balancing(_), _)] = sim.readings() {
+                    assert!(sim.voltages_v().eq(sim.pack().voltages_v(0.0)), "no current flows");
+                    asleep.push((moment.time.secs(), sim.readings().iter().any(|(_, bit)| *bit == Some(1.0))));
+                }
             }
+            (asleep, sim.pack().cells().to_vec())
+        };
+        let ((asleep, with), (none, without)) = (run(true), run(false));
+        assert!(none.is_empty() && with == without, "the bits change nothing");
+        for pair in asleep.windows(2) {
+            let [(before_s, was_bled), (after_s, _)] = pair else { unreachable!() };
+            assert!(
+                if *was_bled { (after_s - before_s - 60.0).abs() < 1.0 } else { after_s - before_s > 3600.0 },
+                "{pair:?}"
+            );
         }
-        (asleep, sim.pack().cells().to_vec())
-    };
-    let ((asleep, with), (none, without)) = (truth(true), truth(false));
-    assert!(asleep.len() > 10 && none.is_empty(), "{asleep:?}");
-    let (last, bled) = asleep.split_last().unwrap();
-    assert!(last.1 == 0.0 && bled.iter().all(|(_, bits, _)| *bits > 0.0), "{asleep:?}");
-    assert!(asleep.windows(2).all(|pair| (pair[1].0 - pair[0].0 - 60.0).abs() < 1.0), "{asleep:?}");
-    assert!(asleep.iter().all(|(.., drop_v)| *drop_v == 0.0), "no current flows");
-    assert_eq!(with, without, "the bits change nothing");
+        nights += asleep.iter().filter(|(_, is_bled)| !is_bled).count();
+    }
+    assert!(nights > 0, "no sleep in which a cell was bled");
 }
 
 #[test]
