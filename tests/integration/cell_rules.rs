@@ -392,12 +392,15 @@ fn a_detached_temperature_sensor_is_found_whatever_the_offsets() {
 
 #[test]
 fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() {
-    let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, "weak:3:-12% swap:3:8@day3");
-    pack.run_to(1.9);
-    assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
-    pack.run_to(6.0);
-    let swapped = (FindingKind::SwappedChannels, Some((CellIndex(2), CellIndex(7))));
-    assert!(found(&pack).contains(&swapped), "{:?}", found(&pack));
+    // Far from each other, and side by side.
+    for (fault, other) in [("weak:3:-12% swap:3:8@day3", 7), ("weak:3:-12% swap:3:4@day3", 3)] {
+        let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, fault);
+        pack.run_to(1.9);
+        assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
+        pack.run_to(6.0);
+        let swapped = (FindingKind::SwappedChannels, Some((CellIndex(2), CellIndex(other))));
+        assert!(found(&pack).contains(&swapped), "{fault}: {:?}", found(&pack));
+    }
 }
 
 #[test]

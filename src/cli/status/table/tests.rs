@@ -44,6 +44,24 @@ fn many_findings_are_counted() {
 }
 
 #[test]
+fn a_hostile_bus_is_shown() {
+    let mut document = sample(1);
+    let intruder = |id: &str, kind| Intruder { interface: "can0".to_owned(), id: id.to_owned(), kind };
+    document.intruders =
+        vec![intruder("100", IntruderKind::SecondSender), intruder("6B0", IntruderKind::OwnIdentifier)];
+    document.current_frozen = true;
+    let text = table(&document, false);
+    for line in [
+        "intruder   can0 100 has a second sender: which of its values are the sensor's is not known",
+        "intruder   can0 6B0 is sent by another node: it is an identifier of this program's frames",
+        "current    frozen: its reading does not change, and the voltages show another load",
+    ] {
+        assert!(text.lines().any(|found| found == line), "{line}\n{text}");
+    }
+    assert!(!table(&sample(1), false).contains("intruder"));
+}
+
+#[test]
 fn a_stated_vehicle_is_the_second_line() {
     let mut document = sample(1);
     document.vehicle.name = Some("Bus 12".to_owned());
