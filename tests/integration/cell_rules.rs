@@ -6,6 +6,7 @@ use crate::support::config_texts;
 use packwatch::alarm::{AlarmState, Change, Rule};
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::encode::InputEncoder;
+use packwatch::findings::difference::LEAK;
 use packwatch::findings::{BalancingConfig, Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
@@ -359,6 +360,30 @@ fn what_may_have_been_bled_is_no_leak() {
         config
     };
     assert_eq!(found_in_balanced("", 1.0, without_a_bit), []);
+}
+
+/// The bits of that time were not received, also where the BMS bleeds only while it sends them.
+#[test]
+fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
+    let leak_std = |bleed_a: f64| {
+        let keys = "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nonly_while_sent = true\n[output]\n";
+        let change = |it: BalancingConfig| BalancingConfig { bleed_a, ..it };
+        let config = load(&PACK.replace("[output]\n", keys), "Temperature");
+        let config = MonitorConfig { balancing: config.balancing.map(change), ..config };
+        let mut pack = FaultyPack::simulated(config, settings(), Wiring::single(), "");
+        pack.sim = pack.sim.with_balancing_bits();
+        pack.run_to(0.01);
+        // The daemon stops in the drive and starts after the vehicle was parked for nine hours.
+        let stored = pack.monitor.snapshot();
+        while pack.sim.advance().unwrap().time < Timestamp::from_secs(9.0 * 3600.0) {}
+        pack.monitor = Monitor::new(pack.config.clone());
+        pack.monitor.restore(stored, Downtime::AsStamped).unwrap();
+        pack.run_to(0.45);
+        let stds = (0..CELLS).map(|cell| pack.monitor.difference(CellIndex(cell)).unwrap().state(LEAK).std());
+        stds.sum::<f64>() / f64::from(CELLS)
+    };
+    let (bled, never) = (leak_std(0.0026), leak_std(1e-9));
+    assert!(bled > 1.2 * never, "{bled} {never}");
 }
 
 #[test]

@@ -138,6 +138,12 @@ struct Daemon<'a> {
 }
 
 impl<'a> Daemon<'a> {
+    /// With a listener from the beginning.
+    fn with_listener(config: &'a Config, seed: u64) -> Self {
+        let listener = TimedListener::new(config.output_layout.as_ref().unwrap());
+        Self { listener: Some(listener), ..Self::new(config, seed) }
+    }
+
     fn new(config: &'a Config, seed: u64) -> Self {
         let monitor = Monitor::new(config.monitor.clone());
         Self {
@@ -325,9 +331,7 @@ fn a_listener_that_loses_a_tenth_of_the_frames_has_the_table_after_two_cycles() 
 #[test]
 fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
     let config = load();
-    let database = config.output_layout.clone().unwrap();
-    let mut daemon = Daemon::new(&config, 1);
-    daemon.listener = Some(TimedListener::new(&database));
+    let mut daemon = Daemon::with_listener(&config, 1);
     daemon.temperature_c = Some(55.0);
     daemon.run_for(3_000);
     let raised = daemon.listener.as_mut().unwrap().table(daemon.now_ms);
@@ -345,9 +349,7 @@ fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
 #[test]
 fn a_right_table_is_not_confirmed_once_the_digest_has_stopped_for_its_time_out() {
     let config = load();
-    let database = config.output_layout.clone().unwrap();
-    let mut daemon = Daemon::new(&config, 2);
-    daemon.listener = Some(TimedListener::new(&database));
+    let mut daemon = Daemon::with_listener(&config, 2);
     let timeout_ms = daemon.listener.as_ref().unwrap().timeout_ms;
     let manual = include_str!("../../docs/src/ecu/contract.md");
     let row = manual.lines().find(|line| line.starts_with("| `PACKWATCH_Digest` |")).unwrap();
@@ -380,9 +382,7 @@ fn a_right_table_is_not_confirmed_once_the_digest_has_stopped_for_its_time_out()
 #[test]
 fn a_listener_that_never_received_a_digest_confirms_no_table() {
     let config = load();
-    let database = config.output_layout.clone().unwrap();
-    let mut daemon = Daemon::new(&config, 3);
-    daemon.listener = Some(TimedListener::new(&database));
+    let mut daemon = Daemon::with_listener(&config, 3);
     daemon.is_digest_lost = true;
     daemon.run_for(8_000);
     let now_ms = daemon.now_ms;

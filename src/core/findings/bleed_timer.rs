@@ -72,12 +72,23 @@ impl BleedTimer {
     /// Takes a bit that holds until another time, or the next bit; `None` = it cannot be read.
     pub(super) fn take(&mut self, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         self.count(time);
+        self.counted_until.get_or_insert(time);
         self.has_bits |= is_bled.is_some();
         self.bit = Some(Bit { is_bled, holds_until });
     }
 
-    /// Counts the time up to `now`.
+    /// Takes that nothing was received from a time to another: the daemon did not run.
+    pub(super) fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
+        if self.has_bits {
+            self.take(from, None, to);
+        }
+    }
+
+    /// Counts the time up to `now`; nothing before the first bit.
     fn count(&mut self, now: Timestamp) {
+        if !self.has_bits && self.bit.is_none() {
+            return;
+        }
         let from = *self.counted_until.get_or_insert(now);
         let held_until = self.bit.map_or(from, |bit| bit.holds_until).max(from).min(now);
         let held_s = held_until.since(from).max(0.0);
@@ -170,11 +181,11 @@ mod tests {
     fn nothing_is_known_behind_the_time_for_which_a_bit_holds_and_of_one_that_cannot_be_read() {
         let mut timer = BleedTimer::default();
         timer.begin_row(at(0.0));
-        assert_near(timer.end_row(at(50.0)), BleedTime { silent_s: 25.0, ..bled(0.0) });
-        assert!(!timer.has_bits, "none came");
+        assert_near(timer.end_row(at(50.0)), bled(0.0));
+        assert_eq!(timer, BleedTimer::default(), "none came");
         take(&mut timer, 50.0, true);
         timer.begin_row(at(110.0));
-        assert_near(timer.end_row(at(110.0)), BleedTime { silent_s: 75.0, ..bled(10.0) });
+        assert_near(timer.end_row(at(110.0)), BleedTime { silent_s: 50.0, ..bled(10.0) });
         take(&mut timer, 90.0, true);
         assert_near(timer.end_row(at(110.0)), bled(0.0));
         take(&mut timer, 110.0, None);

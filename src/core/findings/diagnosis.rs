@@ -5,12 +5,13 @@
 
 mod balancing;
 mod judge;
+mod jumps;
 
 use serde::{Deserialize, Serialize};
 
 use super::bleed_timer::BalancingConfig;
 use super::channels::{Channel, compare};
-use super::difference::{CHANNEL, CONTACT, Difference, Jump, LEAK, Observation, RESISTANCE, SOC, STATES};
+use super::difference::{CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
 use super::finding::{Finding, FindingKind};
 use super::gain::{Gain, Learned};
 use super::row::{CellSums, PackSums};
@@ -50,10 +51,6 @@ const LEAST_STEPS: f64 = 0.02;
 const OFF_DROP: f64 = 0.1;
 /// Most that the mean cell's SOC may differ from what the charge says between two rows.
 const SOC_JUMP: f64 = 0.02;
-/// Rows of which the jumps of several cells are one event.
-const SAME_EVENT_S: f64 = 1800.0;
-/// Deviation within which exchanged channels explain each other, V.
-const SWAP_V: f64 = 0.008;
 /// SOC at which a BMS bleeds: near the end of a charge.
 const BLED_SOC: f64 = 0.9;
 const DAY_S: f64 = 86_400.0;
@@ -86,7 +83,7 @@ struct Watched {
     before_jump: [f64; STATES],
     sums: CellSums,
     channel: Channel,
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Bleed::is_unused")]
     bleed: Bleed,
     temperature: Following,
     /// Since when each kind is likelier than not.
@@ -354,32 +351,6 @@ impl Diagnosis {
         true
     }
 
-    /// Cells have changed at once: two have been exchanged, some side by side replaced, or each by itself.
-    fn handle_jumps(
-        &mut self,
-        time: Timestamp,
-        row: &Row<'_>,
-        jumped: &[(usize, Observation)],
-        difference_v: impl Fn(usize) -> Option<f64>,
-    ) {
-        if jumped.is_empty() {
-            return;
-        }
-        let is_recent = |cell: &Watched| cell.jumped.is_some_and(|at| time.since(at) <= SAME_EVENT_S);
-        let recent: Vec<usize> = (0..self.cells.len()).filter(|&cell| is_recent(&self.cells[cell])).collect();
-        if let [a, b] = recent[..]
-            && let (Some(a_v), Some(b_v)) = (difference_v(a), difference_v(b))
-            && self.exchange_if_swapped(time, row, [a, b], [a_v, b_v])
-        {
-            return;
-        }
-        for (index, observed) in jumped {
-            let has_neighbour = recent.iter().any(|other| other.abs_diff(*index) == 1);
-            let jump = if has_neighbour && 2 * recent.len() <= self.cells.len() { Jump::Replaced } else { Jump::Alone };
-            self.cells[*index].difference.open(jump, observed);
-        }
-    }
-
     /// Compares the series resistances that the steps of the current show.
     fn observe_steps(&mut self, row: &Row<'_>) {
         let least_a2 = LEAST_STEPS * row.capacity_ah * row.capacity_ah;
@@ -402,40 +373,6 @@ impl Diagnosis {
             let variance = (part * part + noise * noise).max(scatter_ohm * scatter_ohm);
             cell.difference.observe_steps(&Observation { innovation: innovation_ohm(cell, ohm), slope, variance });
         }
-    }
-
-    /// Exchanges what is known of two cells whose voltages have become each other's; whether they are.
-    fn exchange_if_swapped(
-        &mut self,
-        time: Timestamp,
-        row: &Row<'_>,
-        [a, b]: [usize; 2],
-        differences_v: [f64; 2],
-    ) -> bool {
-        let [of_a, of_b] = [self.cells[a].before_jump, self.cells[b].before_jump];
-        let off = |means: &[f64; STATES], difference_v: f64| row.observation(means, difference_v).innovation.abs();
-        let as_before = off(&of_a, differences_v[0]).min(off(&of_b, differences_v[1]));
-        let exchanged = off(&of_b, differences_v[0]).max(off(&of_a, differences_v[1]));
-        if exchanged > SWAP_V || exchanged > 0.5 * as_before {
-            return false;
-        }
-        let (low, high) = self.cells.split_at_mut(b);
-        std::mem::swap(&mut low[a].difference, &mut high[0].difference);
-        low[a].difference.settle(&of_b);
-        high[0].difference.settle(&of_a);
-        let cells = Some((CellIndex(a as u16), CellIndex(b as u16)));
-        let is_same = |found: &Finding| found.kind == FindingKind::SwappedChannels && found.cells == cells;
-        if self.findings.iter().any(is_same) {
-            self.findings.retain(|found| !is_same(found));
-        } else {
-            let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-            let kind = FindingKind::SwappedChannels;
-            self.insert(Finding { kind, cells, since: time, reported: time, probability: 1.0, size });
-        }
-        for cell in [a, b] {
-            self.cells[cell].jumped = None;
-        }
-        true
     }
 
     fn choose_middle(&mut self, socs: impl Fn(usize) -> Option<f64>) {

@@ -50,12 +50,13 @@ impl Diagnosing {
         self.diagnosis.is_active().then(|| self.diagnosis.clone())
     }
 
-    /// Continues from a checked state. `is_continued`: without a break.
-    pub(super) fn restore(&mut self, stored: Option<Diagnosis>, is_continued: bool) {
+    /// Continues from a checked state. `away`: from when to when the daemon did not run; `None` = it continues without a break.
+    pub(super) fn restore(&mut self, stored: Option<Diagnosis>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored else { return };
         self.diagnosis = stored;
-        if !is_continued {
+        if let Some((from, to)) = away {
             self.diagnosis.interrupt();
+            self.diagnosis.note_unheard(from, to);
         }
     }
 

@@ -271,7 +271,7 @@ impl Stages {
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
         let batch = CellBatch::restore(has_reported, snapshot.waiting);
         self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
-        self.diagnosing.restore(snapshot.diagnosis, is_continued);
+        self.diagnosing.restore(snapshot.diagnosis, (!is_continued).then_some((snapshot.time, now)));
         self.note_faulty_channels();
         // Its shape is checked in `Monitor::restore`.
         self.sampling.sampler.restore(snapshot.sampler);
@@ -337,7 +337,7 @@ impl Stages {
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
-        self.diagnosing.restore(pack.diagnosis, false);
+        self.diagnosing.restore(pack.diagnosis, Some((now, now)));
         self.diagnosing.diagnosis.forget_charge();
         self.note_faulty_channels();
         let capacity = self.learning.weakest_capacity();

@@ -10,8 +10,8 @@ use crate::quantity::{InvalidState, Timestamp};
 const BLEED_PART: f64 = 0.2;
 /// Mean square of the part of an unseen time for which a cell was bled longer than the middle cells: uniform between -1 and 1.
 const UNSEEN_MEAN_SQUARE: f64 = 1.0 / 3.0;
-/// Most that a cell loses unseen beside the others, SOC: a BMS bleeds it down to the lowest.
-const MOST_UNSEEN: f64 = 0.1;
+/// Most that a cell loses beside the others before it is like them, SOC: a BMS bleeds it down to the lowest.
+const MOST_BESIDE: f64 = 0.1;
 
 /// Errors that lie to one side for as long as something lasts: their sum, not their squares, grows.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -21,13 +21,15 @@ struct Lasting {
 }
 
 impl Lasting {
-    /// What one more row adds to the square of the sum; nothing in a row ends it.
+    /// What one more row adds to the square of the sum, which is bounded; nothing in a row ends it.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
+        let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
+        let sum = before + part;
         if part != 0.0 {
-            self.sum = before + part;
+            self.sum = sum.clamp(-MOST_BESIDE, MOST_BESIDE);
         }
-        (self.sum * self.sum - before * before).max(0.0)
+        (sum * sum - before * before).max(0.0)
     }
 }
 
@@ -43,6 +45,11 @@ pub(super) struct Bleed {
 }
 
 impl Bleed {
+    /// Whether no bit has come so far.
+    pub(super) fn is_unused(&self) -> bool {
+        *self == Self::default()
+    }
+
     /// The time so far does not count.
     pub(super) fn forget_time(&mut self) {
         self.timer.forget_time();
@@ -70,6 +77,11 @@ impl Diagnosis {
         }
     }
 
+    /// Takes that no bit was received from a time to another, because the daemon did not run.
+    pub fn note_unheard(&mut self, from: Timestamp, to: Timestamp) {
+        self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_unheard(from, to));
+    }
+
     /// Removes the charge that was bled since the last row from each cell's difference, less that of the middle cells. `balancing`:
     /// `None` forgets all bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
@@ -89,9 +101,8 @@ impl Diagnosis {
                 true => time.unknown_s + silent_s,
                 false => middle_s,
             };
-            let unseen = (soc_per_s * unseen_s).min(MOST_UNSEEN);
             let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
-                + UNSEEN_MEAN_SQUARE * cell.bleed.unseen.add(unseen).min(MOST_UNSEEN * MOST_UNSEEN);
+                + UNSEEN_MEAN_SQUARE * cell.bleed.unseen.add(soc_per_s * unseen_s);
             cell.difference.remove_charge(soc, variance);
         }
     }
@@ -109,10 +120,74 @@ impl Diagnosis {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::findings::difference::SOC;
+
+    const BALANCING: BalancingConfig = BalancingConfig { bleed_a: 0.06, max_age_s: 10.0, is_only_while_sent: true };
+    const HOUR: f64 = 3600.0;
+
+    fn at(seconds: f64) -> Timestamp {
+        Timestamp::from_secs(seconds)
+    }
+
+    /// Three cells of 60 Ah with a bit of 0 at the beginning.
+    fn diagnosis() -> Diagnosis {
+        let mut diagnosis = Diagnosis::new(3);
+        (0..3).for_each(|cell| diagnosis.handle_balancing(cell, at(0.0), Some(false), at(10.0)));
+        diagnosis
+    }
+
+    /// Deviation that a cell's SOC has got by what may have been bled.
+    fn lost_std(diagnosis: &mut Diagnosis, end_s: f64, balancing: BalancingConfig) -> f64 {
+        let variance = |diagnosis: &Diagnosis| diagnosis.cells[0].difference.state(SOC).variance;
+        let before = variance(diagnosis);
+        diagnosis.cells.iter_mut().for_each(|cell| cell.bleed.timer.begin_row(at(end_s)));
+        diagnosis.remove_bled_charge(at(end_s), 60.0, Some(balancing));
+        (variance(diagnosis) - before).sqrt()
+    }
+
+    #[test]
+    fn a_time_without_bits_is_unknown_unless_the_bms_bleeds_only_while_it_sends_and_the_daemon_ran() {
+        // A thousandth of the capacity an hour.
+        let unknown = 0.008 / 3.0_f64.sqrt();
+        let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
+        let near = |a: f64, b: f64| (a - b).abs() < 0.01 * unknown;
+        assert!(near(lost_std(&mut diagnosis(), 8.0 * HOUR, BALANCING), 0.0));
+        assert!(near(lost_std(&mut diagnosis(), 8.0 * HOUR, silent), unknown));
+        let mut stopped = diagnosis();
+        stopped.note_unheard(at(10.0), at(8.0 * HOUR));
+        assert!(near(lost_std(&mut stopped, 8.0 * HOUR, BALANCING), unknown));
+    }
+
+    #[test]
+    fn what_was_bled_is_taken_out_and_known_within_a_fifth() {
+        let mut bled = diagnosis();
+        bled.handle_balancing(0, at(10.0), Some(true), at(10.0 + 10.0 * HOUR));
+        let std = lost_std(&mut bled, 10.0 + 10.0 * HOUR, BALANCING);
+        let soc = bled.cells[0].difference.state(SOC).mean;
+        assert!((soc + 0.01).abs() < 1e-9 && (std - 0.2 * 0.01).abs() < 1e-9, "{soc} {std}");
+        assert_eq!(bled.cells[1].difference.state(SOC).mean, 0.0);
+    }
+
+    #[test]
+    fn what_was_lost_unseen_in_a_year_is_bounded_and_what_is_learned_stays() {
+        let mut year = diagnosis();
+        let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
+        let std = lost_std(&mut year, 8760.0 * HOUR, silent);
+        assert!((std - MOST_BESIDE / 3.0_f64.sqrt()).abs() < 1e-6, "{std}");
+        for row in 1..100 {
+            lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
+        }
+        assert!(year.check(3).is_ok());
+    }
 
     #[test]
     fn errors_to_one_side_add_up_until_nothing_is_added() {
         let mut lasting = Lasting::default();
-        assert_eq!([1.0, 1.0, -1.0, 0.0, 2.0].map(|part| lasting.add(part)), [1.0, 3.0, 0.0, 0.0, 4.0]);
+        let added = [0.01, 0.01, -0.01, 0.0, 0.02].map(|part| lasting.add(part));
+        assert!(added.iter().zip([1.0, 3.0, 0.0, 0.0, 4.0]).all(|(a, b)| (a - 1e-4 * b).abs() < 1e-12), "{added:?}");
+        for _ in 0..1000 {
+            lasting.add(0.02);
+        }
+        assert_eq!(lasting.sum, MOST_BESIDE);
     }
 }

@@ -174,7 +174,7 @@ signal_section! {
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
         /// Longest time for which a value holds. Must be longer than the period at which the BMS sends it, also while the vehicle is parked: the rest of a longer period counts as one without values.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
-        /// Whether the BMS bleeds no cell while it sends no values. `false`: nothing is known of that time, and leaks are learned from the rest alone.
+        /// Whether the BMS bleeds no cell while no values come. Only where it sends them for as long as it balances, and this computer is awake for as long. `false`: nothing is known of that time, and leaks are learned from the rest alone. The time for which the program does not run is unknown in any case.
         only_while_sent: bool, "", Any, Default("false") =>;
     }
 }
