@@ -279,7 +279,13 @@ fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
     }
     match &verdict.broken {
         None if args.json => Ok(()),
-        None => print(&format!("{} rows, none changed; the hash of the last is {}\n", verdict.rows, verdict.head)),
+        None => {
+            let thinned = match verdict.thinned_rows {
+                0 => String::new(),
+                rows => format!(" {rows} of them thinned out,"),
+            };
+            print(&format!("{} rows,{thinned} none changed; the hash of the last is {}\n", verdict.rows, verdict.head))
+        }
         Some(broken) => {
             let place = if broken.table.is_empty() { String::new() } else { format!(" ({})", broken.table) };
             Err(Failure::new(format!(

@@ -14,6 +14,7 @@
 mod backlog;
 mod carve;
 mod chain;
+mod chain_retention;
 pub mod commit_barrier;
 mod database;
 mod delta_encoder;
@@ -150,7 +151,7 @@ impl Store {
         let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(daemon_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
-        let mut folder = Folder::new(path.clone(), config.max_half_cycles);
+        let mut folder = Folder::new(path.clone(), config.into());
         match folder.lock() {
             Ok(()) => {}
             Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {

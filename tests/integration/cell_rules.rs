@@ -366,7 +366,8 @@ fn what_may_have_been_bled_is_no_leak() {
 #[test]
 fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
     let leak_std = |bleed_a: f64| {
-        let keys = "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nonly_while_sent = true\n[output]\n";
+        let keys =
+            "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nonly_while_sent = true\n[output]\n";
         let change = |it: BalancingConfig| BalancingConfig { bleed_a, ..it };
         let config = load(&PACK.replace("[output]\n", keys), "Temperature");
         let config = MonitorConfig { balancing: config.balancing.map(change), ..config };

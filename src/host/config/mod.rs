@@ -137,9 +137,6 @@ impl Config {
     }
 }
 
-/// Half-cycles kept where no configuration says otherwise.
-pub const DEFAULT_MAX_HALF_CYCLES: u32 = 200_000;
-
 /// How state and history are kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoreConfig {
@@ -147,6 +144,8 @@ pub struct StoreConfig {
     pub checkpoint_s: f64,
     /// Half-cycles kept, one row per cell each; beyond, the oldest are thinned.
     pub max_half_cycles: u32,
+    /// Capacities, loss modes, remaining lives, alarms and resets kept; beyond, the oldest are thinned.
+    pub max_chained_rows: u32,
     /// Half-cycles older than this are deleted, years; `None` = whatever their age, they are kept.
     pub keep_years: Option<f64>,
 }

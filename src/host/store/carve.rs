@@ -22,7 +22,7 @@ use super::rows::HistoryTable;
 use super::schema::MIGRATIONS;
 
 /// Tables whose rows are collected.
-const TABLES: [&str; 7] = ["pack", "moment", "half_cycle", "capacity", "alarm", "reset", UNSURE];
+const TABLES: [&str; 8] = ["pack", "moment", "half_cycle", "capacity", "alarm", "reset", "thinned", UNSURE];
 /// Rows of one of the two tables of equal columns, until their hash has shown which.
 const UNSURE: &str = "unsure";
 /// Those tables.
@@ -137,6 +137,8 @@ impl<'a> TableTarget<'a> {
 /// Moves the rows of [`UNSURE`] to the table that their hash shows; returns the number of those that no hash shows.
 fn resolve_unsure(connection: &Connection) -> rusqlite::Result<usize> {
     let links = ["capacity", "alarm", "reset", UNSURE].map(|table| format!("SELECT hash FROM {table} WHERE seq = ?1"));
+    let thinned = "SELECT hash FROM thinned WHERE last = ?1".to_owned();
+    let links: Vec<String> = links.into_iter().chain([thinned]).collect();
     let mut before = connection.prepare(&links.join(" UNION ALL "))?;
     let mut rows = connection.prepare(&format!(
         "SELECT r.hash, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, r.cell, a, b, c, d, e, f, r.seq \

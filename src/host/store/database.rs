@@ -11,10 +11,11 @@ use std::time::{Duration, Instant};
 use rusqlite::{Connection, ErrorCode, MAIN_DB, OpenFlags, OptionalExtension, TransactionBehavior};
 
 use super::chain::hex;
+use super::chain_retention::ChainSweep;
 use super::document::StateDocument;
 use super::learned;
 use super::meta::{self, Meta};
-use super::retention;
+use super::retention::{self, RowLimits};
 use super::row_sql::write_batch;
 use super::rows::{HistoryRow, RowBatch};
 use super::schema::{self, MIGRATIONS};
@@ -97,7 +98,8 @@ pub(super) struct Database {
     connection: Connection,
     meta: Meta,
     copies: StateCopies,
-    max_half_cycles: i64,
+    limits: RowLimits,
+    sweep: ChainSweep,
     /// Half-cycles before this wall clock are deleted, ns since 1970; `None` = none.
     horizon_ns: Option<i64>,
 }
@@ -105,7 +107,7 @@ pub(super) struct Database {
 /// Rows in the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Counts {
-    /// Capacities, alarms and resets.
+    /// Capacities, loss modes, remaining lives, alarms and resets that were written.
     pub chained: i64,
     /// Half-cycles.
     pub half_cycles: i64,
@@ -115,14 +117,14 @@ pub(super) struct Counts {
 
 impl Database {
     /// Opens the file; creates it or brings its layout up to date where needed.
-    pub(super) fn open(path: &Path, now: &Stamp, max_half_cycles: u32) -> Result<Self, OpenError> {
-        Self::open_with(path, now, max_half_cycles, MIGRATIONS)
+    pub(super) fn open(path: &Path, now: &Stamp, limits: RowLimits) -> Result<Self, OpenError> {
+        Self::open_with(path, now, limits, MIGRATIONS)
     }
 
     pub(super) fn open_with(
         path: &Path,
         now: &Stamp,
-        max_half_cycles: u32,
+        limits: RowLimits,
         migrations: &[&str],
     ) -> Result<Self, OpenError> {
         let is_new = std::fs::metadata(path).map_or(true, |file| file.len() == 0);
@@ -156,7 +158,7 @@ impl Database {
         }
         // A damaged record is reported by [`Self::state`].
         let copies = StateCopies::read(&connection, known)?;
-        Ok(Self { connection, meta, copies, max_half_cycles: i64::from(max_half_cycles), horizon_ns: None })
+        Ok(Self { connection, meta, copies, limits, sweep: ChainSweep::default(), horizon_ns: None })
     }
 
     /// Rows so far.
@@ -190,8 +192,10 @@ impl Database {
         for batch in batches {
             write_batch(&transaction, &mut meta, batch)?;
         }
+        let mut sweep = self.sweep;
         if batches.is_empty() {
-            retention::thin(&transaction, &mut meta, self.max_half_cycles)?;
+            sweep.thin(&transaction, &mut meta, self.limits.chained_rows)?;
+            retention::thin(&transaction, &mut meta, self.limits.half_cycles)?;
             if let Some(horizon_ns) = self.horizon_ns {
                 retention::expire(&transaction, &mut meta, horizon_ns)?;
             }
@@ -209,7 +213,7 @@ impl Database {
             meta.write(&transaction)?;
         }
         transaction.commit()?;
-        self.meta = meta;
+        (self.meta, self.sweep) = (meta, sweep);
         written.into_iter().for_each(|written| self.copies.note_stored(written));
         Ok(())
     }

@@ -20,6 +20,7 @@ use std::time::{Duration, Instant};
 
 use super::database::{Database, OpenError};
 use super::document::StateDocument;
+use super::retention::RowLimits;
 use super::rows::{HistoryRow, RowBatch};
 use super::salvage;
 use super::stamp::Stamp;
@@ -53,7 +54,7 @@ pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which 
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
-    max_half_cycles: u32,
+    limits: RowLimits,
     /// Locked as long as this lives.
     lock: Option<File>,
     /// Damage of the database, which is to be replaced; `None` = no known damage.
@@ -88,8 +89,8 @@ impl fmt::Display for Folder {
 
 impl Folder {
     /// A folder that need not exist yet.
-    pub(super) fn new(path: PathBuf, max_half_cycles: u32) -> Self {
-        Self { path, max_half_cycles, lock: None, damaged: None, replaced: None }
+    pub(super) fn new(path: PathBuf, limits: RowLimits) -> Self {
+        Self { path, limits, lock: None, damaged: None, replaced: None }
     }
 
     /// Its path.
@@ -178,7 +179,7 @@ impl Folder {
     }
 
     fn fill(&self, part: &Path, why: &str, now: &Stamp) -> Result<(), OpenError> {
-        let mut database = Database::open(part, now, self.max_half_cycles)?;
+        let mut database = Database::open(part, now, self.limits)?;
         let saved = salvage::salvage(&self.path.join(DATABASE), &self.path.join(PAGES), &mut database)?;
         tracing::error!(
             error = why,
@@ -243,7 +244,7 @@ impl Folder {
         }
         // Before SQLite opens it and resets the log.
         let fault = wal::fault(&with_suffix(path, "-wal"));
-        let database = Database::open(path, now, self.max_half_cycles)?;
+        let database = Database::open(path, now, self.limits)?;
         let (mut rows, mut is_sound, mut state) = (Vec::new(), !was_emptied, None);
         let mut is_unreadable = false;
         let mut report = |reason: &'static str, why: String| {

@@ -4,6 +4,7 @@ use rusqlite::{Connection, OptionalExtension, params};
 
 use super::chain::{ChainHead, Hash};
 use super::rows::HistoryTable;
+use super::schema::{self, VERSION_WITH_THINNED};
 use crate::config::VehicleIdentity;
 
 /// The vehicle that the history is of. A text that cannot be read states none.
@@ -31,16 +32,34 @@ pub(super) struct Meta {
     pub(super) thinned_to: i64,
     /// The pack that is connected.
     pub(super) pack: i64,
+    /// Chained rows that were thinned out: counted in the table `thinned`.
+    pub(super) chain_thinned: i64,
 }
 
 impl Meta {
+    /// Chained rows in the tables.
+    pub(super) const fn chained_rows(&self) -> i64 {
+        self.head.count - self.chain_thinned
+    }
+
     /// Reads it, with the number of the connected pack (0 = none yet).
     pub(super) fn read(connection: &Connection) -> rusqlite::Result<Self> {
         let pack = connection.query_row("SELECT coalesce(max(id), 0) FROM pack", [], |row| row.get(0))?;
+        let has_thinned = schema::version(connection)? >= VERSION_WITH_THINNED;
+        // A real number: damaged numbers do not overflow.
+        let sql = if has_thinned { "SELECT total(last - first + 1) FROM thinned" } else { "SELECT 0.0" };
+        let chain_thinned = connection.query_row(sql, [], |row| Ok(row.get::<_, f64>(0)? as i64))?;
         let sql = "SELECT chained, head, half_cycles, thinned, thinned_to FROM meta WHERE id = 1";
         connection.query_row(sql, [], |row| {
             let head = ChainHead { count: row.get(0)?, hash: row.get(1)? };
-            Ok(Self { head, half_cycles: row.get(2)?, thinned: row.get(3)?, thinned_to: row.get(4)?, pack })
+            Ok(Self {
+                head,
+                half_cycles: row.get(2)?,
+                thinned: row.get(3)?,
+                thinned_to: row.get(4)?,
+                pack,
+                chain_thinned,
+            })
         })
     }
 
@@ -50,6 +69,10 @@ impl Meta {
         let packs: i64 = connection.query_row("SELECT count(*) FROM pack", [], |row| row.get(0))?;
         if packs != self.pack {
             return Ok(Some(format!("{packs} packs, the last of number {}", self.pack)));
+        }
+        if !(0..=self.head.count).contains(&self.chain_thinned) {
+            let Self { head, chain_thinned, .. } = self;
+            return Ok(Some(format!("{chain_thinned} of {} rows thinned out", head.count)));
         }
         let mut last: (i64, Hash) = (0, [0; 32]);
         for table in HistoryTable::CHAINED.into_iter().filter(|table| table.is_in(version)) {

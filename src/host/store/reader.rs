@@ -130,15 +130,7 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
-        let found = verify::hash_at(&self.connection, noted).map_err(|error| self.named(&error))?;
-        let NotedHead { rows, hash } = noted;
-        Ok(match found {
-            Some(found) if found == *hash => None,
-            Some(found) => {
-                Some(format!("row {rows} has the hash {found}, noted was {hash}: the history was written again"))
-            }
-            None => Some(format!("there is no row {rows}, which was noted: the history was written again or cut off")),
-        })
+        verify::contradiction(&self.connection, noted).map_err(|error| self.named(&error))
     }
 
     /// The stored snapshot; `None` = there is none, or it is damaged.

@@ -35,11 +35,11 @@ impl Recorder {
         if folder::has_history(path) {
             return Err(format!("{shown}: exists; a replay needs a state folder of its own, name a new one"));
         }
-        let mut folder = Folder::new(path.to_owned(), config.max_half_cycles);
+        let mut folder = Folder::new(path.to_owned(), config.into());
         folder.lock().map_err(|error| format!("{}: {error}", path.display()))?;
         let now = Stamp::replayed(Timestamp::ZERO);
-        let database = Database::open(&path.join(DATABASE), &now, config.max_half_cycles)
-            .map_err(|error| format!("{shown}: {error}"))?;
+        let database =
+            Database::open(&path.join(DATABASE), &now, config.into()).map_err(|error| format!("{shown}: {error}"))?;
         database.set_vehicle(vehicle).map_err(|error| format!("{shown}: {error}"))?;
         let (history_filter, checkpoint_s) = (HistoryFilter::default(), config.checkpoint_s);
         let keep_years = config.keep_years;

@@ -4,9 +4,9 @@ use std::path::Path;
 
 use super::database::is_damage;
 use super::folder::{self, DATABASE, Folder, OpenedDatabase};
+use super::retention::RowLimits;
 use super::rows::RowBatch;
 use super::stamp::{BootId, Stamp};
-use crate::config::DEFAULT_MAX_HALF_CYCLES;
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 
@@ -20,7 +20,7 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
     if !folder::has_history(path) {
         return Err(named("no daemon runs, and there is no history; name its folder with --state".to_owned()));
     }
-    let mut folder = Folder::new(path.to_owned(), DEFAULT_MAX_HALF_CYCLES);
+    let mut folder = Folder::new(path.to_owned(), RowLimits::NONE);
     folder.lock().map_err(|error| match error.kind() {
         std::io::ErrorKind::WouldBlock => named(
             "a daemon uses it but does not listen on the control socket; name its socket with --control".to_owned(),

@@ -1,16 +1,40 @@
-//! Bounds the history: beyond the configured number of half-cycles, every second transition of the older half is deleted,
+//! Bounds the half-cycles: beyond the configured number of half-cycles, every second transition of the older half is deleted,
 //! and beyond the configured age every transition, with its moment where no other row belongs to it.
 //!
-//! Deletes a little at each checkpoint, so that no commit is long. Capacities, alarms and resets are never thinned.
+//! Deletes a little at each checkpoint, so that no commit is long. `chain_retention` bounds the other rows.
 
 use rusqlite::{Connection, OptionalExtension, params};
 
 use super::meta::Meta;
 use super::rows::HistoryTable;
 use super::stamp::{BootId, SANE_WALL_NS};
+use crate::config::StoreConfig;
 
 /// Transitions deleted at one checkpoint for their number, and as many for their age: far more than one minute adds.
 const MAX_STEPS: usize = 4;
+
+/// Rows that are kept; beyond, the oldest are thinned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct RowLimits {
+    /// Half-cycles.
+    pub(super) half_cycles: i64,
+    /// Rows of the chained tables.
+    pub(super) chained_rows: i64,
+}
+
+impl RowLimits {
+    /// All are kept.
+    pub(super) const NONE: Self = Self { half_cycles: i64::MAX, chained_rows: i64::MAX };
+    /// Those of tests.
+    #[cfg(test)]
+    pub(super) const SMALL: Self = Self { half_cycles: 1000, chained_rows: 10_000 };
+}
+
+impl From<&StoreConfig> for RowLimits {
+    fn from(config: &StoreConfig) -> Self {
+        Self { half_cycles: config.max_half_cycles.into(), chained_rows: config.max_chained_rows.into() }
+    }
+}
 
 /// Deletes transitions beyond the limit, at most [`MAX_STEPS`].
 pub(super) fn thin(connection: &Connection, meta: &mut Meta, max_half_cycles: i64) -> rusqlite::Result<()> {
@@ -72,7 +96,12 @@ fn next_transition(connection: &Connection, after: i64) -> rusqlite::Result<Opti
     connection.query_row("SELECT min(moment) FROM half_cycle WHERE moment > ?1", [after], |row| row.get(0))
 }
 
-fn thin_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
+/// Deletes a moment to which no row belongs any more.
+pub(super) fn thin_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
+    let mut statement = connection.prepare_cached("SELECT 1 FROM half_cycle WHERE moment = ?1 LIMIT 1")?;
+    if statement.exists([moment])? {
+        return Ok(());
+    }
     for table in HistoryTable::CHAINED {
         if has_row(connection, table, moment)? {
             return Ok(());

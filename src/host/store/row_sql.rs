@@ -6,6 +6,7 @@ use rusqlite::{Connection, OptionalExtension, Transaction, params};
 use super::chain::Hash;
 use super::meta::Meta;
 use super::rows::{HistoryTable, RowBatch};
+use super::schema;
 use super::stamp::Stamp;
 use super::state_slots;
 
@@ -101,7 +102,8 @@ fn replace_pack(connection: &Connection, meta: &mut Meta, stamp: &Stamp) -> rusq
     connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns]).map(drop)
 }
 
-/// The hash of row `seq` of the chain in a database of layout `version`; zeros before the first; `None` = the row is missing.
+/// The hash of row `seq` of the chain in a database of layout `version`; zeros before the first. `None` = the row is missing, or
+/// was thinned out together with the next one.
 pub(super) fn hash_of(connection: &Connection, seq: i64, version: i32) -> rusqlite::Result<Option<Hash>> {
     if seq == 0 {
         return Ok(Some([0; 32]));
@@ -113,5 +115,9 @@ pub(super) fn hash_of(connection: &Connection, seq: i64, version: i32) -> rusqli
             return Ok(hash);
         }
     }
-    Ok(None)
+    if version < schema::VERSION_WITH_THINNED {
+        return Ok(None);
+    }
+    let mut thinned = connection.prepare_cached("SELECT hash FROM thinned WHERE last = ?1")?;
+    thinned.query_row([seq], |row| row.get(0)).optional()
 }

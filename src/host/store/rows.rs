@@ -38,15 +38,15 @@ pub(super) struct RowBatch {
 pub enum HistoryTable {
     /// Charges and discharges; the oldest are thinned.
     HalfCycle,
-    /// Learned capacities; chained, never thinned.
+    /// Learned capacities; chained.
     Capacity,
-    /// Lithium and active material that cells have lost; chained, never thinned.
+    /// Lithium and active material that cells have lost; chained.
     LossModes,
-    /// Remaining life of the cell whose life ends first; chained, never thinned.
+    /// Remaining life of the cell whose life ends first; chained.
     RemainingLife,
-    /// Alarms; chained, never thinned.
+    /// Alarms; chained.
     Alarm,
-    /// Resets, other packs, damages; chained, never thinned.
+    /// Resets, other packs, damages; chained.
     Reset,
 }
 

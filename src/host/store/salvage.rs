@@ -12,7 +12,7 @@ use std::fmt;
 use std::path::Path;
 
 use rusqlite::types::Value;
-use rusqlite::{Connection, Row, params};
+use rusqlite::{Connection, OptionalExtension, Row, params};
 
 use super::carve::{Carved, carve};
 use super::chain::{self, Hash};
@@ -78,7 +78,8 @@ pub(super) fn salvage(damaged: &Path, pages: &Path, database: &mut Database) -> 
     let (connection, meta) = database.parts_mut();
     let saved = SalvageReport { state, refused: lost, ..SalvageReport::default() };
     let count = i64::try_from(packs.len()).unwrap_or(1).max(1);
-    let mut copier = Copier { connection, meta, moment: None, before: Some((0, [0; 32])), packs: count, saved };
+    let mut copier =
+        Copier { old: &old, connection, meta, moment: None, before: Some((0, [0; 32])), packs: count, saved };
     let mut sources = HistoryTable::ALL.map(TableSource::new);
     connection.execute_batch("BEGIN IMMEDIATE")?;
     let mut rows = 0_usize;
@@ -206,6 +207,8 @@ fn next(old: &Connection, sources: &mut [TableSource]) -> rusqlite::Result<Optio
 
 /// Writes the new file.
 struct Copier<'a> {
+    /// The rows that were found.
+    old: &'a Connection,
     connection: &'a Connection,
     meta: &'a mut Meta,
     /// The last moment: its number in the old file, its values in the new one.
@@ -219,7 +222,7 @@ struct Copier<'a> {
 
 impl Copier<'_> {
     fn copy_checked(&mut self, table: HistoryTable, row: &SalvagedRow) -> rusqlite::Result<()> {
-        match self.check(table, row) {
+        match self.check(table, row)? {
             Some(is_verified) if self.copy(table, row, is_verified)? => self.saved.count(table),
             _ => self.saved.refused += 1,
         }
@@ -228,21 +231,29 @@ impl Copier<'_> {
 
     /// Whether the row's hash is good, or not to be checked: it has none, or the row before it is lost. `None` = the damage has
     /// changed the row.
-    fn check(&mut self, table: HistoryTable, row: &SalvagedRow) -> Option<bool> {
+    fn check(&mut self, table: HistoryTable, row: &SalvagedRow) -> rusqlite::Result<Option<bool>> {
         if table == HistoryTable::HalfCycle {
-            return Some(false);
+            return Ok(Some(false));
         }
-        let (seq, hash) = (row.key.0, row.hash?);
+        let Some(hash) = row.hash else { return Ok(None) };
+        let seq = row.key.0;
+        let chained: Vec<Value> = row.moment.iter().chain(&row.values).cloned().collect();
+        let is_linked = |before: &Hash| chain::link(before, table, seq, &chained) == hash;
         let is_verified = match self.before {
-            Some((before, _)) if seq <= before => return None,
-            Some((before, before_hash)) if seq - 1 == before => {
-                let chained: Vec<Value> = row.moment.iter().chain(&row.values).cloned().collect();
-                (chain::link(&before_hash, table, seq, &chained) == hash).then_some(true)
-            }
-            _ => Some(false),
+            Some((before, _)) if seq <= before => return Ok(None),
+            Some((before, before_hash)) if seq - 1 == before => is_linked(&before_hash).then_some(true),
+            // The hash of a row that was thinned out may be damaged itself.
+            _ => Some(self.thinned_hash(seq - 1)?.is_some_and(|before_hash| is_linked(&before_hash))),
         };
         self.before = Some((seq, hash));
-        is_verified
+        Ok(is_verified)
+    }
+
+    /// The hash of the last row of a run that was thinned out.
+    fn thinned_hash(&self, seq: i64) -> rusqlite::Result<Option<Hash>> {
+        let mut statement =
+            self.old.prepare_cached("SELECT hash FROM thinned WHERE last = ?1 AND length(hash) = 32")?;
+        statement.query_row([seq], |row| row.get(0)).optional()
     }
 
     /// Copies a row with its moment; `false` = the moment is lost, or the row breaks a rule of the layout.

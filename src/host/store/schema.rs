@@ -5,7 +5,8 @@
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | always |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
-//! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
+//! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | the oldest thinned |
+//! | `thinned` | a run of chained rows that were thinned out, with the hash of the last | always |
 //! | `state`, `state_b` | the core's state, two copies written in turn: slot 0 in full, slot 1 the changes since | the latest two |
 //! | `meta` | one row: the chain's end, counts, the vehicle, the layout's version | |
 //!
@@ -18,12 +19,14 @@ use rusqlite::{Connection, OptionalExtension, TransactionBehavior};
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// The statements that lead to each version from the one before; the first starts from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6];
 
 /// The first version that names the vehicle.
 pub(super) const VERSION_WITH_VEHICLE: i32 = 4;
 /// The first version with two copies of the state.
 pub(super) const VERSION_WITH_COPIES: i32 = 5;
+/// The first version whose chained rows may be thinned out.
+pub(super) const VERSION_WITH_THINNED: i32 = 6;
 /// The first version that `meta` states.
 const VERSION_WITH_LAYOUT: i32 = 5;
 
@@ -156,6 +159,15 @@ CREATE TABLE state_b (
     bytes BLOB NOT NULL
 ) STRICT;
 ALTER TABLE meta ADD COLUMN layout INTEGER;
+";
+
+/// Chained rows that were thinned out.
+const VERSION_6: &str = "
+CREATE TABLE thinned (
+    last INTEGER PRIMARY KEY,
+    first INTEGER NOT NULL,
+    hash BLOB NOT NULL
+) STRICT;
 ";
 
 /// The version of an open database; 0 = an empty file.

@@ -4,6 +4,7 @@ mod flips;
 mod healing;
 mod rounding;
 
+use super::retention::RowLimits;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -97,7 +98,7 @@ fn the_database_holds_the_state_in_which_the_replay_ended() {
     let state = folder.path().join("state");
     let end = snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
     let now = Stamp::replayed(end.time.plus_secs(60.0));
-    let database = Database::open(&state.join(DATABASE), &now, 1000).unwrap();
+    let database = Database::open(&state.join(DATABASE), &now, RowLimits::SMALL).unwrap();
     let counts = database.counts();
     assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
     let stored = StateDocument::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
@@ -317,7 +318,7 @@ fn a_state_of_another_version_is_reported_and_not_overwritten() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let now = document(1, 1, 1).stamp;
-    let mut database = Database::open(&path, &now, 1000).unwrap();
+    let mut database = Database::open(&path, &now, RowLimits::SMALL).unwrap();
     let parts = JsonParts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
     database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
     drop(database);
@@ -326,7 +327,7 @@ fn a_state_of_another_version_is_reported_and_not_overwritten() {
     assert!(!found.works && found.states.is_empty());
     store.unwrap().finish(&at(1.0), Timestamp::from_secs(1.0));
     assert_eq!(reasons(place.path()), ["state_unfit"]);
-    let database = Database::open(&path, &now, 1000).unwrap();
+    let database = Database::open(&path, &now, RowLimits::SMALL).unwrap();
     let kept = "SELECT count(*) FROM state WHERE slot IN (0, 10)";
     assert_eq!(database.connection().query_row(kept, [], |row| row.get::<_, i64>(0)).unwrap(), 2);
 }

@@ -1,4 +1,5 @@
-//! Checks the hash chain of the history, row by row, up to the first row that was changed.
+//! Checks the hash chain of the history, row by row, up to the first row that was changed. Of rows that were thinned out the table
+//! `thinned` has the hash that the next row carries on.
 
 use std::str::FromStr;
 
@@ -10,7 +11,7 @@ use super::chain::{Hash, hex, link};
 use super::meta::Meta;
 use super::row_sql::{MOMENT_COLUMNS, hash_of, rows_sql};
 use super::rows::HistoryTable;
-use super::schema;
+use super::schema::{self, VERSION_WITH_THINNED};
 
 /// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -19,6 +20,8 @@ pub struct ChainReport {
     pub good_rows: i64,
     /// Rows that were written.
     pub rows: i64,
+    /// Those of them that were thinned out since, up to the first row that is not good.
+    pub thinned_rows: i64,
     /// Hash of the last row, to be noted elsewhere.
     pub head: String,
     /// The first row that was changed; `None` = no row was.
@@ -60,9 +63,32 @@ impl FromStr for NotedHead {
     }
 }
 
-/// The hash of the row at which the chain ended when `noted` was written; `None` = there is no such row.
-pub(super) fn hash_at(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
-    Ok(hash_of(connection, noted.rows, schema::version(connection)?)?.map(|hash| hex(&hash)))
+/// What contradicts the chain's end as it was noted; `None` = nothing.
+pub(super) fn contradiction(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
+    let version = schema::version(connection)?;
+    let NotedHead { rows, hash } = noted;
+    if let Some(found) = hash_of(connection, *rows, version)?.map(|hash| hex(&hash)) {
+        return Ok((found != *hash)
+            .then(|| format!("row {rows} has the hash {found}, noted was {hash}: the history was written again")));
+    }
+    let is_thinned = version >= VERSION_WITH_THINNED
+        && connection.query_row(
+            "SELECT min(first) FROM (SELECT first FROM thinned WHERE last > ?1 ORDER BY last LIMIT 1)",
+            [rows],
+            |row| Ok(row.get::<_, Option<i64>>(0)?.is_some_and(|first| first <= *rows)),
+        )?;
+    Ok(Some(if is_thinned {
+        format!("row {rows}, which was noted, was thinned out since: it cannot be compared; note a newer end")
+    } else {
+        format!("there is no row {rows}, which was noted: the history was written again or cut off")
+    }))
+}
+
+/// Rows that were thinned out: those from `first` to `last`, the last of which had this hash.
+struct ThinnedRun {
+    first: i64,
+    last: i64,
+    hash: Vec<u8>,
 }
 
 /// A row of the chain as it is stored.
@@ -90,26 +116,47 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
         })?;
         tables.push((*table, rows.peekable()));
     }
+    let no_runs = version < VERSION_WITH_THINNED;
+    let sql = if no_runs { "SELECT 0, 0, 0 WHERE 0" } else { "SELECT first, last, hash FROM thinned ORDER BY last" };
+    let mut runs = connection.prepare(sql)?;
+    let runs = runs.query_map([], |row| Ok(ThinnedRun { first: row.get(0)?, last: row.get(1)?, hash: row.get(2)? }))?;
+    let mut runs = runs.peekable();
     let mut before: Hash = [0; 32];
-    let mut seq = 0;
+    // The last row that is good or thinned out.
+    let (mut seq, mut thinned_rows) = (0, 0);
     let broken = loop {
-        seq += 1;
+        let continues = |run: &rusqlite::Result<ThinnedRun>| {
+            run.as_ref().map_or(true, |run| run.first == seq + 1 && (run.first..=meta.head.count).contains(&run.last))
+        };
+        if let Some(run) = runs.next_if(continues).transpose()? {
+            before = run.hash.try_into().unwrap_or_default();
+            thinned_rows += run.last - seq;
+            seq = run.last;
+            continue;
+        }
         let heads = tables.iter_mut().filter_map(|(table, rows)| {
             // A row that cannot be read comes first.
             let head = rows.peek()?.as_ref().map_or(i64::MIN, |row| row.seq);
             Some((head, *table, rows))
         });
         let Some((_, table, rows)) = heads.min_by_key(|(head, ..)| *head) else {
-            break judge_end(&meta, seq - 1, &before);
+            break judge_end(&meta, seq, &before).or(runs.next().transpose()?.map(|run| surplus(seq, &run)));
         };
         let Some(row) = rows.next().transpose()? else { break None };
-        match judge(table, seq, &row, &before) {
-            Ok(hash) => before = hash,
+        match judge(table, seq + 1, &row, &before) {
+            Ok(hash) => (before, seq) = (hash, seq + 1),
             Err(broken) => break Some(broken),
         }
     };
-    let good_rows = if broken.is_some() { (seq - 1).min(meta.head.count) } else { seq - 1 };
-    Ok(ChainReport { good_rows, rows: meta.head.count, head: hex(&meta.head.hash), broken })
+    let good_rows = if broken.is_some() { seq.min(meta.head.count) - thinned_rows } else { seq - thinned_rows };
+    Ok(ChainReport { good_rows, rows: meta.head.count, thinned_rows, head: hex(&meta.head.hash), broken })
+}
+
+/// A run of thinned rows whose place in the chain is taken.
+fn surplus(rows: i64, run: &ThinnedRun) -> BrokenRow {
+    let ThinnedRun { first, last, .. } = run;
+    let found = format!("rows {first} to {last} as thinned out");
+    BrokenRow { table: String::new(), row: *first, expected: format!("{rows} rows in their places"), found }
 }
 
 /// Returns the row's hash if it is row `seq` of the chain and unchanged.

@@ -28,7 +28,7 @@ fn state(numbers: &[f64]) -> StateRecord {
 }
 
 fn open(folder: &Path) -> Database {
-    Database::open(&folder.join(DATABASE), &stamp(0.0), 1000).unwrap()
+    Database::open(&folder.join(DATABASE), &stamp(0.0), RowLimits::SMALL).unwrap()
 }
 
 /// A history of every kind of row, with a state.
@@ -207,14 +207,15 @@ fn an_older_layout_is_migrated_with_its_rows() {
     drop(filled(folder.path()));
     let added = "CREATE TABLE added (id INTEGER PRIMARY KEY) STRICT; INSERT INTO added SELECT count(*) FROM alarm;";
     let migrations: Vec<&str> = MIGRATIONS.iter().copied().chain([added]).collect();
-    let database = Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap();
+    let database = Database::open_with(&path, &stamp(1.0), RowLimits::SMALL, &migrations).unwrap();
     assert_eq!(database.counts().chained, 200);
     assert_eq!(database.connection().query_row("SELECT id FROM added", [], |row| row.get::<_, i64>(0)).unwrap(), 40);
     drop(database);
     // Now it is a newer layout, which the present program must not touch.
     let before = std::fs::read(&path).unwrap();
-    let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
-    assert_eq!(newer, OpenError::Newer { found: 6, known: 5 });
+    let newer = Database::open(&path, &stamp(2.0), RowLimits::SMALL).unwrap_err();
+    let known = schema::known(MIGRATIONS);
+    assert_eq!(newer, OpenError::Newer { found: known + 1, known });
     assert_eq!(std::fs::read(&path).unwrap(), before);
 }
 
@@ -226,7 +227,7 @@ fn a_history_of_an_older_layout_is_read_and_continued() {
 fn continues_from_version(version: usize) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
-    let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..version]).unwrap();
+    let mut old = Database::open_with(&path, &stamp(1.0), RowLimits::SMALL, &MIGRATIONS[..version]).unwrap();
     let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(HistoryRow::Event).collect();
     old.commit(&[RowBatch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
     drop(old);
@@ -251,9 +252,10 @@ fn a_failed_migration_changes_nothing() {
     drop(filled(folder.path()));
     let migrations: Vec<&str> =
         MIGRATIONS.iter().copied().chain(["CREATE TABLE added (id); INSERT INTO nowhere VALUES (1);"]).collect();
-    Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap_err();
+    Database::open_with(&path, &stamp(1.0), RowLimits::SMALL, &migrations).unwrap_err();
     let database = open(folder.path());
-    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (5, 200));
+    let version = schema::version(database.connection()).unwrap();
+    assert_eq!((version, database.counts().chained), (schema::known(MIGRATIONS), 200));
 }
 
 #[test]
@@ -283,7 +285,7 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_copied() {
         let place = tempfile::tempdir().unwrap();
         drop(filled(place.path()));
         damage(&place.path().join(DATABASE), from, 3000);
-        let mut folder = Folder::new(place.path().to_owned(), 1000);
+        let mut folder = Folder::new(place.path().to_owned(), RowLimits::SMALL);
         let opening = folder.open(&stamp(1.0)).unwrap();
         assert!(!opening.is_sound, "{from}");
         assert!(place.path().join("packwatch.db.damaged-1").exists(), "{from}");
@@ -317,7 +319,7 @@ fn a_file_that_is_no_database_is_set_aside() {
     ];
     for (number, make) in (1..).zip(makers) {
         make();
-        let mut opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        let mut opening = Folder::new(place.path().to_owned(), RowLimits::SMALL).open(&stamp(1.0)).unwrap();
         assert!(!opening.is_sound);
         assert!(place.path().join(format!("packwatch.db.damaged-{number}")).exists());
         opening.database.commit(&[], Some(state(&[1.0]))).unwrap();
@@ -329,9 +331,9 @@ fn a_file_that_is_no_database_is_set_aside() {
 #[test]
 fn a_folder_belongs_to_one_process() {
     let place = tempfile::tempdir().unwrap();
-    let mut first = Folder::new(place.path().join("made/on the way"), 1000);
+    let mut first = Folder::new(place.path().join("made/on the way"), RowLimits::SMALL);
     first.lock().unwrap();
-    let mut second = Folder::new(place.path().join("made/on the way"), 1000);
+    let mut second = Folder::new(place.path().join("made/on the way"), RowLimits::SMALL);
     assert_eq!(second.lock().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
     drop(first);
     second.lock().unwrap();
@@ -439,7 +441,7 @@ fn a_damaged_copy_leaves_the_other_and_is_written_next() {
 fn a_state_of_layout_4_is_restored_and_becomes_the_first_copy() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
-    let old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..4]).unwrap();
+    let old = Database::open_with(&path, &stamp(1.0), RowLimits::SMALL, &MIGRATIONS[..4]).unwrap();
     let parts = |number: f64| state(&[number; 300]).parts;
     // As that layout wrote them: sealed without their own number, which is that of the full record.
     for (slot, record) in [(0, packed::full(&parts(1.5), 0)), (1, packed::old_delta(&parts(2.5), &parts(1.5), 3))] {
@@ -464,9 +466,9 @@ fn a_flipped_bit_of_the_version_is_damage_and_a_newer_program_is_not() {
         let version: i32 = 5 ^ (1 << bit);
         database.connection().pragma_update(None, "user_version", version).unwrap();
         database.close().unwrap();
-        let error = Database::open(&place.path().join(DATABASE), &stamp(1.0), 1000).unwrap_err();
+        let error = Database::open(&place.path().join(DATABASE), &stamp(1.0), RowLimits::SMALL).unwrap_err();
         assert!(matches!(error, OpenError::Damaged(_)), "{version}: {error}");
-        let opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        let opening = Folder::new(place.path().to_owned(), RowLimits::SMALL).open(&stamp(1.0)).unwrap();
         assert_eq!(opening.database.counts(), Counts { chained: 201, half_cycles: 160, packs: 1 }, "{version}");
     }
 }
@@ -484,10 +486,10 @@ fn what_meta_says_of_the_history_is_compared_with_it() {
         let database = filled(place.path());
         assert_eq!(database.connection().execute(change, []).unwrap(), 1);
         drop(database);
-        let opened = Database::open(&place.path().join(DATABASE), &stamp(1.0), 1000);
+        let opened = Database::open(&place.path().join(DATABASE), &stamp(1.0), RowLimits::SMALL);
         assert_eq!(matches!(opened, Err(OpenError::Damaged(_))), is_damage, "{change}");
         drop(opened);
-        let opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        let opening = Folder::new(place.path().to_owned(), RowLimits::SMALL).open(&stamp(1.0)).unwrap();
         let rows = if is_damage { 201 } else { 200 };
         assert_eq!(opening.database.counts(), Counts { chained: rows, half_cycles: 160, packs: 1 }, "{change}");
     }

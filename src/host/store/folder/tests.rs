@@ -2,6 +2,7 @@
 
 use super::super::database::Counts;
 use super::super::reader::{HistoryQuery, HistoryReader};
+use super::super::retention::RowLimits;
 use super::super::rows::tests::capacity;
 use super::super::tests::document;
 use super::*;
@@ -14,7 +15,7 @@ fn damaged() -> tempfile::TempDir {
     use std::os::unix::fs::FileExt as _;
     let place = tempfile::tempdir().unwrap();
     let state = document(1, 100, 1_800_000_000);
-    let mut database = Database::open(&place.path().join(DATABASE), &state.stamp, 1000).unwrap();
+    let mut database = Database::open(&place.path().join(DATABASE), &state.stamp, RowLimits::SMALL).unwrap();
     for hundredth in 0..200_u32 {
         let learned: Vec<EventKind> =
             (0..4).map(|cell| capacity(cell, Some(2.0), f64::from(hundredth) / 100.0)).collect();
@@ -32,11 +33,14 @@ fn damaged() -> tempfile::TempDir {
 /// Starts and returns the chained rows and the number of reports of the damage.
 fn start(place: &Path) -> (Counts, usize) {
     let now = document(1, 200, 1_800_000_100).stamp;
-    let opening = Folder::new(place.to_owned(), 1000).open(&now).unwrap();
+    let opening = Folder::new(place.to_owned(), RowLimits::SMALL).open(&now).unwrap();
     assert!(!opening.is_sound && opening.state.is_some());
     let counts = opening.database.counts();
     drop(opening);
-    assert!(Folder::new(place.to_owned(), 1000).open(&now).unwrap().is_sound, "the next start finds nothing wrong");
+    assert!(
+        Folder::new(place.to_owned(), RowLimits::SMALL).open(&now).unwrap().is_sound,
+        "the next start finds nothing wrong"
+    );
     let names: Vec<String> = fs::read_dir(place)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -58,10 +62,10 @@ fn an_interrupted_replacement_is_repeated_or_finished() {
     let uncut = start(damaged().path());
     assert!(uncut.0.chained > 400 && uncut.0.chained < 800 && uncut.1 == 1, "{uncut:?}");
     let stamp = document(1, 150, 1_800_000_050).stamp;
-    let filled = |place: &Path| Folder::new(place.to_owned(), 1000).fill_replacement(WHY, &stamp).unwrap();
+    let filled = |place: &Path| Folder::new(place.to_owned(), RowLimits::SMALL).fill_replacement(WHY, &stamp).unwrap();
     let cuts: [Cut<'_>; 4] = [
         ("while it was filled", &|place| {
-            let _ = Database::open(&place.join(PART), &stamp, 1000).unwrap();
+            let _ = Database::open(&place.join(PART), &stamp, RowLimits::SMALL).unwrap();
             fs::write(place.join("packwatch.db.part-wal"), "of another file").unwrap();
         }),
         ("when it was complete", &filled),
@@ -85,7 +89,7 @@ fn an_interrupted_replacement_is_repeated_or_finished() {
 fn a_history_is_no_place_for_a_replay_while_its_replacement_waits() {
     let place = damaged();
     let stamp = document(1, 150, 1_800_000_050).stamp;
-    Folder::new(place.path().to_owned(), 1000).fill_replacement(WHY, &stamp).unwrap();
+    Folder::new(place.path().to_owned(), RowLimits::SMALL).fill_replacement(WHY, &stamp).unwrap();
     fs::remove_file(place.path().join(DATABASE)).unwrap();
     assert!(has_history(place.path()));
 }
@@ -95,7 +99,7 @@ fn a_replacement_that_cannot_be_made_leaves_the_damaged_database_where_it_is() {
     let place = damaged();
     // No file can be created under that name.
     fs::create_dir_all(place.path().join("packwatch.db.new/x")).unwrap();
-    let mut folder = Folder::new(place.path().to_owned(), 1000);
+    let mut folder = Folder::new(place.path().to_owned(), RowLimits::SMALL);
     let now = document(1, 150, 1_800_000_050).stamp;
     folder.lock().unwrap();
     assert!(matches!(folder.fill_replacement(WHY, &now), Err(OpenError::Unavailable(_))));

@@ -1,13 +1,14 @@
 //! Rows without evidence, and a history larger than the memory.
 
 use super::super::folder::DATABASE;
+use super::super::retention::RowLimits;
 use super::super::rows::tests::{capacity, half_cycle};
 use super::super::rows::{HistoryRow, RowBatch};
 use super::*;
 use crate::monitor::EventKind;
 
 fn open(path: &Path) -> Database {
-    Database::open(path, &Stamp::replayed(Timestamp::ZERO), 1000).unwrap()
+    Database::open(path, &Stamp::replayed(Timestamp::ZERO), RowLimits::SMALL).unwrap()
 }
 
 fn commit(database: &mut Database, seconds: f64, kinds: &[EventKind]) {

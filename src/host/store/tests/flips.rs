@@ -4,6 +4,7 @@
 //! another database. The counts are printed.
 
 use super::folder::Folder;
+use super::retention::RowLimits;
 use super::rows::tests::capacity;
 use super::*;
 use crate::monitor::LearnedCell;
@@ -12,6 +13,8 @@ use crate::monitor::LearnedCell;
 const SAMPLE_STEP: usize = 397;
 /// Least part of the flips after which the learned capacity is alive.
 const MIN_ALIVE: f64 = 0.999;
+/// Least part of the rows that a replaced database has: a page whose head is damaged is lost, and in a small store a page is much.
+const MIN_ROWS: f64 = 0.9;
 
 /// What the flips led to.
 #[derive(Debug, Default)]
@@ -23,6 +26,8 @@ struct FlipCounts {
     stateless: usize,
     /// Neither a state nor the learned capacity was found.
     forgotten: usize,
+    /// Rows of the history that replaced databases were to have, and those they have.
+    rows: (i64, i64),
     /// Nothing could be written, or it was not there at the next start.
     never_written: Vec<(usize, String)>,
 }
@@ -33,6 +38,8 @@ struct Reference {
     /// The stored state, and those that are read when a record is damaged.
     states: Vec<Vec<u8>>,
     learned: Vec<LearnedCell>,
+    /// Rows of its history.
+    rows: i64,
     now: Stamp,
     /// The state that is written after each flip.
     next: StateDocument,
@@ -52,10 +59,11 @@ impl Reference {
         let place = place();
         std::fs::write(place.path().join(DATABASE), &bytes).unwrap();
         let now = document(2, 200, 1_900_000_100).stamp;
-        let opening = Folder::new(place.path().to_owned(), 1000).open(&now).unwrap();
+        let opening = Folder::new(place.path().to_owned(), RowLimits::SMALL).open(&now).unwrap();
         assert!(opening.is_sound);
         let mut states = vec![json(&opening.state.unwrap())];
         let learned = opening.database.learned().unwrap();
+        let found = opening.database.counts();
         drop(opening.database);
         // Without a copy the other is read, and without the deltas the full records.
         let delta_lost = "UPDATE state SET serial = -1 WHERE slot = 1";
@@ -63,12 +71,13 @@ impl Reference {
         let other_lost = format!("DELETE FROM state; {}", delta_lost.replace("state", "state_b"));
         for change in ["DELETE FROM state", "DELETE FROM state_b", &both_lost, &other_lost] {
             std::fs::write(place.path().join(DATABASE), &bytes).unwrap();
-            let opening = Folder::new(place.path().to_owned(), 1000).open(&now).unwrap();
+            let opening = Folder::new(place.path().to_owned(), RowLimits::SMALL).open(&now).unwrap();
             opening.database.connection().execute_batch(change).unwrap();
             let other = opening.database.state().unwrap().unwrap();
             states.extend(other.map(|other| json(&StateDocument::parse(&other.json).unwrap())));
         }
-        Self { bytes, states, learned, now, next: document(2, 100, 1_900_000_000) }
+        let rows = found.chained + found.half_cycles;
+        Self { bytes, states, learned, rows, now, next: document(2, 100, 1_900_000_000) }
     }
 
     fn flip(&self, bit: usize, place: &Path, counts: &mut FlipCounts) {
@@ -87,8 +96,14 @@ impl Reference {
 
     /// Starts with the damaged store, writes, and starts again.
     fn start(&self, place: &Path, counts: &mut FlipCounts) -> Result<(), String> {
-        let mut folder = Folder::new(place.to_owned(), 1000);
+        let mut folder = Folder::new(place.to_owned(), RowLimits::SMALL);
         let opening = folder.open(&self.now).map_err(|error| error.to_string())?;
+        if place.join("packwatch.db.damaged-1").exists() {
+            let found = opening.database.counts();
+            counts.rows.0 += self.rows;
+            // One says that it was damaged.
+            counts.rows.1 += found.chained + found.half_cycles - 1;
+        }
         let is_alive = |learned: &[LearnedCell]| learned == self.learned && !learned.is_empty();
         match &opening.state {
             Some(state) if self.states.contains(&json(state)) => {}
@@ -110,7 +125,7 @@ impl Reference {
             database.commit(&[batch], Some(record())).map_err(|again| format!("{error}, then {again}"))?;
         }
         drop((database, folder));
-        let again = Folder::new(place.to_owned(), 1000).open(&self.now);
+        let again = Folder::new(place.to_owned(), RowLimits::SMALL).open(&self.now);
         let opening = again.map_err(|error| format!("again: {error}"))?;
         match opening.state {
             Some(found) if json(&found) == json(&self.next) => Ok(()),
@@ -165,12 +180,14 @@ fn after_any_flipped_bit_the_store_is_written_and_the_learned_capacity_is_alive(
     for bit in (0..8 * reference.bytes.len()).step_by(step) {
         reference.flip(bit, place.path(), &mut counts);
     }
-    let FlipCounts { flips, rebuilt, stateless, forgotten, never_written } = &counts;
+    let FlipCounts { flips, rebuilt, stateless, forgotten, rows: (wanted, saved), never_written } = &counts;
     let bytes = reference.bytes.len();
     let never = never_written.len();
     eprintln!(
-        "{bytes} bytes, {flips} flips: {never} never written, {forgotten} forgotten, {stateless} without a state, {rebuilt} rebuilt"
+        "{bytes} bytes, {flips} flips: {never} never written, {forgotten} forgotten, {stateless} without a state, {rebuilt} rebuilt \
+         with {saved} of {wanted} rows"
     );
     assert!(never_written.is_empty(), "{never_written:?}");
+    assert!(*saved as f64 >= MIN_ROWS * *wanted as f64 && *wanted > 0, "{counts:?}");
     assert!(*forgotten as f64 <= (1.0 - MIN_ALIVE) * *flips as f64, "{counts:?}");
 }

@@ -1,6 +1,7 @@
 //! What is left of a store whose states are lost, and what must not come back.
 
 use super::folder::Folder;
+use super::retention::RowLimits;
 use super::rows::tests::{alarm, capacity};
 use super::*;
 use crate::alarm::{Change, Selector};
@@ -51,7 +52,7 @@ fn a_damaged_row_of_the_history_is_not_learned_from() {
         change(place.path(), &format!("DELETE FROM {table}"));
     }
     let learned = || {
-        let mut folder = Folder::new(place.path().join("state"), 1000);
+        let mut folder = Folder::new(place.path().join("state"), RowLimits::SMALL);
         folder.open(&document(1, 1, 1).stamp).unwrap().learned[0]
     };
     let good = learned();
@@ -81,7 +82,7 @@ fn the_state_of_the_old_pack_does_not_come_back_with_a_salvage() {
     let (place, _) = replayed_store();
     let state = place.path().join("state");
     assert_eq!(replace_pack(&state).unwrap(), 2);
-    let mut folder = Folder::new(state, 1000);
+    let mut folder = Folder::new(state, RowLimits::SMALL);
     folder.mark_damaged("for the test");
     let opening = folder.open(&document(1, 1, 1).stamp).unwrap();
     assert!(opening.state.is_none() && opening.learned.is_empty());
@@ -118,7 +119,7 @@ fn a_history_that_was_written_again_does_not_fit_what_was_noted() {
     let path = folder.path().join(DATABASE);
     let write = |ah: f64, rows: usize| {
         let _ = std::fs::remove_file(&path);
-        let mut database = Database::open(&path, &document(1, 1, 1).stamp, 1000).unwrap();
+        let mut database = Database::open(&path, &document(1, 1, 1).stamp, RowLimits::SMALL).unwrap();
         for _ in 0..rows {
             let rows = vec![HistoryRow::Event(capacity(0, Some(2.0), ah))];
             database.commit(&[RowBatch { stamp: document(1, 1, 1).stamp, rows }], None).unwrap();
