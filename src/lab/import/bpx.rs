@@ -105,11 +105,8 @@ impl Model {
         let row = |&kelvin: &f64| table.soc.iter().map(|&soc| circuit::resistances(cell, curve, soc, kelvin)).collect();
         let resistances: Vec<Vec<Resistances>> = kelvin.iter().map(row).collect();
         let at = |t: usize, s: usize, of: &Resistances| {
-            let is_finite = of.branches.iter().all(|(r_ohm, tau_s)| r_ohm.is_finite() && tau_s.is_finite());
             let (soc, kelvin) = (table.soc[s], kelvin[t]);
-            let fault =
-                format!("Parameterisation: a resistance at SOC {soc} and {kelvin} K is no number, must be finite");
-            (!(is_finite && of.r0_ohm.is_finite())).then_some(fault)
+            of.fault().map(|fault| format!("Parameterisation: at SOC {soc} and {kelvin} K {fault}"))
         };
         let faults =
             resistances.iter().enumerate().flat_map(|(t, row)| row.iter().enumerate().map(move |(s, of)| (t, s, of)));

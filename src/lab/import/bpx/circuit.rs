@@ -16,6 +16,7 @@ use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
 use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
+use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
 /// Distance over which the slope of a potential is taken, lithium content: a table's noise must not be read as slope.
 const SLOPE_STEP: f64 = 0.005;
@@ -38,6 +39,19 @@ impl Resistances {
     /// All resistances together, ohm.
     pub(super) fn settled_ohm(&self) -> f64 {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
+    }
+
+    /// What no cell has, found and allowed; `None` = nothing.
+    pub(super) fn fault(&self) -> Option<String> {
+        let resistances = std::iter::once(self.r0_ohm).chain(self.branches.iter().map(|branch| branch.0));
+        let capacitances = self.branches.iter().map(|(r_ohm, tau_s)| tau_s / r_ohm);
+        let fault = |what: &str, unit: &str, allowed: &Bounds, found: f64| {
+            (!allowed.has(found))
+                .then(|| format!("the parameters give a {what} of {found:.3e} {unit}, must be {}", allowed.allowed))
+        };
+        let resistance = |found| fault("resistance", "ohm", &RESISTANCE_OHM, found);
+        let capacitance = |found| fault("capacitance", "F", &CAPACITANCE_F, found);
+        resistances.filter_map(resistance).chain(capacitances.filter_map(capacitance)).next()
     }
 }
 

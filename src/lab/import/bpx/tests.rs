@@ -184,13 +184,22 @@ fn what_no_model_can_be_made_of_is_refused() {
         ("/Parameterisation/Cell", "Upper voltage cut-off [V]", json!(3), "must be above the lower, 3.3"),
         ("/Parameterisation/Negative electrode", "Particle", json!({}), "a blend of materials, must be one material"),
         ("/Parameterisation", "Cell", json!(null), "Parameterisation.Cell: missing, must be an object"),
-        ("/Parameterisation/Negative electrode", "Diffusivity [m2.s-1]", json!("log(x - 2)"), "must be finite"),
+        (
+            "/Parameterisation/Negative electrode",
+            "Diffusivity [m2.s-1]",
+            json!("log(x - 2)"),
+            "resistance of NaN ohm, must be",
+        ),
     ] {
         let mut value = straight();
         value.pointer_mut(path).unwrap()[key] = found;
         let error = import_value(&value).unwrap_err().0;
         assert!(error.contains(text), "{text}\n{error}");
     }
+    let mut value = full();
+    value["Parameterisation"]["Electrolyte"]["Diffusivity [m2.s-1]"] = json!(2e-50);
+    let error = import_value(&value).unwrap_err().0;
+    assert!(error.contains("at SOC 0 and") && error.contains("ohm, must be 1e-9 to 1000 ohm"), "{error}");
     assert!(import_value(&json!([])).unwrap_err().0.contains("must be BPX"));
     assert!(import("{", &BpxSettings::default()).unwrap_err().0.contains("no JSON"));
 }
