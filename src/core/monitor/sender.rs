@@ -246,6 +246,8 @@ impl Sender {
                 periods(*digest, config.digest_period_s).saturating_mul(pages(config.plan.digest_pages())),
             ),
             (LayoutMessage::Alarm, alarms.frames_until(now, engine, config.alarm_period_s).saturating_add(unknown)),
+            // A refused command changes nothing that is stored at once: its reply may be one that the stored counter has not seen.
+            (LayoutMessage::Reply, 1),
         ] {
             config.plan.skip(message, frames, counters);
         }

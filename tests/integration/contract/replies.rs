@@ -243,6 +243,20 @@ fn the_alarm_frame_s_counter_after_a_kill_is_that_of_a_daemon_that_never_stopped
 }
 
 #[test]
+fn the_counter_of_a_reply_does_not_come_again_after_a_kill() {
+    let mut rig = Rig::new("[output.reply]\ne2e = \"1C\"\ndata_id = 5\n");
+    rig.seconds(2);
+    rig.command(1, 31, 2047);
+    let stored = rig.monitor.snapshot();
+    rig.command(9, 31, 2047);
+    rig.monitor = Monitor::new(rig.config.clone());
+    rig.monitor.restore(stored, Downtime::Seconds(0.5)).unwrap();
+    rig.deci += 5;
+    rig.command(1, 31, 2047);
+    assert_eq!(counters(&rig, REPLY, Protection { profile: Profile::P01C, data_id: 5 }), [0, 1, 2]);
+}
+
+#[test]
 fn counters_after_an_unknown_time_continue_where_the_stored_state_ends_and_without_a_state_at_zero() {
     for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
         let mut rig = protected_rig(profile);
