@@ -257,7 +257,7 @@ impl Writer {
         }
     }
 
-    fn commit(&mut self, batches: &[RowBatch], document: &StateDocument, exact: bool) -> Result<(), String> {
+    pub(super) fn commit(&mut self, batches: &[RowBatch], document: &StateDocument, exact: bool) -> Result<(), String> {
         let record = StateRecord::new(document, exact, self.sets_aside)?;
         let mut database = match self.database.take() {
             Some(database) => database,

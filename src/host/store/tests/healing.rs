@@ -142,3 +142,51 @@ fn a_history_that_was_written_again_does_not_fit_what_was_noted() {
         assert!(text.parse::<NotedHead>().is_err(), "{text}");
     }
 }
+
+#[test]
+fn the_end_of_the_chain_is_logged_with_the_first_commit_of_each_day() {
+    // 2027-01-15T00:00:00Z.
+    const MIDNIGHT_S: i64 = 1_799_971_200;
+    let place = tempfile::tempdir().unwrap();
+    let (progress, _) = watch::channel(StoreProgress::default());
+    let mut writer = Writer {
+        write_queue: Arc::default(),
+        vehicle: VehicleIdentity::default(),
+        is_vehicle_noted: false,
+        reserve: Reserve::new(place.path()),
+        head_day: None,
+        keep_years: None,
+        folder: Folder::new(place.path().to_owned(), RowLimits::SMALL),
+        database: None,
+        progress,
+        retry: Retry::default(),
+        commits: 0,
+        failures: 0,
+        knows_state: true,
+        sets_aside: false,
+    };
+    let log = place.path().join("log");
+    let file = Arc::new(std::fs::File::create(&log).unwrap());
+    let subscriber = tracing_subscriber::fmt().with_writer(file).with_ansi(false).finish();
+    let mut seen = 0;
+    let mut logged = |from_midnight_s: i64| {
+        let state = document(1, 100_000 + from_midnight_s, MIDNIGHT_S + from_midnight_s);
+        let batch = RowBatch { stamp: state.stamp, rows: vec![HistoryRow::Event(capacity(0, Some(2.0), 1.9))] };
+        writer.commit(&[batch], &state, true).unwrap();
+        let text = std::fs::read_to_string(&log).unwrap();
+        text[std::mem::replace(&mut seen, text.len())..].to_owned()
+    };
+    tracing::subscriber::with_default(subscriber, || {
+        assert!(logged(-7200).contains("end of the history's chain"), "the first of this process");
+        assert_eq!(logged(-1), "", "the same day");
+        let head = logged(0);
+        let word =
+            |key: &str| head.split_whitespace().find_map(|word| word.strip_prefix(key)).unwrap().trim_matches('"');
+        assert_eq!(logged(86_399), "");
+        let noted = format!("{}:{}", word("rows="), word("hash=")).parse().unwrap();
+        assert_eq!(word("rows="), "3");
+        let reader = reader::HistoryReader::open(place.path()).unwrap();
+        assert_eq!(reader.contradiction(&noted), Ok(None), "what is logged is what verify --noted takes");
+        assert!(logged(86_400).contains("rows=5 "), "the next day");
+    });
+}
