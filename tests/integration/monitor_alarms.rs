@@ -30,14 +30,16 @@ fn the_hottest_sensor_raises_and_a_lost_sensor_neither_clears_nor_hides() {
 }
 
 #[test]
-fn alarms_and_health_announce_and_the_status_does_not() {
+fn alarms_health_digest_and_replies_announce_and_the_status_does_not() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.temperatures_c[0] = Some(60.0);
     rig.seconds(12);
-    let [status, health, alarm, digest] = [0x6B0, 0x6B1, 0x6B2, 0x6B4].map(|id| CanId::standard(id).unwrap());
+    rig.command(1, 31, 2047);
+    let [status, health, alarm, digest, reply] =
+        [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5].map(|id| CanId::standard(id).unwrap());
     assert_eq!(
         rig.sent.iter().copied().collect::<Vec<_>>(),
-        [(status, false), (health, true), (alarm, true), (digest, true)]
+        [(status, false), (health, true), (alarm, true), (digest, true), (reply, true)]
     );
 }
 

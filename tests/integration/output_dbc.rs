@@ -528,11 +528,27 @@ fn every_rule_is_named_in_the_value_tables_by_its_number() {
     let text = include_str!("../../config/packwatch.dbc");
     let dbc = Database::parse(text).unwrap();
     let rules = Rule::ALL.map(|rule| (i64::from(rule as u8), camel_case(rule.name())));
-    for signal in ["PACKWATCH_Alarm.Rule", "PACKWATCH_Command.Rule"] {
+    for message in ["Alarm.Rule", "Command.Rule", "Reply.Rule", "Digest.ThresholdRule"] {
+        let signal = &format!("PACKWATCH_{message}");
         let table = &dbc.signal(signal).unwrap().1.values;
         assert_eq!(table[..rules.len()], rules, "{signal}");
         assert_eq!(table.len(), rules.len() + 1, "{signal}: and one code for none or all");
     }
+}
+
+/// The messages of the table on the contract page, without their prefix.
+fn contract_rows() -> Vec<&'static str> {
+    contract_table().map(|cells| cells[1].trim_matches('`').trim_start_matches("PACKWATCH_")).collect()
+}
+
+/// Identifier, period, repetition and time-out of each.
+fn contract_cells() -> impl Iterator<Item = [String; 4]> {
+    contract_table().map(|cells| [2, 3, 5, 6].map(|at| cells[at].to_owned()))
+}
+
+fn contract_table() -> impl Iterator<Item = Vec<&'static str>> {
+    let rows = include_str!("../../docs/src/ecu/contract.md").lines().filter(|line| line.starts_with("| `PACKWATCH_"));
+    rows.map(|line| line.split('|').map(str::trim).collect())
 }
 
 /// As the manual's contract page has it: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
@@ -557,7 +573,23 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
     assert_eq!(stated("Reply"), (None, None, None, Some(100)), "10 a second");
     assert_eq!(stated("Freshness"), (Some(1000), None, None, None));
     assert_eq!(stated("Command"), (None, None, None, None), "the sender's task");
+    assert_eq!(contract_rows(), ["Status", "Health", "Alarm", "Command", "Digest", "Reply", "Freshness"]);
+    for (name, [identifier, period, repetition, timeout]) in contract_rows().iter().zip(contract_cells()) {
+        let message = database.message(&format!("PACKWATCH_{name}")).unwrap();
+        let id = u32::from_str_radix(identifier.trim_start_matches("0x"), 16).unwrap();
+        assert_eq!(message.id, CanId::standard(id).unwrap(), "{name}");
+        let first_ms = |text: &str| -> Option<u32> {
+            let words: Vec<&str> = text.split([' ', ',']).collect();
+            words.windows(2).find(|pair| pair[1] == "ms").and_then(|pair| pair[0].parse().ok())
+        };
+        assert_eq!(first_ms(&period), message.cycle_time_ms, "{name}: {period}");
+        let times = repetition.split_once(" times").map(|(count, _)| count.parse().unwrap());
+        assert_eq!((times, first_ms(&repetition)), (message.repetition.count, message.repetition.period_ms), "{name}");
+        let three_periods = message.cycle_time_ms.map(|period_ms| 3 * period_ms);
+        assert!(first_ms(&timeout) == three_periods || ["Alarm", "Reply"].contains(name), "{name}: {timeout}");
+    }
     const NOT_AVAILABLE: &str = "not available";
+    const SEVERITIES: [(i64, &str); 4] = [(0, "none"), (1, "info"), (2, "warning"), (3, "severe")];
     const RULE_STATES: [&str; 6] = ["none", "info", "warning", "severe", "unknown", "not watched"];
     for (signal, named, last) in [
         ("PACKWATCH_Health.Page", ["capacity", "recharge", "usable", "life", "losses"].as_slice(), 15),
@@ -567,6 +599,31 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
         let wanted = (0..).zip(named.iter().copied()).chain([(last, NOT_AVAILABLE)]).collect::<Vec<_>>();
         assert_eq!(words(&database, signal), wanted, "{signal}");
     }
+    for (signal, named, last) in [
+        ("PACKWATCH_Status.Mode", ["unknown", "charge", "rest", "discharge"].as_slice(), 7),
+        ("PACKWATCH_Status.Validity", &["unavailable", "valid", "degraded", "untrusted"], 7),
+        ("PACKWATCH_Status.HighestSeverity", &SEVERITIES.map(|(_, word)| word), 7),
+        ("PACKWATCH_Status.UnknownRules", &["none", "some", "all"], 3),
+        ("PACKWATCH_Health.ModelState", &["prior", "learning", "learned", "unfit", "given"], 7),
+        ("PACKWATCH_Digest.Worst", &SEVERITIES.map(|(_, word)| word), 7),
+    ] {
+        let wanted = (0..).zip(named.iter().copied()).chain([(last, NOT_AVAILABLE)]).collect::<Vec<_>>();
+        assert_eq!(words(&database, signal), wanted, "{signal}");
+    }
+    for (signal, of_zero) in [
+        ("PACKWATCH_Alarm.Severity", NOT_AVAILABLE),
+        ("PACKWATCH_Digest.ThresholdSeverity", NOT_AVAILABLE),
+        ("PACKWATCH_Reply.Severity", NOT_AVAILABLE),
+        ("PACKWATCH_Command.Severity", "all"),
+    ] {
+        let wanted = [&[(0, of_zero)], &SEVERITIES[1..]].concat();
+        assert_eq!(words(&database, signal), wanted, "{signal}");
+    }
+    assert_eq!(words(&database, "PACKWATCH_Alarm.Test"), [(0, "real"), (1, "test")]);
+    assert_eq!(words(&database, "PACKWATCH_Alarm.Acknowledged"), [(0, "no"), (1, "yes")]);
+    const COMMANDS: [(i64, &str); 3] = [(1, "acknowledge"), (2, "clear"), (3, "pack_replaced")];
+    assert_eq!(words(&database, "PACKWATCH_Command.Command"), COMMANDS);
+    assert_eq!(words(&database, "PACKWATCH_Reply.Command"), [COMMANDS.as_slice(), &[(15, NOT_AVAILABLE)]].concat());
     for (number, (rule, ..)) in RULES.iter().enumerate() {
         let name = format!("PACKWATCH_Digest.Rule_{rule}");
         let wanted = (0..).zip(RULE_STATES).chain([(7, NOT_AVAILABLE)]).collect::<Vec<_>>();

@@ -347,6 +347,7 @@ fn log_learned(kind: &EventKind) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::alarm::{AlarmState, Change, Rule, Severity};
     use crate::filter::ScalarGaussian;
     use crate::findings::FindingKind;
     use crate::quantity::Mode;
@@ -436,6 +437,19 @@ mod tests {
                 days: known,
                 days_low: known,
                 days_high: known,
+            },
+            EventKind::Alarm {
+                rule: Rule::CapacityLow,
+                severity: Severity::Warning,
+                cell: Some(cell),
+                change: Change::Raised,
+                state: AlarmState::Active,
+                active: true,
+                value: known,
+                probability: known,
+                threshold: x,
+                occurrences: 1,
+                acknowledged: false,
             },
             EventKind::RechargePeriod { seconds: known, normalised_s: known, normalised_std_s: known },
             EventKind::Model {

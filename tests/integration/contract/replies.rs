@@ -119,6 +119,62 @@ fn the_first_tick_after_a_second_or_more_away_sends_all_cyclic_frames_and_each_p
 }
 
 #[test]
+fn less_than_a_second_after_the_stop_the_cyclic_frames_keep_their_periods() {
+    for more_deci in [0, 3, 6] {
+        let mut rig = Rig::new("");
+        rig.seconds(3);
+        (0..more_deci).for_each(|_| rig.tick_with_frames());
+        let stopped = rig.deci;
+        rig.restart(Downtime::Seconds(0.3));
+        // The first tick comes 0.3 s after the stop.
+        rig.deci -= 1;
+        let restarted = rig.deci;
+        rig.frames.clear();
+        let mut firsts = [HEALTH, DIGEST].map(|id| (id, 0));
+        while firsts.iter().any(|(_, deci)| *deci == 0) {
+            rig.tick();
+            for (id, deci) in firsts.iter_mut().filter(|(_, deci)| *deci == 0) {
+                *deci = if rig.frames_with(*id).is_empty() { 0 } else { rig.deci };
+            }
+        }
+        // Their periods began with the first tick.
+        let due = stopped / 10 * 10 + if stopped % 10 < 1 { 1 } else { 11 };
+        let wanted = due.max(restarted + 1);
+        assert_eq!(firsts.map(|(_, deci)| deci), [wanted; 2], "{more_deci}: not all at the first tick");
+    }
+}
+
+#[test]
+fn a_cleared_alarm_is_sent_four_times() {
+    let mut rig = Rig::new(HOT);
+    rig.heat(60.0, 6);
+    rig.frames.clear();
+    rig.heat(25.0, 6);
+    let states: Vec<u8> = rig.wire().iter().map(|wire| wire.state).filter(|state| *state != 1).collect();
+    assert_eq!(states, [2; 4]);
+}
+
+#[test]
+fn the_digest_never_shows_as_none_what_cannot_be_judged() {
+    let rule = |rig: &Rig, number: u32| rig.digest(1, 20 + 3 * (number - 1), 3);
+    let soc = "[[alarm]]\nrule = \"soc_low\"\nwarning = \"5 %\"\n";
+    let mut rig = Rig::new(&format!("{HOT}{soc}"));
+    rig.heat(60.0, 6);
+    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 0, 5], "a warning, judged, not watched");
+    rig.restart(Downtime::Seconds(60.0));
+    rig.frames.clear();
+    rig.tick();
+    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 4, 5], "nothing is read yet");
+    rig.seconds(3);
+    assert_eq!([9, 8].map(|number| rule(&rig, number)), [2, 0]);
+    // One of two sensors.
+    let mut rig = Rig::new(HOT);
+    rig.temperatures_c = [Some(25.0), None];
+    rig.seconds(12);
+    assert_eq!(rule(&rig, 9), 4);
+}
+
+#[test]
 fn a_flood_of_commands_has_few_replies() {
     let mut rig = learned();
     for _ in 0..30 {
