@@ -536,6 +536,8 @@ fn every_rule_is_named_in_the_value_tables_by_its_number() {
     }
 }
 
+const CONTRACT: &str = include_str!("../../docs/src/ecu/contract.md");
+
 /// The messages of the table on the contract page, without their prefix.
 fn contract_rows() -> Vec<&'static str> {
     contract_table().map(|cells| cells[1].trim_matches('`').trim_start_matches("PACKWATCH_")).collect()
@@ -547,7 +549,7 @@ fn contract_cells() -> impl Iterator<Item = [String; 4]> {
 }
 
 fn contract_table() -> impl Iterator<Item = Vec<&'static str>> {
-    let rows = include_str!("../../docs/src/ecu/contract.md").lines().filter(|line| line.starts_with("| `PACKWATCH_"));
+    let rows = CONTRACT.lines().filter(|line| line.starts_with("| `PACKWATCH_"));
     rows.map(|line| line.split('|').map(str::trim).collect())
 }
 
@@ -588,6 +590,12 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
         let three_periods = message.cycle_time_ms.map(|period_ms| 3 * period_ms);
         assert!(first_ms(&timeout) == three_periods || ["Alarm", "Reply"].contains(name), "{name}: {timeout}");
     }
+    let pass_time = &database.signal("PACKWATCH_Digest.PassTime").unwrap().1.layout;
+    // The last code is "not available", and 20 ms are the share of one alarm.
+    let longest_s = f64::from((1_u32 << pass_time.length_bits) - 2) * pass_time.factor;
+    let ends =
+        format!("`PassTime` ends at {longest_s:.1} s, the pass of 10,{:03.0} raised", longest_s / 0.02 - 10_000.0);
+    assert!(CONTRACT.contains(&ends), "{ends}");
     const NOT_AVAILABLE: &str = "not available";
     const SEVERITIES: [(i64, &str); 4] = [(0, "none"), (1, "info"), (2, "warning"), (3, "severe")];
     const RULE_STATES: [&str; 6] = ["none", "info", "warning", "severe", "unknown", "not watched"];

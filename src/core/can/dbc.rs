@@ -375,6 +375,9 @@ fn read_signal<'a>(
         signal: Some(signal.name.clone()),
         what: format!("signal {}.{}: {what}", message.name, signal.name),
     };
+    let finite = |name: &str, value: f64| {
+        if value.is_finite() { Ok(value) } else { Err(fault(format!("{name} {value}, must be finite"))) }
+    };
     let bits = |name: &str, n: u64| u16::try_from(n).map_err(|_| fault(format!("{name} {n}, must be 0 to 65535")));
     let own = details.get(message, signal);
     let layout = SignalLayout {
@@ -390,10 +393,10 @@ fn read_signal<'a>(
             (_, can_dbc::ValueType::Signed) => ValueType::Signed,
             (_, can_dbc::ValueType::Unsigned) => ValueType::Unsigned,
         },
-        factor: signal.factor,
-        offset: signal.offset,
-        minimum: number(&signal.min),
-        maximum: number(&signal.max),
+        factor: finite("factor", signal.factor)?,
+        offset: finite("offset", signal.offset)?,
+        minimum: finite("minimum", number(&signal.min))?,
+        maximum: finite("maximum", number(&signal.max))?,
     };
     Ok(Signal {
         name: signal.name.clone(),

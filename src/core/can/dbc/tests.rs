@@ -96,6 +96,15 @@ fn faults_name_the_line() {
     let (line, text) =
         line_and_text(&format!("BO_ 1 A: 8 X\n{}{}", signal.replace("m1 ", ""), signal.replace("m1 ", "")));
     assert_eq!((line, text.contains("A.S is defined twice")), (7, true));
+    for (numbers, found) in [
+        ("(1e999,0) [0|0]", "factor inf"),
+        ("(1,-1e999) [0|0]", "offset -inf"),
+        ("(1,0) [-1e999|0]", "minimum -inf"),
+        ("(1,0) [0|1e999]", "maximum inf"),
+    ] {
+        let (line, text) = line_and_text(&format!("BO_ 1 A: 8 X\n SG_ S : 0|8@1+ {numbers} \"\" X\n"));
+        assert_eq!((line, text.contains(&format!("A.S: {found}, must be finite"))), (6, true), "{text}");
+    }
 }
 
 #[test]
