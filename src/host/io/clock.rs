@@ -13,6 +13,9 @@
 //!
 //! Times of one interface never go backwards. All functions but [`Reading::now`] are pure: tests bring their own clock.
 
+use std::time::Duration;
+
+use nix::sys::time::TimeSpec;
 use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
@@ -45,7 +48,12 @@ impl Reading {
 }
 
 fn nanos_of(clock: ClockId) -> i64 {
-    clock_gettime(clock).map_or(0, |t| t.tv_sec().saturating_mul(1_000_000_000) + t.tv_nsec())
+    clock_gettime(clock).map_or(0, nanos)
+}
+
+/// Nanoseconds of a kernel's time, which is never negative; seconds have 32 or 64 bits, as the computer has.
+pub(super) fn nanos(time: TimeSpec) -> i64 {
+    i64::try_from(Duration::from(time).as_nanos()).unwrap_or(i64::MAX)
 }
 
 /// Stamps the kernel gave a frame, ns on their own clocks.

@@ -20,7 +20,7 @@ use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
 use super::wire::{self, FD_BYTES, Wire};
 use crate::can::{CanId, Frame};
-use crate::io::clock::KernelStamps;
+use crate::io::clock::{KernelStamps, nanos};
 
 /// Receive buffer asked for, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its
 /// bookkeeping), a third of a second of a full 1 Mbit/s bus. The kernel caps it at net.core.rmem_max.
@@ -233,10 +233,10 @@ fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> KernelSt
     for message in messages {
         match message {
             ControlMessageOwned::ScmTimestampsns(all) => {
-                stamps.software_ns = nanos(all.system).or(stamps.software_ns);
-                stamps.hardware_ns = nanos(all.hw_raw);
+                stamps.software_ns = stamp(all.system).or(stamps.software_ns);
+                stamps.hardware_ns = stamp(all.hw_raw);
             }
-            ControlMessageOwned::ScmTimestampns(stamp) => stamps.software_ns = nanos(stamp),
+            ControlMessageOwned::ScmTimestampns(time) => stamps.software_ns = stamp(time),
             _ => {}
         }
     }
@@ -244,9 +244,8 @@ fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> KernelSt
 }
 
 /// Zero means "no such stamp".
-fn nanos(time: TimeSpec) -> Option<i64> {
-    let nanos = time.tv_sec().saturating_mul(1_000_000_000).saturating_add(time.tv_nsec());
-    (nanos != 0).then_some(nanos)
+fn stamp(time: TimeSpec) -> Option<i64> {
+    Some(nanos(time)).filter(|nanos| *nanos != 0)
 }
 
 #[cfg(test)]
@@ -271,8 +270,8 @@ mod tests {
 
     #[test]
     fn a_zero_stamp_is_none() {
-        assert_eq!(nanos(TimeSpec::new(0, 0)), None);
-        assert_eq!(nanos(TimeSpec::new(1, 5)), Some(1_000_000_005));
+        assert_eq!(stamp(TimeSpec::new(0, 0)), None);
+        assert_eq!(stamp(TimeSpec::new(1, 5)), Some(1_000_000_005));
     }
 
     #[test]
