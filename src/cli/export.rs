@@ -1,12 +1,12 @@
 //! `packwatch export`: estimates, half-cycles and alarms of many logs as Parquet or CSV.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde_json::json;
 
 use super::Failure;
-use super::fleet::LogArgs;
+use super::logs::LogArgs;
 use super::numbers::{NamedValue, one_of, within};
 use super::output::{failure, print_json, unless_closed, write_table};
 use crate::config::{self, Config};
@@ -63,12 +63,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new("--config and --out must be given"));
     };
     let config = config::load(config)?;
-    let open = |config: &Config, log: &Path| args.logs.open(config, log);
+    let open = |config: &Config, logs: &[PathBuf]| args.logs.open(config, logs);
     let settings = ExportSettings {
         access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         format: args.format,
         out: out.clone(),
-        period_s: args.period,
+        period_s: Some(args.period),
         jobs: args.logs.threads(),
     };
     let bar = args.logs.bar(1);

@@ -1,74 +1,211 @@
-//! Arguments shared by the commands over many logs: the logs, how to read them, progress.
+//! `packwatch fleet`: the vehicles of a fleet, replayed in parts on any machines, and the tables of all.
 
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use indicatif::ProgressBar;
+use indicatif::HumanBytes;
+use serde_json::json;
 
 use super::Failure;
-use super::output::{check_distinct, progress_bar};
-use super::replay::{InputArgs, log_options};
-use crate::config::Config;
-use crate::io::log::LogSource;
-use crate::lab::fleet::{OpenedLog, truth};
+use super::logs;
+use super::numbers::within;
+use super::output::{check_distinct, failure, print, print_json, progress_bar, unless_closed};
+use super::replay::InputArgs;
+use crate::config::{self, Config};
+use crate::io::result_file::ResultFile;
+use crate::lab::error::LabError;
+use crate::lab::fleet::LogAccess;
+use crate::lab::fleet::export::merge::{MergeSummary, merge};
+use crate::lab::fleet::export::{ExportSettings, TableFormat};
+use crate::lab::fleet::vehicles::{self, Outcome, Shard, Vehicle};
 
-/// The logs and how they are read.
+/// Version of the JSON documents.
+const VERSION: u32 = 1;
+
+/// Arguments of `fleet`.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Logs")]
-pub(crate) struct LogArgs {
-    /// Journals, candump logs or CSV files, also .gz or .zst; each is a life or a trip of its own
-    #[arg(required = true, value_name = "LOG")]
-    pub(crate) logs: Vec<PathBuf>,
-    #[command(flatten)]
-    input: InputArgs,
+pub(crate) struct Args {
+    #[command(subcommand)]
+    command: FleetCommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum FleetCommand {
+    /// List the vehicles with their logs: the manifest
+    Plan(PlanArgs),
+    /// Replay the vehicles of a manifest, or a part of them
+    Run(RunArgs),
+    /// Put the tables of all parts together
+    Merge(MergeArgs),
+}
+
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "The manifest has a JSON document on each line: vehicle (its name), bytes (the size of its logs), logs, and if you add it config, the \
+                  configuration of this vehicle."
+)]
+struct PlanArgs {
+    /// A log, which is a vehicle of its own, or a folder with the logs of one vehicle, in the order of their names
+    #[arg(required = true, value_name = "LOG|DIR")]
+    logs: Vec<PathBuf>,
+    /// File to write; - is standard output
+    #[arg(short, long, value_name = "MANIFEST", default_value = "-")]
+    out: PathBuf,
+}
+
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet and, with --estimates, estimates.parquet; vehicle.json is the last. A vehicle that has \
+                  it is not replayed again, so a run that was stopped continues. A vehicle that fails is reported and the others continue; a further run tries it \
+                  again. The exit code is 0 when every vehicle was replayed or has failed for a reason that is written down."
+)]
+struct RunArgs {
+    /// Manifest
+    #[arg(value_name = "MANIFEST")]
+    manifest: PathBuf,
+    /// Configuration of the vehicles that name none
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Folder for the vehicles' folders; created when it does not exist
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+    /// The part to replay: I of N parts of like size
+    #[arg(long, value_name = "I/N", default_value = "1/1")]
+    shard: Shard,
+    /// Also a table of estimates, at most one per cell in each period; 0 = every one
+    #[arg(long, value_name = "S", value_parser = period)]
+    estimates: Option<f64>,
     /// Threads (default: one per core)
     #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    input: InputArgs,
 }
 
-impl LogArgs {
-    /// Checks the arguments that depend on each other.
-    pub(crate) fn check(&self) -> Result<(), Failure> {
-        check_distinct(&self.logs)?;
-        if self.input.start_times.is_some() && self.logs.len() > 1 {
-            let found = self.logs.len();
-            return Err(Failure::new(format!(
-                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv next to each log works as well"
-            )));
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, where they were exported, estimates.parquet: one row group per vehicle, \
+                  the vehicles by name. In whatever parts and order they were replayed, the bytes are the same."
+)]
+struct MergeArgs {
+    /// Folders that `fleet run` has written
+    #[arg(required = true, value_name = "DIR")]
+    folders: Vec<PathBuf>,
+    /// Folder for the tables; created when it does not exist
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+    /// Manifest: every vehicle of it must be there
+    #[arg(long, value_name = "MANIFEST")]
+    manifest: Option<PathBuf>,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.command {
+        FleetCommand::Plan(args) => plan(args),
+        FleetCommand::Run(args) => replay(args),
+        FleetCommand::Merge(args) => put_together(args),
+    }
+}
+
+fn plan(args: &PlanArgs) -> Result<(), Failure> {
+    check_distinct(&args.logs)?;
+    let vehicles = vehicles::plan(&args.logs).map_err(failure)?;
+    let text = vehicles::manifest(&vehicles);
+    if args.out == Path::new("-") {
+        return print(&text);
+    }
+    let write = || {
+        let mut file = ResultFile::create(&args.out)?;
+        file.write_all(text.as_bytes())?;
+        file.finish()
+    };
+    write().map_err(failure)?;
+    let bytes: u64 = vehicles.iter().map(|vehicle| vehicle.bytes).sum();
+    print(&format!("{}: {} vehicles, {}\n", args.out.display(), vehicles.len(), HumanBytes(bytes)))
+}
+
+fn replay(args: &RunArgs) -> Result<(), Failure> {
+    let all = vehicles::read_manifest(&args.manifest).map_err(failure)?;
+    let chosen = args.shard.choose(&all);
+    let usual = config::load(&args.config)?;
+    let config_of = |vehicle: &Vehicle| match &vehicle.config {
+        None => Ok(usual.clone()),
+        Some(path) => config::load(path).map_err(|faults| LabError(faults.0.join("; "))),
+    };
+    let open = |config: &Config, found: &[PathBuf]| logs::open(&args.input, config, found);
+    let settings = ExportSettings {
+        access: LogAccess { open: &open, sleep_gap_s: args.input.sleep_gap },
+        format: TableFormat::Parquet,
+        out: args.out.clone(),
+        period_s: args.estimates,
+        jobs: args.jobs.map(usize::from),
+    };
+    let bar = progress_bar(
+        chosen.iter().map(|vehicle| vehicle.bytes).sum::<u64>(),
+        "{bar:32} {bytes}/{total_bytes} eta {eta}",
+    );
+    let outcomes = vehicles::run(&chosen, &config_of, &settings, &|bytes| bar.inc(bytes));
+    bar.finish_and_clear();
+    let outcomes = outcomes.map_err(failure)?;
+    unless_closed(if args.json { print_json(&document(&outcomes)) } else { summary(&outcomes, args.shard) })
+}
+
+fn document(outcomes: &[Outcome]) -> serde_json::Value {
+    let vehicles = outcomes.iter().map(|outcome| {
+        let (word, record) = parts(outcome);
+        json!({ "outcome": word, "record": record })
+    });
+    json!({ "version": VERSION, "vehicles": vehicles.collect::<Vec<_>>() })
+}
+
+fn parts(outcome: &Outcome) -> (&'static str, &vehicles::VehicleRecord) {
+    match outcome {
+        Outcome::Written(record) => ("replayed", record),
+        Outcome::Kept(record) => ("complete before", record),
+        Outcome::Failed(record) => ("failed", record),
+    }
+}
+
+fn summary(outcomes: &[Outcome], shard: Shard) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    for (word, record) in outcomes.iter().map(parts) {
+        let name = &record.line.vehicle;
+        if let Some(error) = &record.error {
+            writeln!(out, "{word}: {name}: {error}")?;
         }
-        if self.logs.len() > 1 && self.is_stdin() {
-            return Err(Failure::new("-: standard input must be the only log"));
-        }
-        Ok(())
+        record.notes.iter().try_for_each(|note| writeln!(out, "note: {name}: {note}"))?;
     }
+    let count = |wanted: &str| outcomes.iter().filter(|outcome| parts(outcome).0 == wanted).count();
+    let [replayed, before, failed] = ["replayed", "complete before", "failed"].map(count);
+    let days: f64 = outcomes.iter().map(|outcome| parts(outcome).1.days).sum();
+    let Shard { number, of } = shard;
+    writeln!(
+        out,
+        "part {number} of {of}: {replayed} vehicles replayed, {before} complete before, {failed} failed; {days:.1} days in all"
+    )
+}
 
-    /// Opens a log as it is read with a configuration.
-    pub(crate) fn open(&self, config: &Config, log: &Path) -> OpenedLog {
-        let mut options = log_options(&self.input, config);
-        let found = if options.csv.start_times.is_none() { truth::cycles_next_to(log) } else { None };
-        let note = found.as_ref().map(|table| format!("dated by {}", table.display()));
-        options.csv.start_times = options.csv.start_times.or(found);
-        (LogSource::new([log.to_owned()], options), note)
+fn put_together(args: &MergeArgs) -> Result<(), Failure> {
+    let wanted =
+        args.manifest.as_ref().map(|manifest| vehicles::read_manifest(manifest)).transpose().map_err(failure)?;
+    let merged = merge(&args.folders, wanted.as_deref(), &args.out).map_err(failure)?;
+    if args.json {
+        return unless_closed(print_json(&json!({ "version": VERSION, "merged": merged })));
     }
+    let MergeSummary { vehicles, failed, rows } = &merged;
+    let mut text: String = failed.iter().map(|(name, error)| format!("failed: {name}: {error}\n")).collect();
+    let rows: Vec<String> = rows.iter().map(|(table, rows)| format!("{table} {rows} rows")).collect();
+    text += &format!("{vehicles} vehicles, {} failed; {}\n", failed.len(), rows.join(", "));
+    print(&text)
+}
 
-    /// A gap longer than this means that the recorder was asleep, s.
-    pub(crate) fn sleep_gap_s(&self) -> f64 {
-        self.input.sleep_gap
-    }
-
-    /// Whether the log is standard input, which is read once only.
-    pub(crate) fn is_stdin(&self) -> bool {
-        self.logs.iter().any(|log| log == Path::new("-"))
-    }
-
-    /// Number of threads; `None` = one per core.
-    pub(crate) fn threads(&self) -> Option<usize> {
-        self.jobs.map(usize::from)
-    }
-
-    /// Progress in bytes, each log read `times`.
-    pub(crate) fn bar(&self, times: usize) -> ProgressBar {
-        let size = |path: &PathBuf| std::fs::metadata(path).map_or(0, |meta| meta.len());
-        let total = self.logs.iter().map(size).sum::<u64>() * times as u64;
-        progress_bar(total, "{bar:32} {bytes}/{total_bytes} eta {eta}")
-    }
+fn period(text: &str) -> Result<f64, String> {
+    within(text, |value| (0.0..=1e6).contains(&value), "0 to 1e6 s")
 }

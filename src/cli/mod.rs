@@ -28,6 +28,8 @@ mod history;
 #[cfg(feature = "lab")]
 mod import;
 mod label;
+#[cfg(feature = "lab")]
+mod logs;
 mod model;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod numbers;
@@ -133,6 +135,9 @@ enum Command {
     /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
     #[cfg(feature = "lab")]
     Export(Box<export::Args>),
+    /// Replay the vehicles of a fleet in parts, on any machines, and merge their tables
+    #[cfg(feature = "lab")]
+    Fleet(fleet::Args),
     /// Write a page about the state and the past of a battery, from a history or a replay
     #[cfg(feature = "lab")]
     Report(Box<report::Args>),
@@ -206,6 +211,8 @@ pub fn main() -> ExitCode {
         Command::Whatif(args) => whatif::run(&args),
         #[cfg(feature = "lab")]
         Command::Export(args) => export::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Fleet(args) => fleet::run(&args),
         #[cfg(feature = "lab")]
         Command::Report(args) => report::run(&args),
     };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use super::Failure;
 use super::control_args::rule_parser;
-use super::fleet::LogArgs;
+use super::logs::LogArgs;
 use super::numbers::{above_0, percent};
 use super::output::{failure, unless_closed};
 use crate::alarm::Rule;
@@ -85,7 +85,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.logs.is_stdin() && grid.replays > 1 {
         return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
     }
-    let open = |config: &Config, log: &Path| args.logs.open(config, log);
+    let open = |config: &Config, logs: &[PathBuf]| args.logs.open(config, logs);
     let settings = WhatifSettings {
         access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         end_of_life_ah: match args.end_of_life {

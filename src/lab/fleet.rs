@@ -1,4 +1,5 @@
-//! Work over many logs at once: alarms under other settings ([`whatif`]), and tables of the results ([`export`]).
+//! Work over many logs at once: alarms under other settings ([`whatif`]), tables of the results ([`export`]), and those of the vehicles
+//! of a fleet on several machines ([`vehicles`]).
 //!
 //! In: a configuration and logs of any form `replay` reads. Each log is replayed by itself, the logs on all cores; a log
 //! that fails is reported and the others continue. Memory is bounded by the results per log, not by its length.
@@ -10,6 +11,7 @@ mod track;
 pub mod truth;
 mod variant_batch;
 pub mod variants;
+pub mod vehicles;
 pub mod whatif;
 
 pub use drive::{LogAccess, OpenedLog};

@@ -32,6 +32,8 @@ mod export_cli;
 mod fit_cli;
 mod fit_logs;
 mod fit_logs_bad;
+#[cfg(feature = "lab")]
+mod fleet_cli;
 mod fuzz_seeds;
 #[cfg(feature = "lab")]
 mod gp_measured;

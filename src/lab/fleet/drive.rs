@@ -3,7 +3,7 @@
 //! Input: a log and a monitor without earlier input. Output: the monitor's outputs after each input, passed to a closure.
 //! Promise: the monitor receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use crate::config::Config;
@@ -22,8 +22,8 @@ pub type OpenedLog = (LogSource, Option<String>);
 /// How to read logs.
 #[derive(Clone, Copy)]
 pub struct LogAccess<'a> {
-    /// Opens a log as it is read with a configuration.
-    pub open: &'a (dyn Fn(&Config, &Path) -> OpenedLog + Sync),
+    /// Opens logs, one recording after the other, as they are read with a configuration.
+    pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
     /// A gap longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
 }

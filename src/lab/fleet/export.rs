@@ -6,6 +6,7 @@
 //! independent of the length of the log; a log that fails leaves no file and the others continue.
 
 mod columns;
+pub mod merge;
 mod rows;
 mod table;
 
@@ -60,8 +61,8 @@ pub struct ExportSettings<'a> {
     pub format: TableFormat,
     /// Folder for the logs' folders.
     pub out: PathBuf,
-    /// At most one estimate per cell in each period, s; 0 = every one.
-    pub period_s: f64,
+    /// At most one estimate per cell in each period, s; 0 = every one, `None` = no table of estimates.
+    pub period_s: Option<f64>,
     /// Threads; `None` = all cores.
     pub jobs: Option<usize>,
 }
@@ -92,12 +93,18 @@ pub fn run(
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<ExportResult, LabError>>, LabError> {
     let names = names(logs);
-    super::in_parallel(logs, settings.jobs, |index, log| export(config, log, &names[index], settings, report))
+    super::in_parallel(logs, settings.jobs, |index, log| {
+        export(config, std::slice::from_ref(log), &names[index], settings, report)
+    })
 }
 
-fn export(
+/// Exports the logs of one recording.
+///
+/// # Errors
+/// A log cannot be read or a table not be written; then no table is left.
+pub(super) fn export(
     config: &Config,
-    log: &Path,
+    logs: &[PathBuf],
     name: &str,
     settings: &ExportSettings<'_>,
     report: &dyn Fn(u64),
@@ -107,7 +114,8 @@ fn export(
         .map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
     let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
-    let source = (settings.access.open)(config, log);
+    let source = (settings.access.open)(config, logs);
+    let log = Path::new(&logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")).to_owned();
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
         let result = tables.take(monitor, out);
         out.clear();
@@ -115,12 +123,12 @@ fn export(
     };
     let monitor = Monitor::new(config.monitor.clone());
     let driven = drive(source, monitor, out, settings.access.sleep_gap_s, &mut each, report)?;
-    let span = driven.span_of(log)?;
-    let metadata = metadata(config, log, span, settings);
+    let span = driven.span_of(&log)?;
+    let metadata = metadata(config, &log, span, settings);
     let mut notes = driven.notes.clone();
-    notes.extend(remove_about(&folder, log)?);
+    notes.extend(remove_about(&folder, &log)?);
     let rows = tables.finish(&metadata)?;
-    let exported = ExportResult { log: log.to_owned(), folder, rows, days: driven.days(), notes };
+    let exported = ExportResult { log, folder, rows, days: driven.days(), notes };
     write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }
@@ -159,9 +167,9 @@ fn metadata(
         ("packwatch.log", log.display().to_string()),
         ("packwatch.start_utc", stamp::format_utc_micros(first)),
         ("packwatch.end_utc", stamp::format_utc_micros(last)),
-        ("packwatch.estimates_period_s", settings.period_s.to_string()),
     ];
-    run.into_iter().chain(vehicle).collect()
+    let period = settings.period_s.map(|period_s| ("packwatch.estimates_period_s", period_s.to_string()));
+    run.into_iter().chain(period).chain(vehicle).collect()
 }
 
 fn write_about(
@@ -183,7 +191,7 @@ fn write_about(
 
 /// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before
 /// it or a number after it.
-fn names(logs: &[PathBuf]) -> Vec<String> {
+pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
         if log == Path::new("-") {
@@ -208,7 +216,7 @@ fn names(logs: &[PathBuf]) -> Vec<String> {
 }
 
 /// Replaces characters that are not safe in file names.
-fn clean(name: &str) -> String {
+pub(super) fn clean(name: &str) -> String {
     let safe = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '_' };
     let name: String = name.chars().map(safe).collect();
     if name.starts_with('.') { format!("_{name}") } else { name }
@@ -217,7 +225,7 @@ fn clean(name: &str) -> String {
 /// The three tables of one log.
 struct LogTables {
     log: Arc<str>,
-    estimates: TableFile<EstimateRow>,
+    estimates: Option<TableFile<EstimateRow>>,
     half_cycles: TableFile<HalfCycleRow>,
     alarms: TableFile<AlarmRow>,
     period_ns: i64,
@@ -237,10 +245,13 @@ impl LogTables {
         let path = |table: &str| folder.join(format!("{table}.{ending}"));
         Ok(Self {
             log: name.into(),
-            estimates: TableFile::create(&path("estimates"), form, columns::ESTIMATES)?,
+            estimates: settings
+                .period_s
+                .map(|_| TableFile::create(&path("estimates"), form, columns::ESTIMATES))
+                .transpose()?,
             half_cycles: TableFile::create(&path("half_cycles"), form, columns::HALF_CYCLES)?,
             alarms: TableFile::create(&path("alarms"), form, columns::ALARMS)?,
-            period_ns: (settings.period_s * 1e9) as i64,
+            period_ns: (settings.period_s.unwrap_or(0.0) * 1e9) as i64,
             first: None,
             periods: vec![None; cells],
             rated_ah: config.monitor.model.rated_capacity_ah,
@@ -256,7 +267,8 @@ impl LogTables {
             let period = since_ns.checked_div(self.period_ns);
             if period.is_none() || last.is_none_or(|last| period > Some(last)) {
                 *last = period;
-                self.estimates.push(&EstimateRow {
+                let Some(estimates) = &mut self.estimates else { continue };
+                estimates.push(&EstimateRow {
                     log: self.log.clone(),
                     since_s: since_ns as f64 * 1e-9,
                     estimate: *estimate,
@@ -305,11 +317,14 @@ impl LogTables {
 
     /// Completes the files with their metadata; returns the rows of each.
     fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, LabError> {
-        Ok(BTreeMap::from([
-            ("estimates", self.estimates.finish(metadata)?),
+        let mut rows = BTreeMap::from([
             ("half_cycles", self.half_cycles.finish(metadata)?),
             ("alarms", self.alarms.finish(metadata)?),
-        ]))
+        ]);
+        if let Some(estimates) = self.estimates {
+            rows.insert("estimates", estimates.finish(metadata)?);
+        }
+        Ok(rows)
     }
 }
 

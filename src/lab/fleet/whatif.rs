@@ -159,7 +159,7 @@ fn replay(
     let learned = if is_usable { EndOfLifeSource::LearnedUsable } else { EndOfLifeSource::Learned };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
-    let source = (settings.access.open)(config, &job.log);
+    let source = (settings.access.open)(config, std::slice::from_ref(&job.log));
     let mut each = |_: &Monitor, out: &mut Outputs| {
         track.observe(&out.events);
         engines.take(&out.alarm_inputs, &mut batch);

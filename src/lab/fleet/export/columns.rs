@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use std::fmt::Write as _;
 
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+use crate::fleet::vehicles::VehicleRecord;
 
 use crate::cell::LossModes;
 use crate::health::Remaining;
@@ -165,6 +166,26 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
+/// Of `vehicles`, which [`merge`](super::merge) writes.
+pub(super) const VEHICLES: &[Column<VehicleRecord>] = columns! { VehicleRecord;
+    "log" Word "", "name of the vehicle, as in the other tables", |row| text(&row.line.vehicle);
+    "logs" Whole "", "its logs", |row| FieldValue::Whole(u32::try_from(row.line.logs.len()).ok());
+    "bytes" Real "bytes", "their size", |row| real(row.line.bytes as f64);
+    "cells" Whole "", "cells of the pack; 0 = the configuration cannot be read", |row| FieldValue::Whole(Some(row.cells));
+    "days" Real "days", "from the first stamp to the last", |row| real(row.days);
+    "half_cycles" Whole "", "rows in half_cycles", |row| rows_in(row, "half_cycles");
+    "alarms" Whole "", "rows in alarms", |row| rows_in(row, "alarms");
+    "estimates" Whole "", "rows in estimates", |row| rows_in(row, "estimates");
+    "config_sha256" Word "" null, "SHA-256 of the configuration", |row| FieldValue::Word(row.config_sha256.as_deref().map(Cow::Borrowed));
+    "error" Word "" null, "why it has no rows in the other tables; null = it was replayed", |row| FieldValue::Word(row.error.as_deref().map(Cow::Borrowed));
+    "notes" Word "" null, "notes on its logs", |row| FieldValue::Word(Some(row.notes.join("; ").into()).filter(|_| !row.notes.is_empty()));
+};
+
+fn rows_in<'r>(row: &VehicleRecord, table: &str) -> FieldValue<'r> {
+    let rows = row.rows.get(table).copied().unwrap_or(0);
+    FieldValue::Whole(Some(u32::try_from(rows).unwrap_or(u32::MAX)))
+}
+
 fn real<'r>(value: f64) -> FieldValue<'r> {
     FieldValue::Real(Some(value).filter(|value| value.is_finite()))
 }
@@ -214,6 +235,7 @@ pub fn reference() -> String {
         HALF_CYCLES,
     );
     page += &section("alarms", "A change of an alarm.", ALARMS);
+    page += &section("vehicles", "A vehicle of a fleet, written by `packwatch fleet merge`.", VEHICLES);
     page
 }
 

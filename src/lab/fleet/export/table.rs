@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use parquet::basic::Compression;
+use parquet::column::writer::ColumnCloseResult;
 use parquet::data_type::{BoolType, ByteArray, ByteArrayType, DataType, DoubleType, Int32Type, Int64Type};
 use parquet::errors::ParquetError;
-use parquet::file::metadata::KeyValue;
+use parquet::file::metadata::{KeyValue, ParquetMetaDataReader, RowGroupMetaData};
 use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use parquet::schema::parser::parse_message_type;
@@ -130,6 +131,54 @@ impl<R> TableFile<R> {
         file.finish()?;
         Ok(rows)
     }
+}
+
+/// Copies the row groups of Parquet files with these columns into one, in their order; its rows.
+///
+/// # Errors
+/// A file cannot be read or written, or has other columns.
+pub(super) fn concatenate<R>(
+    path: &Path,
+    parts: &[PathBuf],
+    columns: &'static [Column<R>],
+    metadata: &[(&'static str, String)],
+) -> Result<u64, LabError> {
+    let mut whole = TableFile::create(path, TableFormat::Parquet, columns)?;
+    let TableWriter::Parquet { out, .. } = &mut whole.writer else { return Err("a table in Parquet".into()) };
+    for part in parts {
+        let failed = |error: &dyn std::fmt::Display| LabError(format!("{}: cannot be read: {error}", part.display()));
+        let file = std::fs::File::open(part).map_err(|error| failed(&error))?;
+        let found = ParquetMetaDataReader::new().parse_and_finish(&file).map_err(|error| failed(&error))?;
+        if found.file_metadata().schema() != out.schema_descr().root_schema() {
+            return Err(failed(&"other columns than this program writes"));
+        }
+        for group in found.row_groups() {
+            whole.rows += u64::try_from(group.num_rows()).unwrap_or(0);
+            append_group(out, &file, group).map_err(|error| named_error(path, &error))?;
+        }
+    }
+    whole.finish(metadata)
+}
+
+fn append_group(
+    out: &mut SerializedFileWriter<ResultFile>,
+    file: &std::fs::File,
+    group: &RowGroupMetaData,
+) -> Result<(), ParquetError> {
+    let mut copy = out.next_row_group()?;
+    for column in group.columns() {
+        let count = |number: i64| u64::try_from(number).unwrap_or(0);
+        let chunk = ColumnCloseResult {
+            bytes_written: count(column.compressed_size()),
+            rows_written: count(group.num_rows()),
+            metadata: column.clone(),
+            bloom_filter: None,
+            column_index: None,
+            offset_index: None,
+        };
+        copy.append_column(file, chunk)?;
+    }
+    copy.close().map(drop)
 }
 
 /// As Parquet's own language writes it.

@@ -1,0 +1,137 @@
+//! Puts the vehicles' tables of several runs together: one Parquet file per table, a row group per vehicle, the vehicles by name.
+//!
+//! In: folders that [`run`](crate::fleet::vehicles::run) has written. Out: `vehicles.parquet`, a row for each vehicle, also one that
+//! failed, and `half_cycles`, `alarms` and, where they were exported, `estimates.parquet`. Promise: the same bytes, in whatever parts and in
+//! whatever order the vehicles were replayed; column chunks are copied as they are, so memory does not grow with the fleet.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use super::TableFormat;
+use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, VEHICLES};
+use super::table::{TableFile, concatenate};
+use crate::error::LabError;
+use crate::fleet::vehicles::{RECORD, Vehicle, VehicleRecord};
+
+/// What was merged.
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
+pub struct MergeSummary {
+    /// Vehicles, with those that failed.
+    pub vehicles: usize,
+    /// Vehicles without tables, and why.
+    pub failed: BTreeMap<String, String>,
+    /// Rows of each table.
+    pub rows: BTreeMap<String, u64>,
+}
+
+/// A vehicle with its folder.
+struct Found {
+    folder: PathBuf,
+    record: VehicleRecord,
+}
+
+/// Merges the vehicles in `folders` into `out`. `wanted`: the vehicles that must be there, and no others.
+///
+/// # Errors
+/// A vehicle is missing, is there twice with other contents, or was replayed by another version or with another period of the estimates; a
+/// table cannot be read or written.
+pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
+    let vehicles = found(folders)?;
+    check(&vehicles, wanted)?;
+    std::fs::create_dir_all(out).map_err(|error| LabError(format!("{}: cannot be created: {error}", out.display())))?;
+    let mut summary = MergeSummary { vehicles: vehicles.len(), ..MergeSummary::default() };
+    let metadata = [("packwatch.version", env!("CARGO_PKG_VERSION").to_owned())];
+    for table in ["half_cycles", "alarms", "estimates"] {
+        let has_table = |found: &&Found| found.record.rows.contains_key(table);
+        let parts: Vec<PathBuf> =
+            vehicles.values().filter(has_table).map(|found| found.folder.join(format!("{table}.parquet"))).collect();
+        let path = out.join(format!("{table}.parquet"));
+        let is_wanted = table != "estimates" || vehicles.values().any(|found| found.record.period_s.is_some());
+        if is_wanted {
+            let rows = match table {
+                "half_cycles" => concatenate(&path, &parts, HALF_CYCLES, &metadata)?,
+                "alarms" => concatenate(&path, &parts, ALARMS, &metadata)?,
+                _ => concatenate(&path, &parts, ESTIMATES, &metadata)?,
+            };
+            summary.rows.insert(table.to_owned(), rows);
+        }
+    }
+    let mut table = TableFile::create(&out.join("vehicles.parquet"), TableFormat::Parquet, VEHICLES)?;
+    for (name, Found { record, .. }) in vehicles {
+        table.push(&record)?;
+        summary.failed.extend(record.error.map(|error| (name, error)));
+    }
+    summary.rows.insert("vehicles".to_owned(), table.finish(&metadata)?);
+    Ok(summary)
+}
+
+/// The vehicles of all folders by name.
+fn found(folders: &[PathBuf]) -> Result<BTreeMap<String, Found>, LabError> {
+    let mut vehicles: BTreeMap<String, Found> = BTreeMap::new();
+    for folder in folders {
+        let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
+        for entry in std::fs::read_dir(folder).map_err(failed)? {
+            let folder = entry.map_err(failed)?.path();
+            let Some(record) = VehicleRecord::read(&folder) else { continue };
+            let name = record.line.vehicle.clone();
+            let Some(other) = vehicles.get(&name) else {
+                vehicles.insert(name, Found { folder, record });
+                continue;
+            };
+            if other.record != record {
+                let (one, two) = (other.folder.display(), folder.display());
+                return Err(LabError(format!("vehicle {name}: {one} and {two} differ")));
+            }
+        }
+    }
+    if vehicles.is_empty() {
+        let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
+        return Err(LabError(format!(
+            "{}: no vehicle; `packwatch fleet run` writes {RECORD} for each",
+            folders.join(", ")
+        )));
+    }
+    Ok(vehicles)
+}
+
+fn check(vehicles: &BTreeMap<String, Found>, wanted: Option<&[Vehicle]>) -> Result<(), LabError> {
+    let mut made = vehicles.values().map(|found| (&found.record, (&found.record.packwatch, found.record.period_s)));
+    let first = made.next();
+    if let Some((other, (version, period_s))) = made.find(|(_, by)| first.is_some_and(|(_, first)| first != *by)) {
+        let name = &other.line.vehicle;
+        let period =
+            period_s.map_or_else(|| "no estimates".to_owned(), |period_s| format!("an estimate each {period_s} s"));
+        return Err(LabError(format!(
+            "vehicle {name} is by packwatch {version} with {period}, unlike others: run it again"
+        )));
+    }
+    let Some(wanted) = wanted else { return Ok(()) };
+    let missing = wanted
+        .iter()
+        .filter(|vehicle| vehicles.get(&vehicle.vehicle).is_none_or(|found| found.record.line != **vehicle));
+    let missing: Vec<&str> = missing.map(|vehicle| vehicle.vehicle.as_str()).collect();
+    if !missing.is_empty() {
+        return Err(LabError(format!(
+            "{} of {} vehicles are not replayed: {}",
+            missing.len(),
+            wanted.len(),
+            some_of(&missing)
+        )));
+    }
+    let others: Vec<&str> = vehicles
+        .keys()
+        .map(String::as_str)
+        .filter(|name| wanted.iter().all(|vehicle| vehicle.vehicle != *name))
+        .collect();
+    if !others.is_empty() {
+        return Err(LabError(format!("{} vehicles are not in the manifest: {}", others.len(), some_of(&others))));
+    }
+    Ok(())
+}
+
+/// The first few names.
+fn some_of(names: &[&str]) -> String {
+    const SHOWN: usize = 8;
+    let more = if names.len() > SHOWN { ", ..." } else { "" };
+    names[..names.len().min(SHOWN)].join(", ") + more
+}

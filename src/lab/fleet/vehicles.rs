@@ -1,0 +1,367 @@
+//! A fleet in parts: the manifest of its vehicles, the vehicles of one part, and their tables.
+//!
+//! | | in | out |
+//! | --- | --- | --- |
+//! | [`plan`] | logs, and folders of the logs of one vehicle | a vehicle for each, by name |
+//! | [`Shard::choose`] | the vehicles | those of one part; parts of like size, and the same on every machine |
+//! | [`run`] | vehicles | a folder for each: tables as [`export`](super::export) writes them, and `vehicle.json` |
+//!
+//! `vehicle.json` is written last: a vehicle that has it, for the same line of the manifest, configuration and program, is complete and is
+//! not replayed again. A vehicle that fails has one with the reason, and the others continue.
+
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::export::{self, ExportSettings};
+use crate::config::Config;
+use crate::error::LabError;
+use crate::status::document::ConfigFile;
+
+/// Version of `vehicle.json`.
+const VERSION: u32 = 1;
+/// Its name in a vehicle's folder.
+pub(super) const RECORD: &str = "vehicle.json";
+
+/// A vehicle: a line of the manifest.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Vehicle {
+    /// Its name, which is that of its folder and in the first column of its tables.
+    pub vehicle: String,
+    /// Size of its logs.
+    pub bytes: u64,
+    /// Its logs, one recording after the other.
+    pub logs: Vec<PathBuf>,
+    /// Its configuration; `None` = that of the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub config: Option<PathBuf>,
+}
+
+/// Lists the vehicles of `paths` by name: a log is a vehicle, and so is a folder with logs, which are read in the order of their names.
+///
+/// # Errors
+/// A path cannot be read, or a folder has no log.
+pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
+    let names = export::names(paths);
+    let vehicle = |(path, vehicle): (&PathBuf, String)| {
+        let logs = if path.is_dir() { logs_in(path)? } else { vec![path.clone()] };
+        let size = |log: &PathBuf| {
+            let meta = std::fs::metadata(log).map_err(|error| LabError(format!("{}: {error}", log.display())))?;
+            Ok::<u64, LabError>(meta.len())
+        };
+        let bytes = logs.iter().map(size).sum::<Result<u64, LabError>>()?;
+        Ok(Vehicle { vehicle, bytes, logs, config: None })
+    };
+    let mut vehicles = paths.iter().zip(names).map(vehicle).collect::<Result<Vec<_>, LabError>>()?;
+    vehicles.sort_by(|a, b| a.vehicle.cmp(&b.vehicle));
+    Ok(vehicles)
+}
+
+/// The logs in a folder by name.
+fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
+    let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
+    let mut logs = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        if path.is_file() && path.file_name().is_some_and(is_log) {
+            logs.push(path);
+        }
+    }
+    logs.sort();
+    if logs.is_empty() {
+        return Err(LabError(format!(
+            "{}: no log in this folder, must have .log, .journal or .csv files",
+            folder.display()
+        )));
+    }
+    Ok(logs)
+}
+
+/// Whether a file is a log by its name, also a compressed one. Truth and cycle tables beside logs are none.
+fn is_log(name: &OsStr) -> bool {
+    let name = name.to_string_lossy();
+    let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name);
+    let is_table = name.ends_with(".truth.csv") || name.ends_with("_cycles.csv");
+    !name.starts_with('.') && !is_table && [".log", ".journal", ".csv"].iter().any(|ending| name.ends_with(ending))
+}
+
+/// The manifest: a JSON document on each line.
+pub fn manifest(vehicles: &[Vehicle]) -> String {
+    vehicles.iter().filter_map(|vehicle| serde_json::to_string(vehicle).ok()).map(|line| line + "\n").collect()
+}
+
+/// Reads a manifest.
+///
+/// # Errors
+/// The file cannot be read, a line is no vehicle, or two have one name: with the line.
+pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
+    let shown = path.display();
+    let text = std::fs::read_to_string(path).map_err(|error| LabError(format!("{shown}: cannot be read: {error}")))?;
+    let mut lines = BTreeMap::new();
+    let mut vehicles = Vec::new();
+    for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
+        let vehicle: Vehicle =
+            serde_json::from_str(line).map_err(|error| LabError(format!("{shown}:{number}: no vehicle: {error}")))?;
+        let Vehicle { vehicle: name, logs, .. } = &vehicle;
+        if name.is_empty() || export::clean(name) != *name {
+            let allowed = "must be letters, digits, '.', '_' and '-', not '.' first";
+            return Err(LabError(format!("{shown}:{number}: vehicle \"{name}\", {allowed}")));
+        }
+        if logs.is_empty() {
+            return Err(LabError(format!("{shown}:{number}: vehicle {name} has no logs")));
+        }
+        if let Some(first) = lines.insert(name.clone(), number) {
+            return Err(LabError(format!("{shown}:{number}: vehicle {name} is in line {first} already")));
+        }
+        vehicles.push(vehicle);
+    }
+    if vehicles.is_empty() {
+        return Err(LabError(format!("{shown}: no vehicle")));
+    }
+    Ok(vehicles)
+}
+
+/// One of several parts of a fleet, written `i/n`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shard {
+    /// Its number, from 1.
+    pub number: usize,
+    /// How many there are.
+    pub of: usize,
+}
+
+impl FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers = text.split_once('/').and_then(|(number, of)| Some((number.parse().ok()?, of.parse().ok()?)));
+        match numbers {
+            Some((number, of)) if (1..=of).contains(&number) => Ok(Self { number, of }),
+            _ => Err("must be I/N, I from 1 to N".to_owned()),
+        }
+    }
+}
+
+impl Shard {
+    /// The vehicles of this part: each goes, the largest first, to the part with the fewest bytes so far.
+    pub fn choose<'v>(&self, vehicles: &'v [Vehicle]) -> Vec<&'v Vehicle> {
+        let mut largest: Vec<&Vehicle> = vehicles.iter().collect();
+        largest.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.vehicle.cmp(&b.vehicle)));
+        let mut sizes = vec![0_u64; self.of];
+        largest.retain(|vehicle| {
+            let smallest = (0..self.of).min_by_key(|part| sizes[*part]).unwrap_or(0);
+            // An empty log takes some time too.
+            sizes[smallest] = sizes[smallest].saturating_add(vehicle.bytes.max(1));
+            smallest + 1 == self.number
+        });
+        largest
+    }
+}
+
+/// What is known of a vehicle after [`run`]: its `vehicle.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VehicleRecord {
+    /// Version of this form.
+    pub version: u32,
+    /// Version of the program.
+    pub packwatch: String,
+    /// The line of the manifest.
+    pub line: Vehicle,
+    /// SHA-256 of the configuration; `None` = it cannot be read.
+    pub config_sha256: Option<String>,
+    /// Period of the estimates, s; `None` = no table of estimates.
+    pub period_s: Option<f64>,
+    /// Why there are no tables; `None` = there are.
+    pub error: Option<String>,
+    /// Rows of each table.
+    pub rows: BTreeMap<String, u64>,
+    /// Cells of the pack.
+    pub cells: u32,
+    /// From the first stamp to the last, days.
+    pub days: f64,
+    /// Notes on its logs.
+    pub notes: Vec<String>,
+}
+
+impl VehicleRecord {
+    /// Reads it from a vehicle's folder; `None` = the vehicle is not complete.
+    pub fn read(folder: &Path) -> Option<Self> {
+        let text = std::fs::read(folder.join(RECORD)).ok()?;
+        serde_json::from_slice(&text).ok().filter(|record: &Self| record.version == VERSION)
+    }
+
+    /// Whether `other` would give the same tables.
+    fn is_of_same(&self, other: &Self) -> bool {
+        let key = |record: &Self| {
+            let Self { packwatch, line, config_sha256, period_s, .. } = record;
+            (packwatch.clone(), line.clone(), config_sha256.clone(), *period_s)
+        };
+        key(self) == key(other)
+    }
+}
+
+/// How a vehicle came out.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// It was replayed.
+    Written(VehicleRecord),
+    /// It was complete.
+    Kept(VehicleRecord),
+    /// It has no tables: the reason is in the record.
+    Failed(VehicleRecord),
+}
+
+/// Replays the vehicles; returns how each came out, in their order. `config_of` reads the configuration of a vehicle, `report` receives the
+/// bytes read since its last call, or those of a vehicle that is complete.
+///
+/// # Errors
+/// When no threads can be started, or a record cannot be written.
+pub fn run(
+    vehicles: &[&Vehicle],
+    config_of: &(dyn Fn(&Vehicle) -> Result<Config, LabError> + Sync),
+    settings: &ExportSettings<'_>,
+    report: &(dyn Fn(u64) + Sync),
+) -> Result<Vec<Outcome>, LabError> {
+    let outcomes = super::in_parallel(vehicles, settings.jobs, |_, vehicle| one(vehicle, config_of, settings, report))?;
+    outcomes.into_iter().collect()
+}
+
+fn one(
+    vehicle: &Vehicle,
+    config_of: &(dyn Fn(&Vehicle) -> Result<Config, LabError> + Sync),
+    settings: &ExportSettings<'_>,
+    report: &dyn Fn(u64),
+) -> Result<Outcome, LabError> {
+    let folder = settings.out.join(&vehicle.vehicle);
+    let config = config_of(vehicle);
+    let mut record = VehicleRecord {
+        version: VERSION,
+        packwatch: env!("CARGO_PKG_VERSION").to_owned(),
+        line: vehicle.clone(),
+        config_sha256: config.as_ref().ok().and_then(|config| ConfigFile::of(&config.path)).map(|file| file.sha256),
+        period_s: settings.period_s,
+        error: None,
+        rows: BTreeMap::new(),
+        cells: config.as_ref().map_or(0, |config| config.monitor.sample.cells.into()),
+        days: 0.0,
+        notes: Vec::new(),
+    };
+    let earlier = VehicleRecord::read(&folder).filter(|earlier| earlier.is_of_same(&record) && earlier.error.is_none());
+    if let Some(earlier) = earlier {
+        report(vehicle.bytes);
+        return Ok(Outcome::Kept(earlier));
+    }
+    // From here on the folder is not complete.
+    match std::fs::remove_file(folder.join(RECORD)) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
+        _ => {}
+    }
+    // A defect of the program in one vehicle does not end the others.
+    let replayed = catch_unwind(AssertUnwindSafe(|| {
+        let config = config?;
+        export::export(&config, &vehicle.logs, &vehicle.vehicle, settings, report)
+    }));
+    match replayed
+        .unwrap_or_else(|_| Err(LabError("the program has a defect here: its message is on standard error".to_owned())))
+    {
+        Ok(exported) => {
+            record.rows = exported.rows.iter().map(|(table, rows)| ((*table).to_owned(), *rows)).collect();
+            (record.days, record.notes) = (exported.days, exported.notes);
+            write(&folder, &record)?;
+            Ok(Outcome::Written(record))
+        }
+        Err(error) => {
+            record.error = Some(error.0);
+            std::fs::create_dir_all(&folder).map_err(|error| named(&folder, &error))?;
+            write(&folder, &record)?;
+            Ok(Outcome::Failed(record))
+        }
+    }
+}
+
+fn write(folder: &Path, record: &VehicleRecord) -> Result<(), LabError> {
+    Ok(crate::write_file(&folder.join(RECORD), &serde_json::to_vec_pretty(record)?)?)
+}
+
+fn named(folder: &Path, error: &std::io::Error) -> LabError {
+    LabError(format!("{}: {error}", folder.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn vehicle(name: &str, bytes: u64) -> Vehicle {
+        Vehicle { vehicle: name.to_owned(), bytes, logs: vec![PathBuf::from(format!("{name}.log"))], config: None }
+    }
+
+    #[test]
+    fn every_vehicle_is_in_one_part_and_the_parts_are_of_like_size() {
+        let vehicles: Vec<Vehicle> =
+            (0..100).map(|n| vehicle(&format!("car{n:02}"), 1000 + 37 * (n * n % 101))).collect();
+        for of in [1, 2, 3, 7, 100, 130] {
+            let parts: Vec<Vec<&Vehicle>> = (1..=of).map(|number| Shard { number, of }.choose(&vehicles)).collect();
+            let mut names: Vec<&str> = parts.iter().flatten().map(|vehicle| vehicle.vehicle.as_str()).collect();
+            names.sort_unstable();
+            assert_eq!(names, vehicles.iter().map(|vehicle| vehicle.vehicle.as_str()).collect::<Vec<_>>(), "{of}");
+            let sizes: Vec<u64> = parts.iter().map(|part| part.iter().map(|vehicle| vehicle.bytes).sum()).collect();
+            let (least, most) = (sizes.iter().min().unwrap(), sizes.iter().max().unwrap());
+            assert!(most - least <= 4700, "no more than the largest vehicle: {sizes:?}");
+        }
+        // The order of the manifest is of no importance.
+        let reversed: Vec<Vehicle> = vehicles.iter().rev().cloned().collect();
+        assert_eq!(Shard { number: 2, of: 3 }.choose(&vehicles), Shard { number: 2, of: 3 }.choose(&reversed));
+    }
+
+    #[test]
+    fn a_shard_is_one_of_several() {
+        assert_eq!("2/4".parse(), Ok(Shard { number: 2, of: 4 }));
+        for text in ["0/4", "5/4", "1", "1/0", "a/b", "1/4/2", "-1/4", ""] {
+            assert!(text.parse::<Shard>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_manifest_reads_back_and_its_faults_name_the_line() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("fleet.jsonl");
+        let vehicles = vec![vehicle("a", 1), Vehicle { config: Some("b.toml".into()), ..vehicle("b", 2) }];
+        std::fs::write(&path, manifest(&vehicles)).unwrap();
+        assert_eq!(read_manifest(&path), Ok(vehicles));
+        let line = |name: &str| manifest(&[vehicle(name, 1)]);
+        for (text, fault) in [
+            (line("a") + "\n" + &line("a"), ":3: vehicle a is in line 1 already"),
+            (line("a/../b"), ":1: vehicle \"a/../b\", must be letters"),
+            (line(".."), ":1: vehicle \"..\", must be letters"),
+            (line("a").replace("\"a.log\"", ""), ":1: vehicle a has no logs"),
+            (line("a").replace("bytes", "size"), ":1: no vehicle: unknown field `size`"),
+            (String::new(), ": no vehicle"),
+        ] {
+            std::fs::write(&path, &text).unwrap();
+            let error = read_manifest(&path).unwrap_err().0;
+            assert!(error.contains(fault), "{fault}\n{error}");
+        }
+    }
+
+    #[test]
+    fn a_folder_is_a_vehicle_of_all_its_logs() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("car 1");
+        std::fs::create_dir(&folder).unwrap();
+        for name in ["b.log.gz", "a.log", "a.truth.csv", "x_cycles.csv", "notes.txt", ".c.log"] {
+            std::fs::write(folder.join(name), "12345").unwrap();
+        }
+        let vehicles = plan(&[folder.clone()]).unwrap();
+        let logs = vec![folder.join("a.log"), folder.join("b.log.gz")];
+        assert_eq!(vehicles, [Vehicle { vehicle: "car_1".to_owned(), bytes: 10, logs, config: None }]);
+        let empty = place.path().join("empty");
+        std::fs::create_dir(&empty).unwrap();
+        assert!(plan(&[empty]).unwrap_err().0.contains("no log in this folder"));
+        assert!(plan(&["missing.log".into()]).unwrap_err().0.contains("missing.log: "));
+    }
+}

@@ -1,0 +1,193 @@
+//! `packwatch fleet` as its user runs it: the same bytes in whatever parts, nothing lost by a kill or a damaged log.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use assert_cmd::Command;
+use parquet::file::reader::{FileReader, SerializedFileReader};
+use parquet::record::RowAccessor;
+use serde_json::Value;
+
+const TABLES: [&str; 4] = ["vehicles", "half_cycles", "alarms", "estimates"];
+
+struct Fleet {
+    folder: tempfile::TempDir,
+}
+
+impl Fleet {
+    /// Six lives, one of them in three files of a folder, and a log without a record.
+    fn new() -> Self {
+        let fleet = Self { folder: tempfile::tempdir().unwrap() };
+        fs::create_dir_all(fleet.path("logs/six")).unwrap();
+        for (seed, name) in
+            ["one.log", "two.log.gz", "three.log", "four.log", "five.log", "six/whole"].iter().enumerate()
+        {
+            let (out, seed, cycles) = (format!("logs/{name}"), seed.to_string(), (2 + seed % 3).to_string());
+            let args = ["simulate", "paper", "--out", &out, "--cycles", &cycles, "--seed", &seed, "--config"];
+            fleet.command(&args).arg(config()).assert().success();
+        }
+        let whole = fs::read_to_string(fleet.path("logs/six/whole")).unwrap();
+        let lines: Vec<&str> = whole.lines().collect();
+        for (number, part) in lines.chunks(lines.len().div_ceil(3)).enumerate() {
+            fs::write(fleet.path(&format!("logs/six/{number}.log")), part.join("\n") + "\n").unwrap();
+        }
+        fs::write(fleet.path("logs/broken.log"), "no frame\nno frame either\n").unwrap();
+        let names = ["six", "one.log", "two.log.gz", "broken.log", "three.log", "four.log", "five.log"];
+        let logs = names.map(|name| format!("logs/{name}"));
+        fleet.command(&["fleet", "plan", "-o", "fleet.jsonl"]).args(logs).assert().success();
+        fleet
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::cargo_bin("packwatch").unwrap();
+        command.current_dir(self.folder.path()).args(args);
+        command
+    }
+
+    /// Replays a part; returns what is printed.
+    fn run(&self, out: &str, more: &[&str]) -> String {
+        let mut command = self.command(&["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", out, "-c"]);
+        let ran = command.arg(config()).args(more).assert().success();
+        String::from_utf8(ran.get_output().stdout.clone()).unwrap()
+    }
+
+    /// The bytes of the merged tables.
+    fn merged(&self, folders: &[&str], out: &str) -> Vec<Vec<u8>> {
+        let mut command = self.command(&["fleet", "merge", "--manifest", "fleet.jsonl", "-o", out]);
+        command.args(folders).assert().success();
+        TABLES.map(|table| fs::read(self.path(&format!("{out}/{table}.parquet"))).unwrap()).into()
+    }
+
+    fn refused(&self, args: &[&str]) -> String {
+        let ran = self.command(args).assert().failure();
+        String::from_utf8(ran.get_output().stderr.clone()).unwrap()
+    }
+}
+
+fn config() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo.toml")
+}
+
+#[test]
+fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
+    let fleet = Fleet::new();
+    let printed = fleet.run("whole", &[]);
+    assert!(printed.contains("failed: broken: logs/broken.log: holds no record"), "{printed}");
+    assert!(printed.contains("part 1 of 1: 6 vehicles replayed, 0 complete before, 1 failed"), "{printed}");
+    let whole = fleet.merged(&["whole"], "merged");
+    for shard in ["3/4", "1/4", "4/4", "2/4"] {
+        fleet.run(&format!("part{}", &shard[..1]), &["--shard", shard, "--jobs", "1"]);
+    }
+    assert!(whole == fleet.merged(&["part2", "part4", "part1", "part3"], "of_four"), "of four parts");
+
+    let table = |name: &str| {
+        SerializedFileReader::new(fs::File::open(fleet.path(&format!("merged/{name}.parquet"))).unwrap()).unwrap()
+    };
+    let rows = table("vehicles").get_row_iter(None).unwrap().map(Result::unwrap).collect::<Vec<_>>();
+    let names: Vec<&String> = rows.iter().map(|row| row.get_string(0).unwrap()).collect();
+    assert_eq!(names, ["broken", "five", "four", "one", "six", "three", "two"]);
+    assert!(rows[0].get_string(9).unwrap().contains("holds no record"), "one row says why: {}", rows[0]);
+    let half_cycles = table("half_cycles");
+    assert_eq!(half_cycles.metadata().num_row_groups(), 6, "one of each vehicle with tables");
+    let stated: i64 = rows.iter().map(|row| i64::from(row.get_int(5).unwrap())).sum();
+    assert_eq!(half_cycles.metadata().file_metadata().num_rows(), stated);
+
+    // The three files of a folder are one life.
+    let mut command = fleet.command(&["export", "--period", "60", "--out", "alone", "logs/six/whole", "-c"]);
+    command.arg(config()).assert().success();
+    let rows_of = |path: &str| {
+        let reader = SerializedFileReader::new(fs::File::open(fleet.path(path)).unwrap()).unwrap();
+        let rows = reader.get_row_iter(None).unwrap().map(|row| row.unwrap().to_string());
+        rows.map(|row| row.split_once(", ").unwrap().1.to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(rows_of("whole/six/estimates.parquet"), rows_of("alone/whole/estimates.parquet"));
+}
+
+#[test]
+fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
+    let fleet = Fleet::new();
+    let wanted = {
+        fleet.run("whole", &[]);
+        fleet.merged(&["whole"], "merged")
+    };
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("packwatch"))
+        .current_dir(fleet.folder.path())
+        .args(["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", "killed", "--jobs", "1", "-c"])
+        .arg(config())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let complete = || {
+        let folders = fs::read_dir(fleet.path("killed")).into_iter().flatten().flatten();
+        folders.filter(|folder| folder.path().join("vehicle.json").exists()).count()
+    };
+    let since = Instant::now();
+    while complete() < 2 && since.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let before = complete();
+    assert!((2..7).contains(&before), "killed in the middle: {before} complete");
+    let missing = fleet.refused(&["fleet", "merge", "killed", "--manifest", "fleet.jsonl", "-o", "early"]);
+    assert!(missing.contains("of 7 vehicles are not replayed: "), "{missing}");
+
+    let printed = fleet.run("killed", &[]);
+    let document: Value = serde_json::from_str(&fleet.run("killed", &["--json"])).unwrap();
+    let outcomes = document["vehicles"].as_array().unwrap();
+    let count = |word: &str| outcomes.iter().filter(|vehicle| vehicle["outcome"] == word).count();
+    let kept: usize =
+        printed.split(" complete before").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
+    // The broken log may be one of those that have a record.
+    assert!((before - 1..=before).contains(&kept) && kept > 0, "{before} were complete: {printed}");
+    assert_eq!((count("complete before"), count("failed")), (6, 1), "a vehicle that failed is tried again");
+    assert!(wanted == fleet.merged(&["killed"], "continued"));
+
+    // Another configuration, other logs: replayed again.
+    fs::write(
+        fleet.path("fleet.jsonl"),
+        fs::read_to_string(fleet.path("fleet.jsonl")).unwrap().replace("\"bytes\":", "\"bytes\":1"),
+    )
+    .unwrap();
+    assert!(fleet.run("killed", &[]).contains("6 vehicles replayed, 0 complete before"));
+}
+
+#[test]
+fn what_does_not_fit_together_is_not_merged() {
+    let fleet = Fleet::new();
+    fleet.run("first", &["--shard", "1/2"]);
+    let merge = |folders: &[&str]| fleet.refused(&[&["fleet", "merge", "-o", "merged"], folders].concat());
+    assert!(merge(&["logs"]).contains("logs: no vehicle"), "{}", merge(&["logs"]));
+    assert!(merge(&["nowhere"]).contains("nowhere: cannot be read"));
+    let mut command = fleet.command(&["fleet", "run", "fleet.jsonl", "--shard", "2/2", "-o", "second", "-c"]);
+    command.arg(config()).assert().success();
+    let error = merge(&["first", "second"]);
+    assert!(error.contains("unlike others: run it again") && error.contains("estimate"), "{error}");
+    assert!(!fleet.path("merged").exists());
+
+    let manifest = fs::read_to_string(fleet.path("fleet.jsonl")).unwrap();
+    fs::write(fleet.path("fleet.jsonl"), manifest.lines().next().unwrap()).unwrap();
+    let error = fleet.refused(&["fleet", "merge", "first", "--manifest", "fleet.jsonl", "-o", "merged"]);
+    assert!(error.contains("not replayed: broken") || error.contains("are not in the manifest: "), "{error}");
+    let error = fleet.refused(&["fleet", "run", "fleet.jsonl", "--shard", "3/2", "-o", "x", "-c", "demo.toml"]);
+    assert!(error.contains("must be I/N, I from 1 to N"), "{error}");
+}
+
+#[test]
+fn a_vehicle_may_have_a_configuration_of_its_own() {
+    let fleet = Fleet::new();
+    let text = fs::read_to_string(fleet.path("fleet.jsonl")).unwrap();
+    let own = text.replace("{\"vehicle\":\"one\",", "{\"vehicle\":\"one\",\"config\":\"missing.toml\",");
+    fs::write(fleet.path("fleet.jsonl"), &own).unwrap();
+    let printed = fleet.run("out", &[]);
+    assert!(printed.contains("failed: one: missing.toml"), "{printed}");
+    assert!(printed.contains("5 vehicles replayed, 0 complete before, 2 failed"), "{printed}");
+    fs::write(fleet.path("fleet.jsonl"), own.replace("missing.toml", config().to_str().unwrap())).unwrap();
+    assert!(fleet.run("out", &[]).contains("1 vehicles replayed, 5 complete before, 1 failed"));
+}
