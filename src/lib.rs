@@ -24,7 +24,7 @@
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
-//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, plots, import, discover (feature `lab`) |
+//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame

@@ -356,7 +356,7 @@ mod tests {
         for name in ["b.log.gz", "a.log", "a.truth.csv", "x_cycles.csv", "notes.txt", ".c.log"] {
             std::fs::write(folder.join(name), "12345").unwrap();
         }
-        let vehicles = plan(&[folder.clone()]).unwrap();
+        let vehicles = plan(std::slice::from_ref(&folder)).unwrap();
         let logs = vec![folder.join("a.log"), folder.join("b.log.gz")];
         assert_eq!(vehicles, [Vehicle { vehicle: "car_1".to_owned(), bytes: 10, logs, config: None }]);
         let empty = place.path().join("empty");
