@@ -117,7 +117,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn plan(args: &PlanArgs) -> Result<(), Failure> {
     check_distinct(&args.logs)?;
     let vehicles = vehicles::plan(&args.logs).map_err(failure)?;
-    let text = vehicles::manifest(&vehicles);
+    let text = vehicles::manifest(&vehicles).map_err(failure)?;
     if args.out == Path::new("-") {
         return print(&text);
     }

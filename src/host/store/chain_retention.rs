@@ -18,8 +18,12 @@ use super::meta::Meta;
 use super::retention::thin_moment;
 use super::rows::HistoryTable;
 
-/// Rows looked at in one checkpoint, of which most may go: many times what one minute adds.
-const STEP_ROWS: u32 = 512;
+/// Rows looked at in one checkpoint.
+const STEP_ROWS: i64 = 512;
+/// Rows deleted in one checkpoint: more than a minute adds to a pack of 1,000 cells, in some 0.1 s.
+const STEP_DELETED: i64 = 64;
+/// So many times as many where checkpoints are rare, or another limit was configured: from an eighth above the limit on.
+const HASTE: i64 = 16;
 /// Rows of a table among which a neighbour is looked for: several for each cell of the largest pack.
 const NEIGHBOUR_ROWS: u32 = 20_000;
 
@@ -33,16 +37,17 @@ pub(super) struct ChainSweep {
 }
 
 impl ChainSweep {
-    /// Deletes rows while there are more than `max_rows`; looks at [`STEP_ROWS`] at most.
+    /// Deletes some rows if there are more than `max_rows`.
     pub(super) fn thin(&mut self, connection: &Connection, meta: &mut Meta, max_rows: i64) -> rusqlite::Result<()> {
         if meta.chained_rows() <= max_rows {
             return Ok(());
         }
+        let haste = if meta.chained_rows() - max_rows > max_rows / 8 { HASTE } else { 1 };
         let table = HistoryTable::CHAINED[self.table % HistoryTable::CHAINED.len()];
         let newest = meta.head.count - max_rows / 2;
         let sql = format!(
             "SELECT r.seq, r.hash, r.moment, {}, m.pack, {} FROM {} r JOIN moment m ON m.id = r.moment WHERE r.seq > ?1 AND \
-             r.seq <= ?2 ORDER BY r.seq LIMIT {STEP_ROWS}",
+             r.seq <= ?2 ORDER BY r.seq LIMIT ?3",
             redundant_sql(table),
             subject(table).join(", "),
             table.name(),
@@ -50,24 +55,28 @@ impl ChainSweep {
         let subjects = subject(table).len();
         let rows: Vec<OldRow> = connection
             .prepare_cached(&sql)?
-            .query_map(params![self.seq, newest], |row| {
+            .query_map(params![self.seq, newest, haste * STEP_ROWS], |row| {
                 let about = (4..=4 + subjects).map(|at| row.get(at)).collect::<rusqlite::Result<_>>()?;
                 Ok(OldRow { seq: row.get(0)?, hash: row.get(1)?, moment: row.get(2)?, may_go: row.get(3)?, about })
             })?
             .collect::<rusqlite::Result<_>>()?;
-        for row in &rows {
-            let age = meta.head.count - row.seq;
-            if row.may_go
-                && zero_bits(&row.hash) < zero_bits_kept(age, max_rows)
-                && has_neighbours(connection, table, row)?
-            {
-                delete(connection, meta, table, row)?;
-            }
-        }
         *self = match rows.last() {
             Some(last) => Self { seq: last.seq, ..*self },
             None => Self { table: (self.table + 1) % HistoryTable::CHAINED.len(), seq: 0 },
         };
+        let mut deleted = 0;
+        for row in &rows {
+            let age = meta.head.count - row.seq;
+            let is_kept = zero_bits(&row.hash) >= zero_bits_kept(age, max_rows);
+            if !is_kept && row.may_go && has_neighbours(connection, table, row)? {
+                delete(connection, meta, table, row)?;
+                deleted += 1;
+            }
+            if deleted == haste * STEP_DELETED {
+                self.seq = row.seq;
+                break;
+            }
+        }
         Ok(())
     }
 }

@@ -91,8 +91,15 @@ fn is_log(name: &OsStr) -> bool {
 }
 
 /// The manifest: a JSON document on each line.
-pub fn manifest(vehicles: &[Vehicle]) -> String {
-    vehicles.iter().filter_map(|vehicle| serde_json::to_string(vehicle).ok()).map(|line| line + "\n").collect()
+///
+/// # Errors
+/// A path is no UTF-8.
+pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
+    let line = |vehicle: &Vehicle| match serde_json::to_string(vehicle) {
+        Ok(line) => Ok(line + "\n"),
+        Err(error) => Err(LabError(format!("vehicle {}: {error}", vehicle.vehicle))),
+    };
+    vehicles.iter().map(line).collect()
 }
 
 /// Reads a manifest.
@@ -331,9 +338,9 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("fleet.jsonl");
         let vehicles = vec![vehicle("a", 1), Vehicle { config: Some("b.toml".into()), ..vehicle("b", 2) }];
-        std::fs::write(&path, manifest(&vehicles)).unwrap();
+        std::fs::write(&path, manifest(&vehicles).unwrap()).unwrap();
         assert_eq!(read_manifest(&path), Ok(vehicles));
-        let line = |name: &str| manifest(&[vehicle(name, 1)]);
+        let line = |name: &str| manifest(&[vehicle(name, 1)]).unwrap();
         for (text, fault) in [
             (line("a") + "\n" + &line("a"), ":3: vehicle a is in line 1 already"),
             (line("a/../b"), ":1: vehicle \"a/../b\", must be letters"),
