@@ -53,6 +53,8 @@ def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwa
             rows = [replay_vehicle(line, command) for line in batch.column(0).to_pylist()]
             yield pyarrow.RecordBatch.from_pylist(rows, schema=arrow_schema())
 
+    # The executors' Python needs this module.
+    spark.sparkContext.addPyFile(os.path.abspath(__file__))
     # The largest first, a task each: the last tasks are short.
     largest = sorted(lines, key=lambda line: -json.loads(line)["bytes"])
     numbered = spark.sparkContext.parallelize([(line,) for line in largest], max(1, len(largest)))
