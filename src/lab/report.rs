@@ -6,6 +6,8 @@
 mod bins;
 mod context;
 mod data;
+#[cfg(test)]
+mod examples;
 mod forecast;
 mod html;
 mod limits;

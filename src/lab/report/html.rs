@@ -284,14 +284,9 @@ fn alarms(
     outlook: Option<&forecast::Outlook>,
     pictures: &[(String, Picture)],
 ) -> Markup {
-    // What many cells share is one row: the alarms of a rule that change in the same second.
-    let is_alike = |a: &AlarmRecord, b: &AlarmRecord| {
-        let kind = |row: &AlarmRecord| (row.rule.clone(), row.severity.clone(), row.change.clone(), row.cell.is_some());
-        kind(a) == kind(b) && (a.time_s - b.time_s).abs() < 1.0
-    };
-    let groups: Vec<&[AlarmRecord]> = data.alarms.chunk_by(is_alike).collect();
-    let row = |group: &&[AlarmRecord]| {
-        let row = &group[0];
+    let groups = alike(&data.alarms);
+    let row = |group: &Vec<&AlarmRecord>| {
+        let row = group[0];
         let more = if group.len() > 1 { format!("; {} cells in all", group.len()) } else { String::new() };
         let when = summary::moment(data, row.time_s);
         vec![when, row.rule.clone(), row.severity.clone(), row.change.clone(), summary::words(row, "was") + &more]
@@ -325,6 +320,30 @@ fn alarms(
             }
         }
     }
+}
+
+/// Groups what many cells share: the same change of a rule and severity within a second, each of another cell.
+///
+/// The groups are in the order of their first change.
+fn alike(alarms: &[AlarmRecord]) -> Vec<Vec<&AlarmRecord>> {
+    let is_same_limit = |a: &AlarmRecord, b: &AlarmRecord| (&a.rule, &a.severity) == (&b.rule, &b.severity);
+    let is_same_alarm = |a: &AlarmRecord, b: &AlarmRecord| a.cell == b.cell && is_same_limit(a, b);
+    let is_same_change = |a: &AlarmRecord, b: &AlarmRecord| {
+        a.change == b.change && a.cell.is_some() == b.cell.is_some() && is_same_limit(a, b)
+    };
+    let mut groups: Vec<Vec<&AlarmRecord>> = Vec::new();
+    for row in alarms {
+        // Alarms of several rules come cell by cell, so the group need not be the latest. But no change of an alarm is
+        // listed before an earlier one of the same alarm.
+        let may_precede = |group: &&mut Vec<&AlarmRecord>| {
+            (group[0].time_s - row.time_s).abs() < 1.0 && group.iter().all(|other| !is_same_alarm(other, row))
+        };
+        match groups.iter_mut().rev().take_while(may_precede).find(|group| is_same_change(group[0], row)) {
+            Some(group) => group.push(row),
+            None => groups.push(vec![row]),
+        }
+    }
+    groups
 }
 
 /// A table of the first [`MAX_ROWS`] rows with a note on their total number.

@@ -524,3 +524,6 @@ fn coverage(data: &Data) -> Option<Picture> {
     let description = "Share of voltage readings within the 95 % interval the filter expected, percent";
     chart(title, description, clock.axis, Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest), layers)
 }
+
+#[cfg(test)]
+mod tests;

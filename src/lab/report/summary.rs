@@ -393,6 +393,7 @@ fn recharge_tile(data: &Data) -> Tile {
 mod tests {
     use super::*;
     use crate::report::data::CapacityRecord;
+    use crate::report::examples;
 
     fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRecord {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());
@@ -495,8 +496,24 @@ mod tests {
         let doubted = capacity(&of(&data));
         assert_eq!(doubted.note, "\u{b1} 0.010, cell 3; assumed, not measured yet");
         assert_eq!(doubted.doubt.as_deref(), Some("not trusted: cell 3"));
-        let unmarked = of(&data).tiles.into_iter().filter(|tile| tile.doubt.is_none() && tile.value != "unknown");
-        assert_eq!(unmarked.map(|tile| tile.name).collect::<Vec<_>>(), ["Use so far", "Alarms raised now"]);
+    }
+
+    #[test]
+    fn every_estimate_with_a_value_is_marked_and_no_count_is() {
+        let config = examples::config();
+        let context = PageContext { config: Some(&config), ..PageContext::default() };
+        let mut data = examples::worn(3);
+        let of = |data: &Data| of(data, &context, &forecast::outlook(data, &context)).tiles;
+        let trusted = of(&data);
+        assert!(trusted.iter().all(|tile| tile.value != "unknown" && tile.doubt.is_none()), "{trusted:?}");
+        data.untrusted.insert(2);
+        let (marked, unmarked): (Vec<Tile>, _) = of(&data).into_iter().partition(|tile| tile.doubt.is_some());
+        assert!(marked.iter().all(|tile| tile.doubt.as_deref() == Some("not trusted: cell 3")), "{marked:?}");
+        let names = |tiles: Vec<Tile>| tiles.into_iter().map(|tile| tile.name).collect::<Vec<_>>();
+        let estimates =
+            ["State of health", "Capacity", "Usable capacity", "Lithium lost", "Resistance", "Recharge period"];
+        assert_eq!(names(marked), [&estimates[..], &["Remaining life"]].concat());
+        assert_eq!(names(unmarked), ["Use so far", "Alarms raised now"]);
     }
 
     #[test]

@@ -1,11 +1,13 @@
-//! The size of a page of a long life, and the text of a page without data.
+//! The size of a page of a long life, the text of a page without data, and the cards and alarms of a worn pack.
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
 use crate::findings::{Diagnosis, UnknownImbalance};
+use crate::health::InsufficientData;
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
+use crate::report::examples::{self, HALVES, end_s};
 
 #[test]
 fn a_page_of_nothing_says_unknown_and_fetches_nothing() {
@@ -106,14 +108,18 @@ fn capacity(half: u16, cell: u16) -> EventKind {
 }
 
 fn alarm(half: u16, active: bool) -> EventKind {
+    change(Rule::CapacityLow, half % 96, active, capacity_ah(half, half % 96))
+}
+
+fn change(rule: Rule, cell: u16, active: bool, value: f64) -> EventKind {
     EventKind::Alarm {
-        rule: Rule::CapacityLow,
-        cell: Some(CellIndex(half % 96)),
+        rule,
+        cell: Some(CellIndex(cell)),
         change: if active { Change::Raised } else { Change::Cleared },
         state: if active { AlarmState::Active } else { AlarmState::Inactive },
         active,
         severity: Severity::Warning,
-        value: Some(capacity_ah(half, half % 96)),
+        value: Some(value),
         probability: Some(0.9),
         threshold: 1.82,
         occurrences: 1,
@@ -160,4 +166,180 @@ fn the_pack_of_a_history_stands_under_the_title() {
     let mut data = Data::new(Origin::Store);
     data.source.pack = Some(3);
     assert!(page(&data, &PageContext::default()).contains("pack 3 of this history"));
+}
+
+const PLUS_MINUS: char = '\u{b1}';
+
+/// A card as it stands on the page.
+struct Card<'a> {
+    name: &'a str,
+    /// Its value and its note.
+    text: String,
+    doubt: Option<&'a str>,
+}
+
+/// Text between two marks, the first time they are there.
+fn between<'a>(text: &'a str, from: &str, to: &str) -> Option<&'a str> {
+    text.split_once(from)?.1.split(to).next()
+}
+
+fn cards(page: &str) -> Vec<Card<'_>> {
+    let tiles = between(page, "<div class=\"tiles\">", "<section>").expect("cards");
+    let card = |tile| {
+        let part = |class: &str| between(tile, &format!("<div class=\"{class}\">"), "</div>");
+        let [name, value, note] = ["name", "value", "note"].map(|class| part(class).expect("in every card"));
+        Card { name, text: format!("{value}; {note}"), doubt: part("doubt") }
+    };
+    tiles.split("<div class=\"tile\">").skip(1).map(card).collect()
+}
+
+/// Rows of the table under a heading, each with its cells.
+fn rows<'a>(page: &'a str, heading: &str) -> Vec<Vec<&'a str>> {
+    let body = between(page, &format!("<h3>{heading}</h3>"), "</table>").expect("a table");
+    let cells =
+        |row: &'a str| row.split("<td class=\"n\">").skip(1).filter_map(|cell| cell.split('<').next()).collect();
+    body.split("<tr>").skip(2).map(cells).collect()
+}
+
+fn at_end(kind: EventKind) -> Event {
+    Event { time: Timestamp::from_secs(end_s(HALVES - 1)), kind }
+}
+
+fn trust(cell: u16, trusted: bool) -> Event {
+    at_end(EventKind::Trust { cell: CellIndex(cell), trusted, mean_nis: 4.0 })
+}
+
+#[test]
+fn every_card_with_an_estimate_is_marked_while_a_cell_is_not_trusted() {
+    let config = examples::config();
+    let context = PageContext { config: Some(&config), ..PageContext::default() };
+    let mut data = examples::worn(96);
+    data.take_event(&trust(6, false));
+    let doubted = page(&data, &context);
+    let marks: Vec<(&str, Option<&str>)> = cards(&doubted).iter().map(|card| (card.name, card.doubt)).collect();
+    let mark = Some("not trusted: cell 7");
+    let estimates = ["State of health", "Capacity", "Usable capacity", "Lithium lost", "Resistance", "Recharge period"];
+    let counts = [("Use so far", None), ("Alarms raised now", None)];
+    let expected: Vec<_> =
+        estimates.into_iter().chain(["Remaining life"]).map(|name| (name, mark)).chain(counts).collect();
+    assert_eq!(marks, expected);
+    assert!(cards(&doubted).iter().all(|card| !card.text.contains("unknown")), "a card without a value has no mark");
+    data.take_event(&trust(6, true));
+    assert!(!page(&data, &context).contains("class=\"doubt\""), "trusted again");
+}
+
+#[test]
+fn alarms_of_96_cells_are_one_row_of_now_and_one_of_all_changes() {
+    let mut data = examples::worn(96);
+    (0..96).for_each(|cell| data.take_event(&at_end(change(Rule::CapacityLow, cell, true, 1.8))));
+    let raised = page(&data, &PageContext::default());
+    let now = rows(&raised, "Raised now");
+    assert_eq!(now.len(), 1, "{now:?}");
+    assert_eq!(now[0][..3], ["capacity_low", "warning", "cells 1, 2, 3, 4, 5, 6, 7, 8 and 88 more"]);
+    let changes = rows(&raised, "All changes");
+    assert_eq!(changes.len(), 1, "{changes:?}");
+    assert_eq!(changes[0][1..4], ["capacity_low", "warning", "raised"]);
+    assert!(changes[0][4].ends_with("limit 1.82 Ah (cell 1); 96 cells in all"), "{changes:?}");
+    let count = cards(&raised).into_iter().find(|card| card.name == "Alarms raised now").expect("a card");
+    assert_eq!(count.text, "96; 96 entries in all");
+}
+
+#[test]
+fn alarms_of_two_rules_are_grouped_though_they_come_cell_by_cell() {
+    let mut data = examples::worn(96);
+    for cell in 0..96 {
+        // As the monitor learns: all of one cell, then the next.
+        for rule in [Rule::CapacityLow, Rule::UsableCapacityLow] {
+            data.take_event(&at_end(change(rule, cell, true, 1.8)));
+        }
+    }
+    // A change of one cell is no other cell's, nor is a later one the same.
+    for (active, value) in [(false, 1.9), (true, 1.7)] {
+        data.take_event(&at_end(change(Rule::CapacityLow, 4, active, value)));
+    }
+    let page = page(&data, &PageContext::default());
+    let of_now = rows(&page, "Raised now");
+    assert_eq!(of_now.iter().map(|row| row[0]).collect::<Vec<_>>(), ["capacity_low", "usable_capacity_low"]);
+    let changes: Vec<_> = rows(&page, "All changes").into_iter().map(|row| (row[1], row[3], row[4])).collect();
+    let expected = [
+        ("capacity_low", "raised", "a cell's capacity was 1.7 Ah, limit 1.82 Ah (cell 5)"),
+        ("capacity_low", "cleared", "a cell's capacity was 1.9 Ah, limit 1.82 Ah (cell 5)"),
+        (
+            "usable_capacity_low",
+            "raised",
+            "a cell's usable capacity was 1.8 Ah, limit 1.82 Ah (cell 1); 96 cells in all",
+        ),
+        ("capacity_low", "raised", "a cell's capacity was 1.8 Ah, limit 1.82 Ah (cell 1); 96 cells in all"),
+    ];
+    assert_eq!(changes, expected);
+}
+
+/// The number behind every plus-minus sign, and half of its last digit.
+fn deviations(text: &str) -> Vec<(f64, f64)> {
+    let number = |rest: &str| {
+        let rest = rest.trim_start();
+        let end = rest.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(rest.len());
+        let digits = rest[..end].trim_end_matches('.');
+        let decimals = digits.split_once('.').map_or(0, |(_, decimals)| decimals.len());
+        let value = digits.parse().unwrap_or_else(|_| panic!("no number behind the sign: {rest}"));
+        (value, 0.5 * 10.0_f64.powi(-i32::try_from(decimals).expect("few")))
+    };
+    text.split(PLUS_MINUS).skip(1).map(number).collect()
+}
+
+/// Whether the numbers behind the plus-minus signs of a text are these standard deviations, rounded to the printed digits.
+fn states(text: &str, stds: &[f64]) -> bool {
+    let printed = deviations(text);
+    let is_same = |((value, half_digit), std): (&(f64, f64), &f64)| (value - std).abs() <= half_digit + 1e-9;
+    printed.len() == stds.len() && printed.iter().zip(stds).all(is_same)
+}
+
+#[test]
+fn every_plus_minus_on_the_page_is_one_standard_deviation() {
+    const STATEMENT: &str = "Every \u{b1} is one standard deviation.";
+    let config = examples::config();
+    let context = PageContext { config: Some(&config), ..PageContext::default() };
+    let mut data = examples::worn(4);
+    data.set_current_offset(Some((0.012, 0.034)));
+    data.take_estimate(&estimate(0, 0, 0));
+    let page = page(&data, &context);
+    assert!(page.contains(STATEMENT));
+    let [first, second, third, last] = [0, 1, 2, 3].map(examples::stds);
+    // Of the cell that is worst in it.
+    let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
+    for card in cards(&page) {
+        let expected = match card.name {
+            "Capacity" => vec![last.capacity_ah],
+            "Usable capacity" => vec![first.usable_ah],
+            "Lithium lost" => vec![lithium, negative, positive],
+            "Resistance" => vec![first.resistance],
+            _ => Vec::new(),
+        };
+        assert!(states(&card.text, &expected), "{}: {}, not {expected:?}", card.name, card.text);
+    }
+    let offset = between(&page, "reading less true current</td><td>", "</td>").expect("a row");
+    assert!(states(offset, &[0.034]), "{offset}");
+    // No other: the statement, six on cards, the offset.
+    assert_eq!(page.matches(PLUS_MINUS).count(), 8);
+    assert!(!page.contains("+-"), "another sign for the same");
+}
+
+#[test]
+fn a_refused_forecast_states_one_standard_deviation_of_the_loss() {
+    let config = examples::config();
+    let context = PageContext { config: Some(&config), ..PageContext::default() };
+    let mut data = Data::new(Origin::Replay);
+    for half in 0..20_u16 {
+        let at = |kind| Event { time: Timestamp::from_secs(end_s(half)), kind };
+        data.take_event(&at(half_cycle(half, 0)));
+        data.take_event(&at(capacity(0, 0)));
+    }
+    let refused = forecast::cells(&data, &context)[0].remaining(config.monitor.health.end_of_life_ah);
+    let Err(InsufficientData::Fade { std, .. }) = refused else { panic!("no fade: {refused:?}") };
+    let page = page(&data, &context);
+    let life = cards(&page).into_iter().find(|card| card.name == "Remaining life").expect("a card");
+    assert!(life.text.starts_with("unknown; capacity lost is") && states(&life.text, &[100.0 * std]), "{}", life.text);
+    let note = between(&page, "No forecast of the capacity: ", "</p>").expect("a note");
+    assert!(states(note, &[100.0 * std]), "{note}");
+    assert!(!page.contains("+-"), "another sign for the same");
 }
