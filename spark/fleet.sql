@@ -6,13 +6,13 @@
 -- | --- | --- |
 -- | not_replayed | which vehicles could not be replayed, and why |
 -- | usage | how is each vehicle used: cycles a day, charge, temperature |
--- | capacity_of_cells | what has each cell left, first and last |
+-- | capacity_of_cells | what has each cell left |
 -- | capacity_by_cycles | how does capacity fall with equivalent full cycles: quantiles over cells |
 -- | capacity_by_month | the same with months since the first record |
 -- | resistance_by_cycles | how does resistance rise |
 -- | alarms_by_rule | which alarms were raised, how often, in how many vehicles |
 -- | first_alarms | when was each alarm raised first in a vehicle |
--- | alarm_leads | how long before its weakest cell fell below 80 % did a vehicle have its first capacity alarm |
+-- | alarm_leads | how long before its weakest cell fell below 80 % of the rated capacity did a vehicle have its first capacity alarm |
 -- | cell_outliers | which cells differ from their pack |
 -- | pack_outliers | which packs differ from the fleet |
 -- | packs_to_call_in | which packs need a workshop, and why |
@@ -21,13 +21,13 @@
 CREATE OR REPLACE TEMPORARY VIEW not_replayed AS
 SELECT log, error FROM vehicles WHERE error IS NOT NULL;
 
--- Each half-cycle with the cell's capacity relative to its first.
+-- Each half-cycle with the cell's capacity relative to the rated one.
 CREATE OR REPLACE TEMPORARY VIEW relative_capacity AS
 SELECT
-    log, cell, time, since_start_s, full_cycles, charge_ah, mean_temperature_c, capacity_ah, resistance_ratio, remaining_cycles_low,
-    capacity_ah / first_value(capacity_ah) OVER (PARTITION BY log, cell ORDER BY time) AS soh,
-    row_number() OVER (PARTITION BY log, cell ORDER BY time DESC) AS from_last
-FROM half_cycles;
+    h.log, cell, time, since_start_s, full_cycles, charge_ah, mean_temperature_c, capacity_ah, resistance_ratio, remaining_cycles_low,
+    capacity_ah / rated_ah AS soh,
+    row_number() OVER (PARTITION BY h.log, cell ORDER BY time DESC) AS from_last
+FROM half_cycles h JOIN vehicles v ON v.log = h.log;
 
 CREATE OR REPLACE TEMPORARY VIEW usage AS
 SELECT

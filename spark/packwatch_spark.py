@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Replays a fleet on Spark: a task for each vehicle, by the same program as by hand.
 
-    spark-submit spark/packwatch_spark.py MANIFEST --config FILE --out DIR [--binary packwatch] [--estimates S]
+    spark-submit spark/packwatch_spark.py MANIFEST --config FILE --out DIR [--binary packwatch] [--estimates S] [OPTION...]
 
 MANIFEST is that of `packwatch fleet plan`. MANIFEST, FILE, DIR and the logs must have the same names on driver and executors: a folder that
 all of them see. Each task runs `packwatch fleet run` for its vehicle, which writes DIR/VEHICLE; what is complete is not replayed again, so
-a task that Spark repeats, or a job that is started again, costs nothing. A vehicle that fails, also one in which the program crashes, is a
+a task that Spark repeats, or a job that is started again, costs nothing. Other options, such as --csv-sign=charge, go to it as they are. A vehicle that fails, also one in which the program crashes, is a
 row with its reason and does not end the job.
 
 Afterwards: `packwatch fleet merge DIR -o TABLES --manifest MANIFEST`. Printed: a line for each vehicle that failed, and the counts. Exit
@@ -40,11 +40,13 @@ def replay_vehicle(line: str, command: list[str]) -> dict:
     return row | {"seconds": time.monotonic() - begun}
 
 
-def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwatch", estimates: float | None = None):
+def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwatch", estimates: float | None = None,
+           more: list[str] | None = None):  # fmt: skip
     """A DataFrame with a row for each vehicle of these lines of a manifest; they are replayed when it is evaluated. Evaluate it once."""
     command = [binary, "fleet", "run", "--json", "--jobs", "1", "--config", config, "--out", out]
     if estimates is not None:
         command += ["--estimates", str(estimates)]
+    command += more or []
 
     def tasks(batches):
         import pyarrow
@@ -77,13 +79,14 @@ def main() -> None:
     parser.add_argument("--out", required=True)
     parser.add_argument("--binary", default="packwatch")
     parser.add_argument("--estimates", type=float)
-    options = parser.parse_args()
+    options, more = parser.parse_known_args()
     with open(options.manifest, encoding="utf-8") as file:
         lines = [line for line in file.read().splitlines() if line.strip()]
     if not lines:
         sys.exit(f"{options.manifest}: no vehicle")
     spark = SparkSession.builder.appName("packwatch fleet").getOrCreate()
-    rows = replay(spark, lines, os.path.abspath(options.config), os.path.abspath(options.out), options.binary, options.estimates).collect()
+    frame = replay(spark, lines, os.path.abspath(options.config), os.path.abspath(options.out), options.binary, options.estimates, more)
+    rows = frame.collect()
     for row in sorted(rows, key=lambda row: row.vehicle):
         if row.error:
             print(f"failed: {row.vehicle}: {row.error}")

@@ -70,6 +70,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         out: out.clone(),
         period_s: Some(args.period),
         jobs: args.logs.threads(),
+        reading: String::new(),
     };
     let bar = args.logs.bar(1);
     let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.inc(bytes));

@@ -87,7 +87,7 @@ struct RunArgs {
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, where they were exported, estimates.parquet: one row group per vehicle, \
+    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, where they were exported, estimates.parquet: row groups of one vehicle each, \
                   the vehicles by name. In whatever parts and order they were replayed, the bytes are the same."
 )]
 struct MergeArgs {
@@ -133,6 +133,10 @@ fn plan(args: &PlanArgs) -> Result<(), Failure> {
 
 fn replay(args: &RunArgs) -> Result<(), Failure> {
     let all = vehicles::read_manifest(&args.manifest).map_err(failure)?;
+    if args.input.start_times.is_some() && all.len() > 1 {
+        let text = "--start-times is a table of one vehicle; NAME_cycles.csv next to each log works as well";
+        return Err(Failure::new(text));
+    }
     let chosen = args.shard.choose(&all);
     let usual = config::load(&args.config)?;
     let config_of = |vehicle: &Vehicle| match &vehicle.config {
@@ -146,6 +150,7 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
         out: args.out.clone(),
         period_s: args.estimates,
         jobs: args.jobs.map(usize::from),
+        reading: format!("{:?}", args.input),
     };
     let bar = progress_bar(
         chosen.iter().map(|vehicle| vehicle.bytes).sum::<u64>(),

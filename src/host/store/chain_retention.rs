@@ -1,31 +1,42 @@
-//! Bounds the chained history: the latest half of the configured number of rows is kept whole, before it one row of four, before
-//! twice as many one of sixteen, and so on.
+//! Thins the chained history beyond the configured number of rows N.
 //!
-//! * Which rows are kept is written in their hashes: those that end in enough zero bits. Every cell loses the same part, and nothing has
-//!   to be remembered.
-//! * A row goes only between two others of the same cell and pack that say the same kind of thing: no trend loses its ends. Of an alarm
-//!   the first hundred occurrences are kept, of resets all but those of filters.
-//! * The chain stays verifiable: of every run of rows that is gone the table `thinned` has the last row's hash, which the next row
-//!   carries on.
+//! | rows before the end | kept |
+//! | --- | --- |
+//! | up to N/2 | all |
+//! | N/2 to N | one of 4 |
+//! | N to 2 N | one of 16, and so on: a quarter of the part before |
 //!
-//! It works at checkpoints, a little at a time, and only while there are more rows than configured.
+//! * The hash of a row decides whether it is kept: it must end in enough zero bits. Every cell loses the same part, and nothing has to be
+//!   remembered.
+//! * A row is deleted only between two others of its cell and pack in its table: no trend loses its ends. Of an alarm the first
+//!   [`OCCURRENCES_KEPT`] occurrences are kept, of resets all but those of filters: so many more than N rows there may be.
+//! * The chain stays verifiable: of every run of deleted rows the table `thinned` has the last row's hash, from which the next row's
+//!   follows.
+//!
+//! It works at checkpoints, a little at a time, and only while there are more than N rows.
 
 use rusqlite::types::Value;
 use rusqlite::{Connection, OptionalExtension, params};
 
 use super::chain::Hash;
 use super::meta::Meta;
-use super::retention::thin_moment;
+use super::retention::delete_unused_moment;
 use super::rows::HistoryTable;
 
 /// Rows looked at in one checkpoint.
 const STEP_ROWS: i64 = 512;
 /// Rows deleted in one checkpoint: more than a minute adds to a pack of 1,000 cells, in some 0.1 s.
 const STEP_DELETED: i64 = 64;
-/// So many times as many where checkpoints are rare, or another limit was configured: from an eighth above the limit on.
-const HASTE: i64 = 16;
+/// Rows in one checkpoint that turn out to have no neighbour, which takes the longest search.
+const STEP_ALONE: i64 = 4;
+/// The factor of these three from an eighth above the limit on: where checkpoints are rare, or another limit was configured.
+const HASTE: i64 = 8;
 /// Rows of a table among which a neighbour is looked for: several for each cell of the largest pack.
 const NEIGHBOUR_ROWS: u32 = 20_000;
+/// Occurrences of an alarm that are kept.
+const OCCURRENCES_KEPT: u32 = 100;
+/// Least number of rows at the end of the chain that are never deleted: half of the least `store.max_chained_rows`.
+pub(super) const LEAST_WHOLE: i64 = 5_000;
 
 /// Goes through the tables, again and again while there are too many rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -37,6 +48,15 @@ pub(super) struct ChainSweep {
 }
 
 impl ChainSweep {
+    /// Begins at a table and row that the number of rows decides: short runs of the daemon together reach all.
+    pub(super) fn begin(rows: i64) -> Self {
+        // Far apart for neighbouring numbers.
+        let spread = rows.unsigned_abs().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 1;
+        let table = usize::try_from(spread % HistoryTable::CHAINED.len() as u64).unwrap_or(0);
+        let seq = (spread >> 8).checked_rem(rows.unsigned_abs()).unwrap_or(0);
+        Self { table, seq: i64::try_from(seq).unwrap_or(0) }
+    }
+
     /// Deletes some rows if there are more than `max_rows`.
     pub(super) fn thin(&mut self, connection: &Connection, meta: &mut Meta, max_rows: i64) -> rusqlite::Result<()> {
         if meta.chained_rows() <= max_rows {
@@ -57,22 +77,32 @@ impl ChainSweep {
             .prepare_cached(&sql)?
             .query_map(params![self.seq, newest, haste * STEP_ROWS], |row| {
                 let about = (4..=4 + subjects).map(|at| row.get(at)).collect::<rusqlite::Result<_>>()?;
-                Ok(OldRow { seq: row.get(0)?, hash: row.get(1)?, moment: row.get(2)?, may_go: row.get(3)?, about })
+                Ok(OldRow {
+                    seq: row.get(0)?,
+                    hash: row.get(1)?,
+                    moment: row.get(2)?,
+                    is_redundant: row.get(3)?,
+                    about,
+                })
             })?
             .collect::<rusqlite::Result<_>>()?;
         *self = match rows.last() {
             Some(last) => Self { seq: last.seq, ..*self },
             None => Self { table: (self.table + 1) % HistoryTable::CHAINED.len(), seq: 0 },
         };
-        let mut deleted = 0;
+        let (mut deleted, mut alone) = (0, 0);
         for row in &rows {
             let age = meta.head.count - row.seq;
-            let is_kept = zero_bits(&row.hash) >= zero_bits_kept(age, max_rows);
-            if !is_kept && row.may_go && has_neighbours(connection, table, row)? {
+            if !row.is_redundant || zero_bits(&row.hash) >= zero_bits_kept(age, max_rows) {
+                continue;
+            }
+            if has_neighbours(connection, table, row)? {
                 delete(connection, meta, table, row)?;
                 deleted += 1;
+            } else {
+                alone += 1;
             }
-            if deleted == haste * STEP_DELETED {
+            if deleted == haste * STEP_DELETED || alone == haste * STEP_ALONE {
                 self.seq = row.seq;
                 break;
             }
@@ -86,17 +116,17 @@ struct OldRow {
     seq: i64,
     hash: Hash,
     moment: i64,
-    may_go: bool,
+    is_redundant: bool,
     /// Its pack, and what it is about: the values of [`subject`].
     about: Vec<Value>,
 }
 
 /// SQL that is true for rows of which others of their kind say as much.
-const fn redundant_sql(table: HistoryTable) -> &'static str {
+fn redundant_sql(table: HistoryTable) -> String {
     match table {
-        HistoryTable::Alarm => "r.occurrences > 100",
-        HistoryTable::Reset => "r.reason = 'filter_reset'",
-        _ => "1",
+        HistoryTable::Alarm => format!("r.occurrences > {OCCURRENCES_KEPT}"),
+        HistoryTable::Reset => "r.reason = 'filter_reset'".to_owned(),
+        _ => "1".to_owned(),
     }
 }
 
@@ -146,7 +176,7 @@ fn delete(connection: &Connection, meta: &mut Meta, table: HistoryTable, row: &O
     connection.prepare_cached(&format!("DELETE FROM {} WHERE seq = ?1", table.name()))?.execute([row.seq])?;
     note_thinned(connection, row.seq, &row.hash)?;
     meta.chain_thinned += 1;
-    thin_moment(connection, row.moment)
+    delete_unused_moment(connection, row.moment)
 }
 
 /// Adds a row to the run of deleted rows that it continues, begins or joins.

@@ -158,7 +158,8 @@ impl Database {
         }
         // A damaged record is reported by [`Self::state`].
         let copies = StateCopies::read(&connection, known)?;
-        Ok(Self { connection, meta, copies, limits, sweep: ChainSweep::default(), horizon_ns: None })
+        let sweep = ChainSweep::begin(meta.head.count);
+        Ok(Self { connection, meta, copies, limits, sweep, horizon_ns: None })
     }
 
     /// Rows so far.

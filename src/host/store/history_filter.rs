@@ -12,7 +12,7 @@ use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
 /// Capacities of one cell written without condition: two days of an electric car at once, then one an hour. Further ones
-/// (a hybrid that reverses every minute) are written only if they differ: each row takes 100 bytes for ever.
+/// (a hybrid that reverses every minute) are written only if they differ: each row takes 100 bytes for years.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Least change of such a further capacity, in standard deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
@@ -23,7 +23,7 @@ const OWN_COMMITS: BucketSize = BucketSize { burst: 10.0, period_s: 6.0 * 3600.0
 /// the others. A rule that flickers in all of 96 cells causes 1,500 commits of some 10 kB on the first day, then 400.
 const SHARED_COMMITS: BucketSize = BucketSize { burst: 500.0, period_s: 3600.0 };
 /// Times that waiting rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour.
-/// They stay for ever, and each time there are two of each alarm.
+/// They stay for years, and each time there are two of each alarm.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
 /// The capacity written last.

@@ -89,7 +89,7 @@ fn delete_transition(connection: &Connection, meta: &mut Meta, moment: i64) -> r
     let rows = i64::try_from(rows).unwrap_or(i64::MAX);
     meta.half_cycles -= rows;
     meta.thinned += rows;
-    thin_moment(connection, moment)
+    delete_unused_moment(connection, moment)
 }
 
 fn next_transition(connection: &Connection, after: i64) -> rusqlite::Result<Option<i64>> {
@@ -97,7 +97,7 @@ fn next_transition(connection: &Connection, after: i64) -> rusqlite::Result<Opti
 }
 
 /// Deletes a moment to which no row belongs any more.
-pub(super) fn thin_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
+pub(super) fn delete_unused_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
     let mut statement = connection.prepare_cached("SELECT 1 FROM half_cycle WHERE moment = ?1 LIMIT 1")?;
     if statement.exists([moment])? {
         return Ok(());

@@ -3,7 +3,7 @@
 //! | table | a row is | kept |
 //! | --- | --- | --- |
 //! | `pack` | a pack that was or is connected | always |
-//! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | always |
+//! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | as long as a row belongs to it |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
 //! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | the oldest thinned |
 //! | `thinned` | a run of chained rows that were thinned out, with the hash of the last | always |

@@ -8,6 +8,7 @@ use rusqlite::{Connection, Statement};
 use serde::Serialize;
 
 use super::chain::{Hash, hex, link};
+use super::chain_retention::LEAST_WHOLE;
 use super::meta::Meta;
 use super::row_sql::{MOMENT_COLUMNS, hash_of, rows_sql};
 use super::rows::HistoryTable;
@@ -100,6 +101,11 @@ struct ChainLink {
 
 /// Checks the chain in the order of its numbers.
 pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
+    verify_with(connection, LEAST_WHOLE)
+}
+
+/// The same where other than [`LEAST_WHOLE`] rows at the end are never thinned.
+pub(super) fn verify_with(connection: &Connection, least_whole: i64) -> rusqlite::Result<ChainReport> {
     let meta = Meta::read(connection)?;
     let version = schema::version(connection)?;
     let mut statements: Vec<(HistoryTable, Statement<'_>)> = HistoryTable::CHAINED
@@ -125,8 +131,11 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     // The last row that is good or thinned out.
     let (mut seq, mut thinned_rows) = (0, 0);
     let broken = loop {
+        // The latest rows are never thinned: entered as thinned they were removed.
         let continues = |run: &rusqlite::Result<ThinnedRun>| {
-            run.as_ref().map_or(true, |run| run.first == seq + 1 && (run.first..=meta.head.count).contains(&run.last))
+            run.as_ref().map_or(true, |run| {
+                run.first == seq + 1 && (run.first..=meta.head.count - least_whole).contains(&run.last)
+            })
         };
         if let Some(run) = runs.next_if(continues).transpose()? {
             before = run.hash.try_into().unwrap_or_default();
@@ -142,7 +151,7 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
         let Some((_, table, rows)) = heads.min_by_key(|(head, ..)| *head) else {
             break judge_end(&meta, seq, &before).or(runs.next().transpose()?.map(|run| surplus(seq, &run)));
         };
-        let Some(row) = rows.next().transpose()? else { break None };
+        let Some(row) = rows.next().transpose()? else { break judge_end(&meta, seq, &before) };
         match judge(table, seq + 1, &row, &before) {
             Ok(hash) => (before, seq) = (hash, seq + 1),
             Err(broken) => break Some(broken),

@@ -33,6 +33,8 @@ pub use columns::reference;
 
 /// Version of `about.json`.
 const VERSION: u32 = 1;
+/// What is written last of a log's tables.
+pub(super) const ABOUT: &str = "about.json";
 
 /// Form of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,6 +67,8 @@ pub struct ExportSettings<'a> {
     pub period_s: Option<f64>,
     /// Threads; `None` = all cores.
     pub jobs: Option<usize>,
+    /// How logs are read, in any form that differs where the settings differ.
+    pub reading: String,
 }
 
 /// A log's tables.
@@ -136,7 +140,7 @@ pub(super) fn export(
 /// Removes the `about.json` of an earlier export, since its tables are replaced one by one; returns a note when they were
 /// those of another log.
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
-    let path = folder.join("about.json");
+    let path = folder.join(ABOUT);
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
     std::fs::remove_file(&path).map_err(|error| LabError(format!("{}: cannot be removed: {error}", path.display())))?;
     let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
@@ -186,7 +190,7 @@ fn write_about(
         "log": driven.counts,
         "notes": exported.notes,
     });
-    Ok(crate::write_file(&exported.folder.join("about.json"), &serde_json::to_vec_pretty(&document)?)?)
+    Ok(crate::write_file(&exported.folder.join(ABOUT), &serde_json::to_vec_pretty(&document)?)?)
 }
 
 /// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before

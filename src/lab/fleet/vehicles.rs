@@ -6,8 +6,9 @@
 //! | [`Shard::choose`] | the vehicles | those of one part; parts of like size, and the same on every machine |
 //! | [`run`] | vehicles | a folder for each: tables as [`export`](super::export) writes them, and `vehicle.json` |
 //!
-//! `vehicle.json` is written last: a vehicle that has it, for the same line of the manifest, configuration and program, is complete and is
-//! not replayed again. A vehicle that fails has one with the reason, and the others continue.
+//! `vehicle.json` is written last: a vehicle that has it, for the same line of the manifest, settings and program, is complete and is
+//! not replayed again. A vehicle that fails has one with the reason, and the others continue. The folder of a vehicle is locked while it is
+//! replayed: a second process waits, and finds it complete.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -16,16 +17,20 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::export::{self, ExportSettings};
 use crate::config::Config;
 use crate::error::LabError;
-use crate::status::document::ConfigFile;
 
 /// Version of `vehicle.json`.
 const VERSION: u32 = 1;
 /// Its name in a vehicle's folder.
 pub(super) const RECORD: &str = "vehicle.json";
+/// The file that is locked while a vehicle is replayed.
+const LOCK: &str = ".lock";
+/// Most parts of a fleet.
+const MAX_SHARDS: usize = 100_000;
 
 /// A vehicle: a line of the manifest.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,13 +47,15 @@ pub struct Vehicle {
     pub config: Option<PathBuf>,
 }
 
-/// Lists the vehicles of `paths` by name: a log is a vehicle, and so is a folder with logs, which are read in the order of their names.
+/// Lists the vehicles of `paths` by name: a log is a vehicle, and so is a folder with logs, which are read in the order of their names. Paths
+/// are made absolute: the vehicles may be replayed from other folders.
 ///
 /// # Errors
 /// A path cannot be read, or a folder has no log.
 pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
     let names = export::names(paths);
     let vehicle = |(path, vehicle): (&PathBuf, String)| {
+        let path = &std::path::absolute(path).map_err(|error| named(path, &error))?;
         let logs = if path.is_dir() { logs_in(path)? } else { vec![path.clone()] };
         let size = |log: &PathBuf| {
             let meta = std::fs::metadata(log).map_err(|error| LabError(format!("{}: {error}", log.display())))?;
@@ -148,8 +155,8 @@ impl FromStr for Shard {
     fn from_str(text: &str) -> Result<Self, String> {
         let numbers = text.split_once('/').and_then(|(number, of)| Some((number.parse().ok()?, of.parse().ok()?)));
         match numbers {
-            Some((number, of)) if (1..=of).contains(&number) => Ok(Self { number, of }),
-            _ => Err("must be I/N, I from 1 to N".to_owned()),
+            Some((number, of)) if (1..=of).contains(&number) && of <= MAX_SHARDS => Ok(Self { number, of }),
+            _ => Err(format!("must be I/N, I from 1 to N, N at most {MAX_SHARDS}")),
         }
     }
 }
@@ -179,8 +186,8 @@ pub struct VehicleRecord {
     pub packwatch: String,
     /// The line of the manifest.
     pub line: Vehicle,
-    /// SHA-256 of the configuration; `None` = it cannot be read.
-    pub config_sha256: Option<String>,
+    /// SHA-256 of all settings: the configuration with its DBC and cell model, and the options of reading; `None` = it cannot be read.
+    pub settings_sha256: Option<String>,
     /// Period of the estimates, s; `None` = no table of estimates.
     pub period_s: Option<f64>,
     /// Why there are no tables; `None` = there are.
@@ -189,6 +196,8 @@ pub struct VehicleRecord {
     pub rows: BTreeMap<String, u64>,
     /// Cells of the pack.
     pub cells: u32,
+    /// Rated capacity of a cell, Ah; `None` = the configuration cannot be read.
+    pub rated_ah: Option<f64>,
     /// From the first stamp to the last, days.
     pub days: f64,
     /// Notes on its logs.
@@ -205,8 +214,8 @@ impl VehicleRecord {
     /// Whether `other` would give the same tables.
     fn is_of_same(&self, other: &Self) -> bool {
         let key = |record: &Self| {
-            let Self { packwatch, line, config_sha256, period_s, .. } = record;
-            (packwatch.clone(), line.clone(), config_sha256.clone(), *period_s)
+            let Self { packwatch, line, settings_sha256, period_s, .. } = record;
+            (packwatch.clone(), line.clone(), settings_sha256.clone(), *period_s)
         };
         key(self) == key(other)
     }
@@ -250,23 +259,32 @@ fn one(
         version: VERSION,
         packwatch: env!("CARGO_PKG_VERSION").to_owned(),
         line: vehicle.clone(),
-        config_sha256: config.as_ref().ok().and_then(|config| ConfigFile::of(&config.path)).map(|file| file.sha256),
+        settings_sha256: config
+            .as_ref()
+            .ok()
+            .map(|config| sha256(&format!("{:?} {}", config.monitor, settings.reading))),
         period_s: settings.period_s,
         error: None,
         rows: BTreeMap::new(),
         cells: config.as_ref().map_or(0, |config| config.monitor.sample.cells.into()),
+        rated_ah: config.as_ref().ok().map(|config| config.monitor.model.rated_capacity_ah),
         days: 0.0,
         notes: Vec::new(),
     };
+    std::fs::create_dir_all(&folder).map_err(|error| named(&folder, &error))?;
+    let lock = std::fs::File::create(folder.join(LOCK)).and_then(|file| file.lock().map(|()| file));
+    let _lock = lock.map_err(|error| named(&folder.join(LOCK), &error))?;
     let earlier = VehicleRecord::read(&folder).filter(|earlier| earlier.is_of_same(&record) && earlier.error.is_none());
     if let Some(earlier) = earlier {
         report(vehicle.bytes);
         return Ok(Outcome::Kept(earlier));
     }
     // From here on the folder is not complete.
-    match std::fs::remove_file(folder.join(RECORD)) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
-        _ => {}
+    for file in [RECORD, export::ABOUT] {
+        match std::fs::remove_file(folder.join(file)) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
+            _ => {}
+        }
     }
     // A defect of the program in one vehicle does not end the others.
     let replayed = catch_unwind(AssertUnwindSafe(|| {
@@ -284,11 +302,14 @@ fn one(
         }
         Err(error) => {
             record.error = Some(error.0);
-            std::fs::create_dir_all(&folder).map_err(|error| named(&folder, &error))?;
             write(&folder, &record)?;
             Ok(Outcome::Failed(record))
         }
     }
+}
+
+fn sha256(text: &str) -> String {
+    Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn write(folder: &Path, record: &VehicleRecord) -> Result<(), LabError> {
@@ -328,7 +349,7 @@ mod tests {
     #[test]
     fn a_shard_is_one_of_several() {
         assert_eq!("2/4".parse(), Ok(Shard { number: 2, of: 4 }));
-        for text in ["0/4", "5/4", "1", "1/0", "a/b", "1/4/2", "-1/4", ""] {
+        for text in ["0/4", "5/4", "1", "1/0", "a/b", "1/4/2", "-1/4", "1/9999999999999", ""] {
             assert!(text.parse::<Shard>().is_err(), "{text}");
         }
     }

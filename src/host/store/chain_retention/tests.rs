@@ -8,7 +8,7 @@ use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaini
 use super::super::rows::{HistoryRow, RowBatch};
 use super::super::salvage::salvage;
 use super::super::stamp::Stamp;
-use super::super::verify::{BrokenRow, NotedHead, contradiction, verify};
+use super::super::verify::{self, BrokenRow, ChainReport, NotedHead, contradiction};
 use super::*;
 use crate::alarm::Change;
 use crate::monitor::EventKind;
@@ -66,45 +66,23 @@ fn filled(path: &std::path::Path) -> (Database, Vec<(i64, String)>) {
 }
 
 fn raised(times: u32) -> EventKind {
-    match alarm(Change::Raised) {
-        EventKind::Alarm {
-            rule,
-            severity,
-            cell,
-            change,
-            state,
-            active,
-            value,
-            probability,
-            threshold,
-            acknowledged,
-            ..
-        } => {
-            let occurrences = times;
-            EventKind::Alarm {
-                rule,
-                severity,
-                cell,
-                change,
-                state,
-                active,
-                value,
-                probability,
-                threshold,
-                occurrences,
-                acknowledged,
-            }
-        }
-        other => other,
+    let mut kind = alarm(Change::Raised);
+    if let EventKind::Alarm { ref mut occurrences, .. } = kind {
+        *occurrences = times;
     }
+    kind
 }
 
 fn number(database: &Database, sql: &str) -> i64 {
     database.connection().query_row(sql, [], |row| row.get(0)).unwrap()
 }
 
+fn verify(database: &Database) -> ChainReport {
+    verify::verify_with(database.connection(), MAX_ROWS / 2).unwrap()
+}
+
 fn broken(database: &Database) -> Option<BrokenRow> {
-    verify(database.connection()).unwrap().broken
+    verify(database).broken
 }
 
 #[test]
@@ -114,7 +92,7 @@ fn a_long_history_is_bounded_and_still_verified() {
     let (database, heads) = filled(&path);
     let written = database.counts().chained;
     assert!(written > 20 * MAX_ROWS, "{written}");
-    let report = verify(database.connection()).unwrap();
+    let report = verify(&database);
     assert_eq!(report.broken, None);
     assert_eq!((report.rows, report.good_rows), (written, written - report.thinned_rows));
     let sum: Vec<String> =
@@ -195,6 +173,12 @@ fn a_changed_removed_or_hidden_row_is_named() {
     let run = format!("UPDATE thinned SET hash = zeroblob(32) WHERE last = {after_gap} - 1");
     assert_eq!(row_of(&run), Some(after_gap), "the hash that the next row carries on");
     let whole = number(&database, "SELECT max(seq) - 10 FROM capacity");
+    let latest = number(&database, "SELECT max(seq) - 20 FROM alarm");
+    let hidden = format!(
+        "INSERT INTO thinned SELECT seq, seq, hash FROM alarm WHERE seq = (SELECT max(seq) FROM alarm WHERE seq <= {latest} + 20);
+         DELETE FROM alarm WHERE seq = (SELECT max(last) FROM thinned)"
+    );
+    assert!(row_of(&hidden).is_some(), "one of the latest rows cannot be thinned out");
     let others = [
         // Rows that are there cannot be thinned out.
         &format!("INSERT INTO thinned VALUES ({whole}, {whole} - 2, zeroblob(32))"),
@@ -212,7 +196,7 @@ fn a_thinned_history_is_salvaged_whole() {
     let place = place();
     let (path, new) = (place.path().join(DATABASE), place.path().join("new.db"));
     let (database, _) = filled(&path);
-    let report = verify(database.connection()).unwrap();
+    let report = verify(&database);
     let losses = number(&database, "SELECT count(*) FROM loss_modes");
     let lives = number(&database, "SELECT count(*) FROM remaining_life");
     database.close().unwrap();

@@ -1,8 +1,8 @@
-//! Puts the vehicles' tables of several runs together: one Parquet file per table, a row group per vehicle, the vehicles by name.
+//! Puts the vehicles' tables of several runs together: one Parquet file per table, row groups of one vehicle each, the vehicles by name.
 //!
 //! In: folders that [`run`](crate::fleet::vehicles::run) has written. Out: `vehicles.parquet`, a row for each vehicle, also one that
 //! failed, and `half_cycles`, `alarms` and, where they were exported, `estimates.parquet`. Promise: the same bytes, in whatever parts and in
-//! whatever order the vehicles were replayed; column chunks are copied as they are, so memory does not grow with the fleet.
+//! whatever order the vehicles were replayed; column chunks are copied as they are, so memory does not grow with the rows.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -72,7 +72,13 @@ fn found(folders: &[PathBuf]) -> Result<BTreeMap<String, Found>, LabError> {
         let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
         for entry in std::fs::read_dir(folder).map_err(failed)? {
             let folder = entry.map_err(failed)?.path();
-            let Some(record) = VehicleRecord::read(&folder) else { continue };
+            if !folder.is_dir() {
+                continue;
+            }
+            let Some(record) = VehicleRecord::read(&folder) else {
+                let why = "not complete, or by another version: run it again, or remove the folder";
+                return Err(LabError(format!("{}: {why}", folder.display())));
+            };
             let name = record.line.vehicle.clone();
             let Some(other) = vehicles.get(&name) else {
                 vehicles.insert(name, Found { folder, record });
