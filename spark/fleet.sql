@@ -91,38 +91,36 @@ FROM first_alarms a
 JOIN (SELECT log, min(since_start_s) / 86400 AS days FROM relative_capacity WHERE soh < 0.8 GROUP BY log) e ON e.log = a.log
 WHERE a.rule = 'capacity_low';
 
+CREATE OR REPLACE TEMPORARY VIEW pack_medians AS
+SELECT log, percentile_cont(0.5) WITHIN GROUP (ORDER BY capacity_ah) AS median_ah FROM capacity_of_cells GROUP BY log;
+
+CREATE OR REPLACE TEMPORARY VIEW cell_differences AS
+SELECT c.log, c.cell, c.capacity_ah, m.median_ah, c.capacity_ah / m.median_ah - 1 AS differs
+FROM capacity_of_cells c JOIN pack_medians m ON m.log = c.log;
+
 -- Beyond three robust deviations (1.4826 median absolute deviations) of the pack, and 2 % at least.
 CREATE OR REPLACE TEMPORARY VIEW cell_outliers AS
-SELECT c.log, c.cell, c.capacity_ah, m.median_ah, c.capacity_ah / m.median_ah - 1 AS differs
-FROM capacity_of_cells c
-JOIN (SELECT log, percentile_cont(0.5) WITHIN GROUP (ORDER BY capacity_ah) AS median_ah FROM capacity_of_cells GROUP BY log) m
-    ON m.log = c.log
+SELECT d.log, d.cell, d.capacity_ah, d.median_ah, d.differs
+FROM cell_differences d
 JOIN (
-    SELECT d.log, percentile_cont(0.5) WITHIN GROUP (ORDER BY d.apart) AS deviation
-    FROM (
-        SELECT c.log, abs(c.capacity_ah - m.median_ah) AS apart
-        FROM capacity_of_cells c
-        JOIN (SELECT log, percentile_cont(0.5) WITHIN GROUP (ORDER BY capacity_ah) AS median_ah FROM capacity_of_cells GROUP BY log) m
-            ON m.log = c.log
-    ) d
-    GROUP BY d.log
-) s ON s.log = c.log
-WHERE abs(c.capacity_ah - m.median_ah) > 3 * 1.4826 * s.deviation AND abs(c.capacity_ah / m.median_ah - 1) > 0.02;
+    SELECT log, percentile_cont(0.5) WITHIN GROUP (ORDER BY abs(differs)) AS deviation FROM cell_differences GROUP BY log
+) s ON s.log = d.log
+WHERE abs(d.differs) > 3 * 1.4826 * s.deviation AND abs(d.differs) > 0.02;
 
 -- The weakest cell of each vehicle.
 CREATE OR REPLACE TEMPORARY VIEW weakest AS
 SELECT log, min(soh) AS soh, min(remaining_cycles_low) AS remaining_cycles_low, max(resistance_ratio) AS resistance_ratio
 FROM capacity_of_cells GROUP BY log;
 
-CREATE OR REPLACE TEMPORARY VIEW pack_outliers AS
+CREATE OR REPLACE TEMPORARY VIEW pack_differences AS
 SELECT w.log, w.soh, m.median_soh, w.soh - m.median_soh AS differs
-FROM weakest w
-CROSS JOIN (SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY soh) AS median_soh FROM weakest) m
-CROSS JOIN (
-    SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY abs(w.soh - m.median_soh)) AS deviation
-    FROM weakest w CROSS JOIN (SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY soh) AS median_soh FROM weakest) m
-) s
-WHERE abs(w.soh - m.median_soh) > 3 * 1.4826 * s.deviation AND abs(w.soh - m.median_soh) > 0.02;
+FROM weakest w CROSS JOIN (SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY soh) AS median_soh FROM weakest) m;
+
+CREATE OR REPLACE TEMPORARY VIEW pack_outliers AS
+SELECT d.log, d.soh, d.median_soh, d.differs
+FROM pack_differences d
+CROSS JOIN (SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY abs(differs)) AS deviation FROM pack_differences) s
+WHERE abs(d.differs) > 3 * 1.4826 * s.deviation AND abs(d.differs) > 0.02;
 
 -- Alarms as each vehicle's log ended.
 CREATE OR REPLACE TEMPORARY VIEW last_alarms AS

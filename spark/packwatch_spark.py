@@ -90,7 +90,7 @@ def main() -> None:
     for row in sorted(rows, key=lambda row: row.vehicle):
         if row.error:
             print(f"failed: {row.vehicle}: {row.error}")
-    counts = {word: sum(row.outcome == word for row in rows) for word in ("replayed", "complete before", "failed")}
+    counts = {word: sum(row.outcome == word for row in rows) for word in ("replayed", "complete", "failed")}
     print(", ".join(f"{count} {word}" for word, count in counts.items()) + f"; {sum(row.days for row in rows):.1f} days in all")
     spark.stop()
 

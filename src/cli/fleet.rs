@@ -17,7 +17,7 @@ use crate::lab::error::LabError;
 use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::merge::{MergeSummary, merge};
 use crate::lab::fleet::export::{ExportSettings, TableFormat};
-use crate::lab::fleet::vehicles::{self, Outcome, Shard, Vehicle};
+use crate::lab::fleet::vehicles::{self, Outcome, Shard, Vehicle, VehicleRecord};
 
 /// Version of the JSON documents.
 const VERSION: u32 = 1;
@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         FleetCommand::Plan(args) => plan(args),
         FleetCommand::Run(args) => replay(args),
-        FleetCommand::Merge(args) => put_together(args),
+        FleetCommand::Merge(args) => merge_runs(args),
     }
 }
 
@@ -164,40 +164,44 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
 
 fn document(outcomes: &[Outcome]) -> serde_json::Value {
     let vehicles = outcomes.iter().map(|outcome| {
-        let (word, record) = parts(outcome);
+        let (word, record) = named(outcome);
         json!({ "outcome": word, "record": record })
     });
     json!({ "version": VERSION, "vehicles": vehicles.collect::<Vec<_>>() })
 }
 
-fn parts(outcome: &Outcome) -> (&'static str, &vehicles::VehicleRecord) {
+/// The outcome's name in JSON, and the vehicle's record.
+fn named(outcome: &Outcome) -> (&'static str, &VehicleRecord) {
     match outcome {
-        Outcome::Written(record) => ("replayed", record),
-        Outcome::Kept(record) => ("complete before", record),
+        Outcome::Replayed(record) => ("replayed", record),
+        Outcome::Complete(record) => ("complete", record),
         Outcome::Failed(record) => ("failed", record),
     }
 }
 
 fn summary(outcomes: &[Outcome], shard: Shard) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    for (word, record) in outcomes.iter().map(parts) {
-        let name = &record.line.vehicle;
-        if let Some(error) = &record.error {
-            writeln!(out, "{word}: {name}: {error}")?;
+    let (mut replayed, mut complete, mut failed, mut days) = (0, 0, 0, 0.0);
+    for outcome in outcomes {
+        let (_, record) = named(outcome);
+        match outcome {
+            Outcome::Replayed(_) => replayed += 1,
+            Outcome::Complete(_) => complete += 1,
+            Outcome::Failed(_) => failed += 1,
         }
+        days += record.days;
+        let name = &record.line.vehicle;
+        record.error.iter().try_for_each(|error| writeln!(out, "failed: {name}: {error}"))?;
         record.notes.iter().try_for_each(|note| writeln!(out, "note: {name}: {note}"))?;
     }
-    let count = |wanted: &str| outcomes.iter().filter(|outcome| parts(outcome).0 == wanted).count();
-    let [replayed, before, failed] = ["replayed", "complete before", "failed"].map(count);
-    let days: f64 = outcomes.iter().map(|outcome| parts(outcome).1.days).sum();
     let Shard { number, of } = shard;
     writeln!(
         out,
-        "part {number} of {of}: {replayed} vehicles replayed, {before} complete before, {failed} failed; {days:.1} days in all"
+        "part {number} of {of}: {replayed} vehicles replayed, {complete} complete before, {failed} failed; {days:.1} days in all"
     )
 }
 
-fn put_together(args: &MergeArgs) -> Result<(), Failure> {
+fn merge_runs(args: &MergeArgs) -> Result<(), Failure> {
     let wanted =
         args.manifest.as_ref().map(|manifest| vehicles::read_manifest(manifest)).transpose().map_err(failure)?;
     let merged = merge(&args.folders, wanted.as_deref(), &args.out).map_err(failure)?;

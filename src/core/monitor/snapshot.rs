@@ -337,6 +337,7 @@ impl Stages {
         self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch);
         self.modelling.end_stretch();
         self.estimation.handle_unknown_gap();
+        // Of the time since, no balancing is counted: the charge is forgotten.
         self.diagnosing.restore(pack.diagnosis, Some((now, now)));
         self.diagnosing.diagnosis.forget_charge();
         self.note_faulty_channels();

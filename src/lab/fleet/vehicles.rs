@@ -224,10 +224,10 @@ impl VehicleRecord {
 /// How a vehicle came out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
-    /// It was replayed.
-    Written(VehicleRecord),
-    /// It was complete.
-    Kept(VehicleRecord),
+    /// It was replayed now.
+    Replayed(VehicleRecord),
+    /// It was complete before.
+    Complete(VehicleRecord),
     /// It has no tables: the reason is in the record.
     Failed(VehicleRecord),
 }
@@ -243,11 +243,12 @@ pub fn run(
     settings: &ExportSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Outcome>, LabError> {
-    let outcomes = super::in_parallel(vehicles, settings.jobs, |_, vehicle| one(vehicle, config_of, settings, report))?;
+    let outcomes =
+        super::in_parallel(vehicles, settings.jobs, |_, vehicle| replay(vehicle, config_of, settings, report))?;
     outcomes.into_iter().collect()
 }
 
-fn one(
+fn replay(
     vehicle: &Vehicle,
     config_of: &(dyn Fn(&Vehicle) -> Result<Config, LabError> + Sync),
     settings: &ExportSettings<'_>,
@@ -277,7 +278,7 @@ fn one(
     let earlier = VehicleRecord::read(&folder).filter(|earlier| earlier.is_of_same(&record) && earlier.error.is_none());
     if let Some(earlier) = earlier {
         report(vehicle.bytes);
-        return Ok(Outcome::Kept(earlier));
+        return Ok(Outcome::Complete(earlier));
     }
     // From here on the folder is not complete.
     for file in [RECORD, export::ABOUT] {
@@ -298,7 +299,7 @@ fn one(
             record.rows = exported.rows.iter().map(|(table, rows)| ((*table).to_owned(), *rows)).collect();
             (record.days, record.notes) = (exported.days, exported.notes);
             write(&folder, &record)?;
-            Ok(Outcome::Written(record))
+            Ok(Outcome::Replayed(record))
         }
         Err(error) => {
             record.error = Some(error.0);

@@ -21,7 +21,8 @@ struct Lasting {
 }
 
 impl Lasting {
-    /// What one more row adds to the square of the sum, which is bounded; nothing in a row ends it.
+    /// What one more row adds to the square of the sum. The sum is bounded, and with it what a row can add; a row in which nothing
+    /// was lost ends it.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
         let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
@@ -169,14 +170,18 @@ mod tests {
     }
 
     #[test]
-    fn what_was_lost_unseen_in_a_year_is_bounded_and_what_is_learned_stays() {
+    fn a_year_unseen_counts_as_the_most_a_cell_loses_and_each_further_hour_as_little() {
         let mut year = diagnosis();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let std = lost_std(&mut year, 8760.0 * HOUR, silent);
         assert!((std - MOST_BESIDE / 3.0_f64.sqrt()).abs() < 1e-6, "{std}");
+        // A thousandth of the capacity each, to the same side as before.
+        let mut last = std;
         for row in 1..100 {
-            lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
+            last = lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
         }
+        let hour = (MOST_BESIDE + 0.001).powi(2) - MOST_BESIDE.powi(2);
+        assert!((last * last - std * std - 99.0 * hour / 3.0).abs() < 1e-6, "{std}, then {last}");
         assert!(year.check(3).is_ok());
     }
 

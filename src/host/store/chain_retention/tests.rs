@@ -30,12 +30,12 @@ fn open(path: &std::path::Path) -> Database {
     Database::open(path, &Stamp::replayed(Timestamp::ZERO), limits).unwrap()
 }
 
-fn commit(database: &mut Database, hour: u32, kinds: &[EventKind]) {
+/// Writes an hour's rows, and as many checkpoints.
+fn commit(database: &mut Database, hour: u32, kinds: &[EventKind], checkpoints: u32) {
     let stamp = Stamp::replayed(Timestamp::from_secs(3600.0 * f64::from(hour)));
     let rows = kinds.iter().copied().map(HistoryRow::Event).collect();
     database.commit(&[RowBatch { stamp, rows }], None).unwrap();
-    // Fewer checkpoints than an hour has.
-    (0..12).for_each(|_| database.commit(&[], None).unwrap());
+    (0..checkpoints).for_each(|_| database.commit(&[], None).unwrap());
 }
 
 /// Every hour a capacity and the losses of each cell and a remaining life, now and then an alarm and the reset of a filter. Returns the
@@ -44,25 +44,30 @@ fn filled(path: &std::path::Path) -> (Database, Vec<(i64, String)>) {
     let mut database = open(path);
     let mut heads = Vec::new();
     for hour in 0..HOURS {
-        let mut kinds = vec![remaining_life(500.0 - 0.1 * f64::from(hour))];
-        kinds.extend((0..CELLS).flat_map(|cell| {
-            let ah = 2.5 - 1e-4 * f64::from(hour);
-            [capacity(cell, Some(ah), ah), loss_modes(cell, 1e-4 * f64::from(hour))]
-        }));
-        if hour.is_multiple_of(4) {
-            kinds.push(raised(1 + hour / 4));
-            kinds.push(EventKind::FilterReset { cell: CellIndex(3) });
-        }
-        if hour == EXCHANGED {
-            kinds.push(EventKind::PackReplaced { capacity_ah: Some(2.4), capacity_std_ah: Some(0.1) });
-        }
-        if hour == 7 {
-            kinds.push(half_cycle(0));
-        }
-        commit(&mut database, hour, &kinds);
+        // Fewer checkpoints than an hour has.
+        commit(&mut database, hour, &hour_of(hour), 12);
         heads.push(database.head());
     }
     (database, heads)
+}
+
+fn hour_of(hour: u32) -> Vec<EventKind> {
+    let mut kinds = vec![remaining_life(500.0 - 0.1 * f64::from(hour))];
+    kinds.extend((0..CELLS).flat_map(|cell| {
+        let ah = 2.5 - 1e-4 * f64::from(hour);
+        [capacity(cell, Some(ah), ah), loss_modes(cell, 1e-4 * f64::from(hour))]
+    }));
+    if hour.is_multiple_of(4) {
+        kinds.push(raised(1 + hour / 4));
+        kinds.push(EventKind::FilterReset { cell: CellIndex(3) });
+    }
+    if hour == EXCHANGED {
+        kinds.push(EventKind::PackReplaced { capacity_ah: Some(2.4), capacity_std_ah: Some(0.1) });
+    }
+    if hour == 7 {
+        kinds.push(half_cycle(0));
+    }
+    kinds
 }
 
 fn raised(times: u32) -> EventKind {
@@ -142,6 +147,26 @@ fn a_long_history_is_bounded_and_still_verified() {
     let reader = HistoryReader::open(place.path()).unwrap();
     let shown = reader.entries(&HistoryQuery::default()).unwrap();
     assert_eq!(i64::try_from(shown.len()).unwrap(), report.good_rows + 1);
+}
+
+#[test]
+fn short_runs_of_the_daemon_together_reach_all_tables() {
+    let place = place();
+    let path = place.path().join(DATABASE);
+    for hour in 0..HOURS {
+        let mut database = open(&path);
+        commit(&mut database, hour, &hour_of(hour), 2);
+        database.close().unwrap();
+    }
+    let database = open(&path);
+    let report = verify(&database);
+    assert!(report.broken.is_none() && report.good_rows <= 2 * MAX_ROWS, "{report:?}");
+    for (table, rows) in
+        [("capacity", 2000), ("loss_modes", 2000), ("remaining_life", 500), ("alarm", 280), ("reset", 250)]
+    {
+        let left = number(&database, &format!("SELECT count(*) FROM {table}"));
+        assert!(left < rows, "{table}: {left}");
+    }
 }
 
 #[test]

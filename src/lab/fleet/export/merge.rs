@@ -4,7 +4,7 @@
 //! failed, and `half_cycles`, `alarms` and, where they were exported, `estimates.parquet`. Promise: the same bytes, in whatever parts and in
 //! whatever order the vehicles were replayed; column chunks are copied as they are, so memory does not grow with the rows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::TableFormat;
@@ -24,8 +24,8 @@ pub struct MergeSummary {
     pub rows: BTreeMap<String, u64>,
 }
 
-/// A vehicle with its folder.
-struct Found {
+/// A vehicle that was replayed, and where its tables are.
+struct VehicleFolder {
     folder: PathBuf,
     record: VehicleRecord,
 }
@@ -36,13 +36,13 @@ struct Found {
 /// A vehicle is missing, is there twice with other contents, or was replayed by another version or with another period of the estimates; a
 /// table cannot be read or written.
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
-    let vehicles = found(folders)?;
+    let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;
     std::fs::create_dir_all(out).map_err(|error| LabError(format!("{}: cannot be created: {error}", out.display())))?;
     let mut summary = MergeSummary { vehicles: vehicles.len(), ..MergeSummary::default() };
     let metadata = [("packwatch.version", env!("CARGO_PKG_VERSION").to_owned())];
     for table in ["half_cycles", "alarms", "estimates"] {
-        let has_table = |found: &&Found| found.record.rows.contains_key(table);
+        let has_table = |vehicle: &&VehicleFolder| vehicle.record.rows.contains_key(table);
         let parts: Vec<PathBuf> =
             vehicles.values().filter(has_table).map(|found| found.folder.join(format!("{table}.parquet"))).collect();
         let path = out.join(format!("{table}.parquet"));
@@ -57,7 +57,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
         }
     }
     let mut table = TableFile::create(&out.join("vehicles.parquet"), TableFormat::Parquet, VEHICLES)?;
-    for (name, Found { record, .. }) in vehicles {
+    for (name, VehicleFolder { record, .. }) in vehicles {
         table.push(&record)?;
         summary.failed.extend(record.error.map(|error| (name, error)));
     }
@@ -66,8 +66,8 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
 }
 
 /// The vehicles of all folders by name.
-fn found(folders: &[PathBuf]) -> Result<BTreeMap<String, Found>, LabError> {
-    let mut vehicles: BTreeMap<String, Found> = BTreeMap::new();
+fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabError> {
+    let mut vehicles: BTreeMap<String, VehicleFolder> = BTreeMap::new();
     for folder in folders {
         let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
         for entry in std::fs::read_dir(folder).map_err(failed)? {
@@ -81,7 +81,7 @@ fn found(folders: &[PathBuf]) -> Result<BTreeMap<String, Found>, LabError> {
             };
             let name = record.line.vehicle.clone();
             let Some(other) = vehicles.get(&name) else {
-                vehicles.insert(name, Found { folder, record });
+                vehicles.insert(name, VehicleFolder { folder, record });
                 continue;
             };
             if other.record != record {
@@ -100,7 +100,7 @@ fn found(folders: &[PathBuf]) -> Result<BTreeMap<String, Found>, LabError> {
     Ok(vehicles)
 }
 
-fn check(vehicles: &BTreeMap<String, Found>, wanted: Option<&[Vehicle]>) -> Result<(), LabError> {
+fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>) -> Result<(), LabError> {
     let mut made = vehicles.values().map(|found| (&found.record, (&found.record.packwatch, found.record.period_s)));
     let first = made.next();
     if let Some((other, (version, period_s))) = made.find(|(_, by)| first.is_some_and(|(_, first)| first != *by)) {
@@ -124,11 +124,8 @@ fn check(vehicles: &BTreeMap<String, Found>, wanted: Option<&[Vehicle]>) -> Resu
             some_of(&missing)
         )));
     }
-    let others: Vec<&str> = vehicles
-        .keys()
-        .map(String::as_str)
-        .filter(|name| wanted.iter().all(|vehicle| vehicle.vehicle != *name))
-        .collect();
+    let named: BTreeSet<&str> = wanted.iter().map(|vehicle| vehicle.vehicle.as_str()).collect();
+    let others: Vec<&str> = vehicles.keys().map(String::as_str).filter(|name| !named.contains(name)).collect();
     if !others.is_empty() {
         return Err(LabError(format!("{} vehicles are not in the manifest: {}", others.len(), some_of(&others))));
     }

@@ -146,7 +146,10 @@ pub(super) fn concatenate<R>(
     let mut whole = TableFile::create(path, TableFormat::Parquet, columns)?;
     let TableWriter::Parquet { out, .. } = &mut whole.writer else { return Err("a table in Parquet".into()) };
     for part in parts {
-        let failed = |error: &dyn std::fmt::Display| LabError(format!("{}: cannot be read: {error}", part.display()));
+        let failed = |error: &dyn std::fmt::Display| {
+            let help = "remove its folder, and replay the vehicle again";
+            LabError(format!("{}: cannot be read: {error}; {help}", part.display()))
+        };
         let file = std::fs::File::open(part).map_err(|error| failed(&error))?;
         let found = ParquetMetaDataReader::new().parse_and_finish(&file).map_err(|error| failed(&error))?;
         if found.file_metadata().schema() != out.schema_descr().root_schema() {
