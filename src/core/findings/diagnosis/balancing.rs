@@ -181,7 +181,7 @@ mod tests {
             last = lost_std(&mut year, (8760.0 + f64::from(row)) * HOUR, silent);
         }
         let hour = (MOST_BESIDE + 0.001).powi(2) - MOST_BESIDE.powi(2);
-        assert!((last * last - std * std - 99.0 * hour / 3.0).abs() < 1e-6, "{std}, then {last}");
+        assert!((last * last - hour / 3.0).abs() < 1e-9, "a row, not all of them: {std}, then {last}");
         assert!(year.check(3).is_ok());
     }
 
