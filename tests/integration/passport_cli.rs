@@ -58,9 +58,18 @@ fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
 }
 
-fn manufacturer() -> Value {
+/// The manufacturer's part of the measured cell.
+fn cell_part() -> Value {
     let text = fs::read_to_string(shipped("tests/integration/passport_cli/manufacturer.json")).expect("a file");
     serde_json::from_str(&text).expect("JSON")
+}
+
+/// The same of the simulated pack, of two such cells.
+fn manufacturer() -> Value {
+    let mut part = cell_part();
+    part["performance"]["rated"]["capacity"]["value"] = json!(4.0);
+    part["performance"]["rated"]["energy"]["value"] = json!(0.014);
+    part
 }
 
 fn close(a: f64, b: f64) -> bool {
@@ -188,9 +197,10 @@ fn a_replay_gives_what_its_store_gives_and_the_energy() {
         |before: &str| passport(&["-c", &config, &log, "--static", &accidents, "--throughput-before-ah", before]);
     let mut whole = replayed("0");
     let energy = whole.as_object_mut().unwrap().remove("EnergyThroughput").expect("a replay has voltages");
-    let mean_v = 1e3 * energy["EnergyThroughputValue"].as_f64().unwrap()
-        / stored["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
-    assert!((3.2..4.3).contains(&mean_v), "{mean_v} V");
+    let energy_wh = 1e3 * energy["EnergyThroughputValue"].as_f64().unwrap();
+    // The last charge, of some 2.3 Ah, is not complete: its energy has been counted, its charge not yet.
+    let moved_ah = stored["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
+    assert!((3.5 * moved_ah..4.3 * (moved_ah + 2.3)).contains(&energy_wh), "{energy_wh} Wh, {moved_ah} Ah");
     for group in stored.as_object().unwrap().keys() {
         let pairs = stored[group].as_object().into_iter().flatten();
         for (name, value) in pairs.filter(|(name, _)| *name != "LastUpdate") {
@@ -454,9 +464,9 @@ fn schema(name: &str, document: &str) -> Option<String> {
 }
 
 /// Both passports of a record, in files.
-fn both(life: &Life, args: &[&str], certified_kwh: &str) -> (String, String) {
+fn both(life: &Life, args: &[&str], (part, certified_kwh): (&Value, &str)) -> (String, String) {
     let (condition, pass) = (life.path("condition.json"), life.path("battery_pass.json"));
-    let (accidents, path) = (life.path("accidents.json"), life.write("manufacturer.json", &manufacturer()));
+    let (accidents, path) = (life.path("accidents.json"), life.write("manufacturer.json", part));
     let args = [args, &["--certified-energy-kwh", certified_kwh, "--throughput-before-ah", "0"]].concat();
     good(&[&["passport"], &args[..], &["--static", &accidents, "-o", &condition]].concat());
     good(&[&["passport"], &args[..], &["--static", &path, "--form", "battery-pass", "-o", &pass]].concat());
@@ -477,7 +487,8 @@ fn assert_valid(condition: &str, pass: &str) {
 #[test]
 fn peers_find_no_fault_in_a_passport_and_one_in_a_broken_one() {
     let life = Life::new();
-    let (condition, pass) = both(&life, &["-c", &life.path("pack.toml"), &life.path("life.log")], "0.014");
+    let (condition, pass) =
+        both(&life, &["-c", &life.path("pack.toml"), &life.path("life.log")], (&manufacturer(), "0.014"));
     assert_valid(&condition, &pass);
     let mut broken: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
     broken["StateOfCharge"].as_object_mut().unwrap().remove("LastUpdate");
@@ -493,7 +504,7 @@ fn a_measured_life_gives_both_passports_from_a_replay_and_from_its_store() {
     let life = Life::configured("");
     let (config, log) = (shipped("config/measured.toml").display().to_string(), log.display().to_string());
     let starts = log.replace(".csv.gz", "_cycles.csv");
-    let (condition, pass) = both(&life, &["-c", &config, &log, "--start-times", &starts], "0.0068");
+    let (condition, pass) = both(&life, &["-c", &config, &log, "--start-times", &starts], (&cell_part(), "0.0068"));
     assert_valid(&condition, &pass);
     let of_replay: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
     // 168 discharges of 1.86 to 1.29 Ah, as their publishers measured them, and as many charges.
@@ -503,7 +514,7 @@ fn a_measured_life_gives_both_passports_from_a_replay_and_from_its_store() {
     assert!(of_replay["RemainingCapacity"]["LastUpdate"].as_str().unwrap().starts_with("2008-05-"));
     let state = life.path("state");
     good(&["replay", "-c", &config, &log, "--start-times", &starts, "--state", &state]);
-    let (condition, pass) = both(&life, &["-c", &config, "--state", &state], "0.0068");
+    let (condition, pass) = both(&life, &["-c", &config, "--state", &state], (&cell_part(), "0.0068"));
     assert_valid(&condition, &pass);
     let of_store: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
     assert_eq!(of_store["CapacityThroughput"], of_replay["CapacityThroughput"]);

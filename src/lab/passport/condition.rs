@@ -47,6 +47,16 @@ pub type Known = Result<Quantity, String>;
 #[derive(Debug)]
 pub struct Condition {
     values: Vec<(Field, Known)>,
+    rated: Rated,
+}
+
+/// What the configuration and the command line say of the new battery: a passport that says otherwise is of another one.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Rated {
+    /// Capacity, Ah.
+    pub(super) capacity_ah: Option<f64>,
+    /// Energy at the certification, kWh.
+    pub(super) energy_kwh: Option<f64>,
 }
 
 impl Condition {
@@ -58,13 +68,19 @@ impl Condition {
         let battery = Battery::new(record, config, model)?;
         let moved = battery.moved_ah(terms);
         let values = Field::ALL.map(|field| (field, battery.value(field, terms, &moved)));
-        Ok(Self { values: values.to_vec() })
+        let rated = Rated { capacity_ah: Some(battery.rated_ah()), energy_kwh: terms.certified_kwh };
+        Ok(Self { values: values.to_vec(), rated })
     }
 
     /// Values made for a test.
     #[cfg(test)]
-    pub(super) fn of(values: Vec<(Field, Known)>) -> Self {
-        Self { values }
+    pub(super) fn of(values: Vec<(Field, Known)>, rated: Rated) -> Self {
+        Self { values, rated }
+    }
+
+    /// What the new battery was.
+    pub(super) fn rated(&self) -> Rated {
+        self.rated
     }
 
     /// A value.
@@ -115,7 +131,7 @@ impl<'a> Battery<'a> {
     }
 
     fn value(&self, field: Field, terms: &Terms, moved: &Known) -> Known {
-        let rated_ah = self.strings * self.model.rated_capacity_ah;
+        let rated_ah = self.rated_ah();
         match field {
             Field::CapacityThroughput => moved.clone(),
             Field::FullCycles => moved.clone().map(|moved| moved.times(1.0 / (2.0 * rated_ah))),
@@ -138,6 +154,10 @@ impl<'a> Battery<'a> {
                 Ok(self.energy_kwh()?.times(100.0 / certified_kwh))
             }
         }
+    }
+
+    fn rated_ah(&self) -> f64 {
+        self.strings * self.model.rated_capacity_ah
     }
 
     fn wall(&self, time: Timestamp) -> Timestamp {

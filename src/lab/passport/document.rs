@@ -5,7 +5,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::condition::Condition;
+use super::condition::{Condition, Rated};
 use super::field::{Field, Place, Standard, rounded};
 use super::shape::{Verdict, joined};
 use super::standards;
@@ -13,6 +13,8 @@ use super::standards;
 use crate::config::VehicleIdentity;
 use crate::io::stamp::format_utc;
 
+/// Largest difference between what the static part and the configuration say of the new battery, fraction: they may be rounded.
+const RATED_TOLERANCE: f64 = 0.01;
 /// Version of the details.
 const VERSION: u32 = 1;
 
@@ -34,6 +36,7 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
         }
     }
     let document = Value::Object(root);
+    faults.extend(other_battery(condition.rated(), &document));
     let is_opened = |path: &str| places(standard).any(|(_, place)| path != place.group && is_above(path, place.group));
     let Verdict { faults: wrong, missing } = standards::shape(standard).check(&document, &is_opened);
     faults.extend(wrong);
@@ -100,6 +103,19 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     Ok(())
 }
 
+/// Faults of a static part that is another battery's: only Catena-X states what it was when new.
+fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
+    let both = [
+        ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),
+        ("energy", rated.energy_kwh, "kWh by --certified-energy-kwh"),
+    ];
+    both.into_iter().filter_map(|(name, known, source)| {
+        let (known, stated) = (known?, document.pointer(&format!("/performance/rated/{name}/value"))?.as_f64()?);
+        let is_other = (stated - known).abs() > RATED_TOLERANCE * known.abs();
+        is_other.then(|| format!("performance.rated.{name}.value: found {stated}, but it is {known} {source}"))
+    })
+}
+
 fn missing_fault(standard: Standard, condition: &Condition, path: &str) -> String {
     let of_field = places(standard).find(|(_, place)| is_above(path, place.group) || is_above(place.group, path));
     match of_field.map(|(field, _)| condition.get(field)) {
@@ -123,7 +139,7 @@ mod tests {
             let is_absent = absent.contains(&field);
             (field, if is_absent { Err("no reading".to_owned()) } else { known(12.75) })
         };
-        Condition::of(Field::ALL.map(value).to_vec())
+        Condition::of(Field::ALL.map(value).to_vec(), Rated { capacity_ah: Some(4.0), energy_kwh: Some(0.014) })
     }
 
     #[test]
@@ -174,6 +190,23 @@ mod tests {
         assert!(has("performance.dynamic.energy.soce: required, but not known: no reading"), "{refused:?}");
         assert!(has("performance.dynamic.power: required, and no record holds it: --static gives it"), "{refused:?}");
         assert!(!refused.iter().any(|fault| fault.contains("fullCycles")), "{refused:?}");
+    }
+
+    #[test]
+    fn a_static_part_of_another_battery_is_refused() {
+        let faults = |capacity: f64, energy: f64| {
+            let rated = json!({ "capacity": { "value": capacity }, "energy": { "value": energy } });
+            let stated = json!({ "performance": { "rated": rated } });
+            let refused = passport(Standard::BatteryPass, &condition(&[]), stated).unwrap_err();
+            refused.into_iter().filter(|fault| fault.contains("but it is")).collect::<Vec<String>>()
+        };
+        assert_eq!(faults(3.97, 0.0141), Vec::<String>::new(), "rounded");
+        let both = faults(60.0, 22.0);
+        assert_eq!(
+            both[0],
+            "performance.rated.capacity.value: found 60, but it is 4 Ah by the configuration (cell model and strings)"
+        );
+        assert_eq!(both[1], "performance.rated.energy.value: found 22, but it is 0.014 kWh by --certified-energy-kwh");
     }
 
     #[test]

@@ -192,9 +192,9 @@ impl Field {
     }
 }
 
-/// To a millionth, far below every deviation; a zero is positive.
+/// To seven digits, far below every deviation; a zero is positive.
 pub(super) fn rounded(value: f64) -> f64 {
-    (1e6 * value).round() / 1e6 + 0.0
+    format!("{value:.6e}").parse().unwrap_or(value) + 0.0
 }
 
 #[cfg(test)]
@@ -202,10 +202,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cycles_are_whole_and_other_numbers_have_six_digits() {
+    fn cycles_are_whole_and_other_numbers_have_seven_digits() {
         assert_eq!(Field::FullCycles.number(12.97), Value::from(12));
-        assert_eq!(Field::StateOfCharge.number(12.971_234_56), Value::from(12.971_235));
-        assert_eq!(rounded(-1e-9).to_bits(), 0.0_f64.to_bits());
+        assert_eq!(Field::StateOfCharge.number(12.971_234_56), Value::from(12.971_23));
+        assert_eq!(rounded(0.004_460_274_12), 0.004_460_274);
+        assert_eq!(rounded(-0.0).to_bits(), 0.0_f64.to_bits());
     }
 
     #[test]
