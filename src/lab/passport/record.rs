@@ -240,14 +240,14 @@ mod tests {
     #[test]
     fn energy_counts_both_directions_and_no_gap() {
         let mut record = Record::of_replay(60.0);
-        // 7.2 W for a minute, and the same in the other direction; two minutes of nothing between them; a voltage without a current.
+        // 7.2 W for 50 s, and the same in the other direction; two minutes of nothing between them; a voltage without a current.
         for (time_s, current_a) in
-            [(0.0, 2.0), (60.0, 2.0), (180.0, -2.0), (240.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
+            [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {
             record.take_estimate(&estimate(time_s, 3.6, current_a));
         }
         let (energy_wh, until) = record.energy.unwrap();
-        assert!((energy_wh - 2.0 * 7.2 / 60.0).abs() < 1e-12, "{energy_wh}");
-        assert_eq!(until, Some(240_000_000_000));
+        assert!((energy_wh - 2.0 * 7.2 * 50.0 / 3600.0).abs() < 1e-12, "{energy_wh}");
+        assert_eq!(until, Some(230_000_000_000));
     }
 }
