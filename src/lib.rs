@@ -24,7 +24,7 @@
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
-//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, fleets, plots, import, discover (feature `lab`) |
+//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -77,6 +77,7 @@
 //! | what a cell model file holds | `host/config/cell_model.rs` (read), `host/config/cell_model/write.rs` (written) |
 //! | a picture of a cell model | `lab/model_pictures.rs` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
+//! | a value of a battery passport, its place in a standard; what a standard requires | `lab/passport/field.rs`, `lab/passport/condition.rs`; `lab/passport/standards.rs` |
 //! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
 //! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |

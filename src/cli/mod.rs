@@ -35,6 +35,8 @@ mod model;
 mod numbers;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod output;
+#[cfg(feature = "lab")]
+mod passport;
 mod replay;
 #[cfg(feature = "lab")]
 mod report;
@@ -141,6 +143,9 @@ enum Command {
     /// Write a page about the state and the past of a battery, from a history or a replay
     #[cfg(feature = "lab")]
     Report(Box<report::Args>),
+    /// Write the measured part of a battery passport, merged with the manufacturer's part and checked
+    #[cfg(feature = "lab")]
+    Passport(Box<passport::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -215,6 +220,8 @@ pub fn main() -> ExitCode {
         Command::Fleet(args) => fleet::run(&args),
         #[cfg(feature = "lab")]
         Command::Report(args) => report::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Passport(args) => passport::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

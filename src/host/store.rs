@@ -64,7 +64,7 @@ use runtime::RuntimeState;
 use stamp::{BootId, Stamp, WallClock};
 use writer::{Retry, WriteQueue, Writer};
 
-pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
+pub use reader::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
 pub use rows::HistoryTable;

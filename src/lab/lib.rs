@@ -18,6 +18,7 @@ pub mod import;
 pub mod measured;
 pub mod model_pictures;
 pub mod pack_view;
+pub mod passport;
 pub mod report;
 pub mod rul;
 pub mod score;

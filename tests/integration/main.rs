@@ -63,6 +63,8 @@ mod other_cell;
 mod output_dbc;
 mod pack_memory;
 mod paper_scenario;
+#[cfg(feature = "lab")]
+mod passport_cli;
 mod protected_input;
 mod recharge_fleet;
 mod reference_scenario;

@@ -177,6 +177,16 @@ impl Monitor {
         sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
     }
 
+    /// The latest good reading of every signal that has had one, however old it is: channel, time, value.
+    pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
+        self.stages.sampling.sampler.latest_readings()
+    }
+
+    /// Whether a cell's innovations agree with their covariance, and its model is not another cell's.
+    pub fn is_trusted(&self, cell: CellIndex) -> bool {
+        self.stages.estimation.is_trusted(cell.index())
+    }
+
     /// How many signals are configured.
     pub fn inputs(&self) -> usize {
         self.stages.sampling.sampler.channels().len()

@@ -341,6 +341,12 @@ impl Sampler {
         &self.channels
     }
 
+    /// The latest good reading of every channel that has had one, however old it is: channel, time, value.
+    pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
+        let each = self.channels.iter().zip(&self.state.signals);
+        each.filter_map(|(&channel, signal)| signal.good.map(|good| (channel, good.time, good.value())))
+    }
+
     /// For how long no reading of any input has come, s; `None` = not even `quiet_s`, or none has come at all.
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;

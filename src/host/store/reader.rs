@@ -75,6 +75,15 @@ pub struct HistoryEntry {
     pub values: Vec<serde_json::Value>,
 }
 
+/// How much of the half-cycles a store holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HistoryExtent {
+    /// Number of the pack that is connected, from 1; 0 = none yet.
+    pub pack: i64,
+    /// Half-cycles, of any pack, that were deleted: thinned out, or too old.
+    pub deleted_half_cycles: i64,
+}
+
 impl HistoryReader {
     /// Opens the store in a folder.
     ///
@@ -117,6 +126,15 @@ impl HistoryReader {
         meta::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
 
+    /// How much of the half-cycles the store holds.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn extent(&self) -> Result<HistoryExtent, String> {
+        let meta = meta::Meta::read(&self.connection).map_err(|error| self.named(&error))?;
+        Ok(HistoryExtent { pack: meta.pack, deleted_half_cycles: meta.thinned })
+    }
+
     /// Checks the hash chain.
     ///
     /// # Errors
@@ -136,6 +154,11 @@ impl HistoryReader {
     /// The stored snapshot; `None` = there is none, or it is damaged.
     pub fn snapshot(&self) -> Option<Snapshot> {
         self.state().map(|document| *document.snapshot)
+    }
+
+    /// The stored snapshot and the wall clock when it was taken, ns since 1970; `None` as for [`HistoryReader::snapshot`].
+    pub fn dated_snapshot(&self) -> Option<(i64, Snapshot)> {
+        self.state().map(|document| (document.stamp.wall_ns, *document.snapshot))
     }
 
     /// The stored state, if it is good.

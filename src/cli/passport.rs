@@ -1,0 +1,186 @@
+//! `packwatch passport`: the JSON of a battery passport, from a store or a replay, with the manufacturer's part merged in.
+
+use std::cell::RefCell;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use serde::Serialize as _;
+use serde_json::{Map, Value};
+
+use super::Failure;
+use super::numbers::{NamedValue, above_0, one_of, within};
+use super::output::{failure, unless_closed};
+use super::replay::{Bar, InputArgs, log_options};
+use super::report::cell_model;
+use crate::config::{self, Config, VehicleIdentity};
+use crate::io::log::LogSource;
+use crate::io::result_file::check_place;
+use crate::lab;
+use crate::lab::passport::{self, Condition, Record, Standard, Terms};
+use crate::monitor::Monitor;
+use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
+use crate::store::HistoryReader;
+
+/// Largest manufacturer's part, bytes: a passport has some ten thousand.
+const MAX_STATIC_BYTES: u64 = 16 << 20;
+
+/// Standards by name.
+const STANDARDS: [NamedValue<Standard>; 2] = [
+    (
+        "product-condition",
+        Standard::ProductCondition,
+        "IDTA 02035-5, Digital Battery Passport, Part 5: Product Condition 1.0.1",
+    ),
+    ("battery-pass", Standard::BatteryPass, "Catena-X io.catenax.battery.battery_pass 6.0.0"),
+];
+
+/// Arguments of `passport`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "A value that is not known is left out. Where the standard requires it, nothing is written, and each missing value is \
+                  listed with the reason and with what makes it known. The static part may state everything that packwatch does \
+                  not measure; a value that both have is a fault."
+)]
+pub(crate) struct Args {
+    /// Configuration of the pack
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst, read one after another as one record
+    #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
+    logs: Vec<PathBuf>,
+    /// Folder of state and history to use instead, also one that a daemon is using
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
+    /// Standard of the passport
+    #[arg(long, value_name = "STANDARD", value_parser = one_of(&STANDARDS), default_value = "product-condition")]
+    form: Standard,
+    /// The part of the passport that no record holds, in the form of the standard: manufacturer, materials, accidents
+    #[arg(long = "static", value_name = "FILE.json")]
+    manufacturer: Option<PathBuf>,
+    /// Usable energy of the pack at its certification, kWh; without it there is no state of certified energy (SOCE)
+    #[arg(long, value_name = "KWH", value_parser = above_0)]
+    certified_energy_kwh: Option<f64>,
+    /// Charge that the pack had moved, charged and discharged, before the record began, Ah: 0 for a battery recorded since new
+    #[arg(long, value_name = "AH", value_parser = at_least_0)]
+    throughput_before_ah: Option<f64>,
+    /// Charge that the pack has moved in all, charged and discharged, Ah, as its own counter says: instead of the record's sum
+    #[arg(long, value_name = "AH", value_parser = at_least_0, conflicts_with = "throughput_before_ah")]
+    throughput_ah: Option<f64>,
+    /// Passport to write; - is standard output
+    #[arg(short, long, value_name = "FILE.json", default_value = "-")]
+    out: PathBuf,
+    /// Write each value's standard deviation, unit and definition, and why values are absent
+    #[arg(long, value_name = "FILE.json")]
+    details: Option<PathBuf>,
+    #[command(flatten)]
+    input: InputArgs,
+}
+
+fn at_least_0(text: &str) -> Result<f64, String> {
+    within(text, |value| value >= 0.0, "a finite number, 0 or more")
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    args.check()?;
+    let config = config::load(&args.config)?;
+    let manufacturer = args.manufacturer.as_deref().map(read_static).transpose()?;
+    let manufacturer = manufacturer.unwrap_or_else(|| Value::Object(Map::new()));
+    let (record, vehicle) = match &args.state {
+        Some(folder) => of_store(folder, &config)?,
+        None => (of_replay(args, &config)?, config.vehicle.clone()),
+    };
+    let model =
+        cell_model(record.snapshot(), Some(&config))?.map_or_else(|| config.monitor.model.clone(), |it| it.model);
+    let condition = Condition::new(&record, &config, &model, &args.terms()).map_err(Failure::new)?;
+    let document = passport::passport(args.form, &condition, manufacturer);
+    let document = document.map_err(|faults| Failure::new(faults.join("\n")))?;
+    if let Some(path) = &args.details {
+        write(path, &passport::details(args.form, &condition, &vehicle))?;
+    }
+    write(&args.out, &document)
+}
+
+impl Args {
+    fn check(&self) -> Result<(), Failure> {
+        let inputs = || self.logs.iter().chain(&self.manufacturer).chain([&self.config]);
+        for out in self.details.iter().chain([&self.out]) {
+            check_place(out, inputs()).map_err(Failure::new)?;
+        }
+        if self.details.as_ref() == Some(&self.out) {
+            return Err(Failure::new(format!("{}: named for two results", self.out.display())));
+        }
+        Ok(())
+    }
+
+    fn terms(&self) -> Terms {
+        Terms {
+            moved_before_ah: self.throughput_before_ah,
+            moved_ah: self.throughput_ah,
+            certified_kwh: self.certified_energy_kwh,
+        }
+    }
+}
+
+fn read_static(path: &Path) -> Result<Value, Failure> {
+    let named = |error: String| Failure::new(format!("{}: {error}", path.display()));
+    let file = File::open(path).map_err(|error| named(error.to_string()))?;
+    let mut bytes = Vec::new();
+    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(error.to_string()))?;
+    if u64::try_from(bytes.len()).is_ok_and(|length| length > MAX_STATIC_BYTES) {
+        return Err(named(format!("more than {MAX_STATIC_BYTES} bytes")));
+    }
+    serde_json::from_slice(&bytes).map_err(|error| named(error.to_string()))
+}
+
+fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {
+    let reader = HistoryReader::open(folder).map_err(Failure::new)?;
+    let vehicle = reader.vehicle().map_err(Failure::new)?;
+    if vehicle.is_stated() && config.vehicle.is_stated() && vehicle != config.vehicle {
+        return Err(Failure::new(format!(
+            "{}: is of {vehicle}, the configuration is of {}",
+            folder.display(),
+            config.vehicle
+        )));
+    }
+    let record = Record::of_store(&reader).map_err(|error| Failure::new(format!("{}: {error}", folder.display())))?;
+    Ok((record, vehicle))
+}
+
+fn of_replay(args: &Args, config: &Config) -> Result<Record, Failure> {
+    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
+    let sample = &config.monitor.sample;
+    let longest_step_s = sample.current.max_age_s.min(sample.voltage.max_age_s);
+    let record = Rc::new(RefCell::new(Record::of_replay(longest_step_s)));
+    let watched = Rc::clone(&record);
+    let watch: OutputWatch = Box::new(move |_, out| {
+        let mut record = watched.borrow_mut();
+        out.estimates.iter().for_each(|estimate| record.take_estimate(estimate));
+        out.events.iter().for_each(|event| record.take_event(event));
+    });
+    let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
+    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
+    let settings = ReplaySettings { snapshot: true, ..plain };
+    let bar = Bar::new(&args.logs);
+    let monitor = Monitor::new(config.monitor.clone());
+    let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
+    bar.clear();
+    let (_, snapshot) = result.map_err(failure)?;
+    // The replay has ended and with it the closure that shared the record.
+    let record = Rc::try_unwrap(record).map_err(|_| Failure::new("the replay still holds its record"))?;
+    let mut record = record.into_inner();
+    if let Some(snapshot) = snapshot {
+        record.finish(snapshot);
+    }
+    Ok(record)
+}
+
+/// Writes a document, indented.
+fn write(path: &Path, document: &Value) -> Result<(), Failure> {
+    let mut bytes = Vec::new();
+    document.serialize(&mut serde_json::Serializer::pretty(&mut bytes)).map_err(failure)?;
+    bytes.push(b'\n');
+    unless_closed(lab::write_file(path, &bytes))
+}

@@ -1,0 +1,223 @@
+//! The passport as JSON: the manufacturer's part with the known values merged in, checked against the form of its standard.
+//!
+//! In: a [`Condition`] and the manufacturer's part. Out: the passport, and the [details](details) that the standards have no members
+//! for. One value has one source: a static part that states a value which was measured is refused. Same inputs, same bytes.
+
+use serde_json::{Map, Value, json};
+
+use super::condition::{Condition, Rated};
+use super::field::{Field, Place, Standard, rounded};
+use super::shape::{Verdict, joined};
+use super::standards;
+
+use crate::config::VehicleIdentity;
+use crate::io::stamp::format_utc;
+
+/// Largest difference between what the static part and the configuration say of the new battery, fraction: they may be rounded.
+const RATED_TOLERANCE: f64 = 0.01;
+/// Version of the details.
+const VERSION: u32 = 1;
+
+/// Merges the known values into the manufacturer's part and checks the whole.
+///
+/// # Errors
+/// Every fault of the static part by its path, and every required value that is missing, with the reason; one per line.
+pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) -> Result<Value, Vec<String>> {
+    let Value::Object(mut root) = manufacturer else {
+        return Err(vec!["static part: must be an object".to_owned()]);
+    };
+    let mut faults = Vec::new();
+    for (field, place) in places(standard) {
+        if let Ok(quantity) = condition.get(field) {
+            let (number, time) = (field.number(quantity.value), Value::from(format_utc(quantity.time)));
+            for (name, value) in [(place.value, number), (place.time, time)] {
+                faults.extend(insert(&mut root, place.group, name, value).err());
+            }
+        }
+    }
+    let document = Value::Object(root);
+    faults.extend(other_battery(condition.rated(), &document));
+    let is_opened = |path: &str| places(standard).any(|(_, place)| path != place.group && is_above(path, place.group));
+    let Verdict { faults: wrong, missing } = standards::shape(standard).check(&document, &is_opened);
+    faults.extend(wrong);
+    faults.extend(missing.iter().map(|path| missing_fault(standard, condition, path)));
+    if faults.is_empty() { Ok(document) } else { Err(faults) }
+}
+
+/// Every value with its unit, definition, standard deviation and time, and why values are absent.
+pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdentity) -> Value {
+    let (mut values, mut absent) = (Vec::new(), Vec::new());
+    for field in Field::ALL {
+        let (name, unit, definition) = field.meaning();
+        let path = field.place(standard).map(|place| joined(place.group, place.value));
+        match condition.get(field) {
+            Ok(quantity) => values.push(json!({
+                "name": name,
+                "path": path,
+                "value": rounded(quantity.value),
+                "std": quantity.std.map(rounded),
+                "unit": unit,
+                "time": format_utc(quantity.time),
+                "definition": definition,
+            })),
+            Err(why) => absent.push(json!({ "name": name, "path": path, "reason": why })),
+        }
+    }
+    let vehicle: Map<String, Value> =
+        vehicle.labels().into_iter().map(|(key, text)| (key.to_owned(), Value::from(text))).collect();
+    json!({
+        "version": VERSION,
+        "program": format!("packwatch {}", env!("CARGO_PKG_VERSION")),
+        "standard": standard.name(),
+        "vehicle": vehicle,
+        "values": values,
+        "absent": absent,
+    })
+}
+
+fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
+    Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
+}
+
+/// Whether a path leads to a group, or is it.
+fn is_above(path: &str, group: &str) -> bool {
+    group.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+}
+
+/// Puts a measured value below `group`.
+fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) -> Result<(), String> {
+    let mut object = root;
+    for step in group.split('.') {
+        let next = object.entry(step).or_insert_with(|| Value::Object(Map::new()));
+        // Something else in its place is a fault of the form.
+        let Some(next) = next.as_object_mut() else { return Ok(()) };
+        object = next;
+    }
+    if object.contains_key(name) {
+        let path = joined(group, name);
+        return Err(format!(
+            "{path}: stated in the static part, but measured ({value}): one of both, leave it out there"
+        ));
+    }
+    object.insert(name.to_owned(), value);
+    Ok(())
+}
+
+/// Faults of a static part that is another battery's: only Catena-X states what it was when new.
+fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
+    let both = [
+        ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),
+        ("energy", rated.energy_kwh, "kWh by --certified-energy-kwh"),
+    ];
+    both.into_iter().filter_map(|(name, known, source)| {
+        let (known, stated) = (known?, document.pointer(&format!("/performance/rated/{name}/value"))?.as_f64()?);
+        let is_other = (stated - known).abs() > RATED_TOLERANCE * known.abs();
+        is_other.then(|| format!("performance.rated.{name}.value: found {stated}, but it is {known} {source}"))
+    })
+}
+
+fn missing_fault(standard: Standard, condition: &Condition, path: &str) -> String {
+    let of_field = places(standard).find(|(_, place)| is_above(path, place.group) || is_above(place.group, path));
+    match of_field.map(|(field, _)| condition.get(field)) {
+        Some(Err(why)) => format!("{path}: required, but not known: {why}"),
+        _ => format!("{path}: required, and no record holds it: --static gives it"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::passport::condition::{Known, Quantity};
+    use crate::quantity::Timestamp;
+
+    fn known(value: f64) -> Known {
+        Ok(Quantity { value, std: Some(0.5), time: Timestamp::from_secs(1.7e9) })
+    }
+
+    fn condition(absent: &[Field]) -> Condition {
+        let value = |field: Field| {
+            let is_absent = absent.contains(&field);
+            (field, if is_absent { Err("no reading".to_owned()) } else { known(12.75) })
+        };
+        Condition::of(Field::ALL.map(value).to_vec(), Rated { capacity_ah: Some(4.0), energy_kwh: Some(0.014) })
+    }
+
+    #[test]
+    fn values_stand_in_their_places_with_their_times() {
+        let built =
+            passport(Standard::ProductCondition, &condition(&[]), json!({ "InformationOnAccidents": [] })).unwrap();
+        let cycles = json!({ "NumberOfFullCyclesValue": 12, "LastUpdate": "2023-11-14T22:13:20Z" });
+        assert_eq!(built["NumberOfFullCycles"], cycles);
+        assert_eq!(built["TemperatureInformation"]["MeasuredTemp"], 12.75);
+        assert_eq!(built.as_object().unwrap().len(), 9, "{built}");
+    }
+
+    #[test]
+    fn an_unknown_value_is_absent_and_a_required_one_refuses() {
+        let accidents = || json!({ "InformationOnAccidents": ["report-1"] });
+        let absent = [Field::StateOfCertifiedEnergy, Field::EnergyThroughput];
+        let built = passport(Standard::ProductCondition, &condition(&absent), accidents()).unwrap();
+        assert!(built.get("StateOfCertifiedEnergy").is_none() && built.get("EnergyThroughput").is_none(), "{built}");
+        let refused =
+            passport(Standard::ProductCondition, &condition(&[Field::StateOfCharge]), accidents()).unwrap_err();
+        assert_eq!(refused, ["StateOfCharge: required, but not known: no reading"]);
+        let refused = passport(Standard::ProductCondition, &condition(&[]), json!({})).unwrap_err();
+        assert_eq!(refused, ["InformationOnAccidents: required, and no record holds it: --static gives it"]);
+    }
+
+    #[test]
+    fn a_value_has_one_source() {
+        let stated = json!({ "InformationOnAccidents": [], "StateOfCharge": { "StateOfChargeValue": 50 } });
+        let refused = passport(Standard::ProductCondition, &condition(&[]), stated).unwrap_err();
+        assert_eq!(
+            refused,
+            [
+                "StateOfCharge.StateOfChargeValue: stated in the static part, but measured (12.75): one of both, leave it out there"
+            ]
+        );
+        let temperatures =
+            json!({ "InformationOnAccidents": [], "TemperatureInformation": { "TimeExtremeHighTemp": 4.5 } });
+        let built = passport(Standard::ProductCondition, &condition(&[]), temperatures).unwrap();
+        assert_eq!(built["TemperatureInformation"]["TimeExtremeHighTemp"], 4.5, "both parts of one group");
+    }
+
+    #[test]
+    fn a_battery_pass_without_a_static_part_names_what_is_missing_once() {
+        let refused =
+            passport(Standard::BatteryPass, &condition(&[Field::StateOfCertifiedEnergy]), json!({})).unwrap_err();
+        let has = |line: &str| refused.iter().any(|fault| fault == line);
+        assert!(has("materials: required, and no record holds it: --static gives it"), "{refused:?}");
+        assert!(has("performance.dynamic.energy.soce: required, but not known: no reading"), "{refused:?}");
+        assert!(has("performance.dynamic.power: required, and no record holds it: --static gives it"), "{refused:?}");
+        assert!(!refused.iter().any(|fault| fault.contains("fullCycles")), "{refused:?}");
+    }
+
+    #[test]
+    fn a_static_part_of_another_battery_is_refused() {
+        let faults = |capacity: f64, energy: f64| {
+            let rated = json!({ "capacity": { "value": capacity }, "energy": { "value": energy } });
+            let stated = json!({ "performance": { "rated": rated } });
+            let refused = passport(Standard::BatteryPass, &condition(&[]), stated).unwrap_err();
+            refused.into_iter().filter(|fault| fault.contains("but it is")).collect::<Vec<String>>()
+        };
+        assert_eq!(faults(3.97, 0.0141), Vec::<String>::new(), "rounded");
+        let both = faults(60.0, 22.0);
+        assert_eq!(
+            both[0],
+            "performance.rated.capacity.value: found 60, but it is 4 Ah by the configuration (cell model and strings)"
+        );
+        assert_eq!(both[1], "performance.rated.energy.value: found 22, but it is 0.014 kWh by --certified-energy-kwh");
+    }
+
+    #[test]
+    fn details_have_deviations_and_reasons() {
+        let details = details(Standard::BatteryPass, &condition(&[Field::PackResistance]), &VehicleIdentity::default());
+        let first = &details["values"][0];
+        assert_eq!(
+            (&first["name"], &first["value"], &first["std"]),
+            (&json!("full_cycles"), &json!(12.75), &json!(0.5))
+        );
+        assert_eq!(first["path"], "performance.dynamic.fullCycles.value");
+        assert_eq!(details["absent"][0]["reason"], "no reading");
+    }
+}

@@ -1,0 +1,227 @@
+//! The values of a battery passport that packwatch can know: name, unit, definition and place in each standard.
+//!
+//! This table decides what is written and where; `docs/src/lab/passport.md` explains it.
+
+use serde_json::Value;
+
+/// Form of a passport.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standard {
+    /// IDTA 02035-5, submodel Product Condition 1.0.1, as the JSON of its values.
+    ProductCondition,
+    /// Catena-X `io.catenax.battery.battery_pass` 6.0.0.
+    BatteryPass,
+}
+
+impl Standard {
+    /// Its name, with the version.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ProductCondition => {
+                "urn:samm:io.admin-shell.idta.batterypass.product_condition:1.0.1#ProductCondition"
+            }
+            Self::BatteryPass => "urn:samm:io.catenax.battery.battery_pass:6.0.0#BatteryPass",
+        }
+    }
+}
+
+/// A value of a passport.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Field {
+    /// Equivalent full cycles.
+    FullCycles,
+    /// Charge moved, Ah.
+    CapacityThroughput,
+    /// Energy moved, kWh.
+    EnergyThroughput,
+    /// State of charge, %.
+    StateOfCharge,
+    /// Highest temperature of the sensors, degrees C.
+    Temperature,
+    /// Capacity, Ah.
+    RemainingCapacity,
+    /// Capacity lost, % of the rated.
+    CapacityFade,
+    /// Resistance gained by the cell that gained most, % of the new.
+    CellResistanceIncrease,
+    /// Resistance gained by all cells together, % of the new.
+    PackResistanceIncrease,
+    /// Ohmic resistance of the cell with the highest, ohm.
+    CellResistance,
+    /// Ohmic resistance of all cells together, ohm.
+    PackResistance,
+    /// Energy of a full discharge, kWh.
+    RemainingEnergy,
+    /// That energy, % of the certified.
+    StateOfCertifiedEnergy,
+}
+
+/// Place of a value in the JSON: names of the members that lead to the number, and to its time.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    /// Members above both.
+    pub(super) group: &'static str,
+    /// Member with the number.
+    pub(super) value: &'static str,
+    /// Member with the time.
+    pub(super) time: &'static str,
+}
+
+impl Place {
+    const fn idta(group: &'static str, value: &'static str) -> Self {
+        Self { group, value, time: "LastUpdate" }
+    }
+
+    const fn catena_x(group: &'static str) -> Self {
+        Self { group, value: "value", time: "time" }
+    }
+}
+
+impl Field {
+    /// All values, in the order in which they are listed.
+    pub const ALL: [Self; 13] = [
+        Self::FullCycles,
+        Self::CapacityThroughput,
+        Self::EnergyThroughput,
+        Self::StateOfCharge,
+        Self::Temperature,
+        Self::RemainingCapacity,
+        Self::CapacityFade,
+        Self::CellResistanceIncrease,
+        Self::PackResistanceIncrease,
+        Self::CellResistance,
+        Self::PackResistance,
+        Self::RemainingEnergy,
+        Self::StateOfCertifiedEnergy,
+    ];
+
+    /// Its name, its unit and what it is.
+    pub(super) const fn meaning(self) -> (&'static str, &'static str, &'static str) {
+        match self {
+            Self::FullCycles => (
+                "full_cycles",
+                "1",
+                "charge moved in both directions over twice the rated capacity; whole ones in the passport",
+            ),
+            Self::CapacityThroughput => {
+                ("capacity_throughput", "Ah", "charge moved in complete charges and discharges, both directions added")
+            }
+            Self::EnergyThroughput => {
+                ("energy_throughput", "kWh", "integral of |voltage x current|, both directions added")
+            }
+            Self::StateOfCharge => {
+                ("state_of_charge", "%", "dischargeable charge over the charge between full and empty")
+            }
+            Self::Temperature => ("temperature", "degrees C", "highest of the sensors' latest readings"),
+            Self::RemainingCapacity => {
+                ("remaining_capacity", "Ah", "capacity of the weakest cell times the parallel strings")
+            }
+            Self::CapacityFade => ("capacity_fade", "%", "rated less remaining capacity, of the rated"),
+            Self::CellResistanceIncrease => {
+                ("cell_resistance_increase", "%", "resistance of the cell that gained most, over new, less 100 %")
+            }
+            Self::PackResistanceIncrease => {
+                ("pack_resistance_increase", "%", "mean of all cells' resistances over new, less 100 %")
+            }
+            Self::CellResistance => (
+                "cell_resistance",
+                "ohm",
+                "series resistance of that cell at half charge and 25 degrees C, by the cell model",
+            ),
+            Self::PackResistance => {
+                ("pack_resistance", "ohm", "the same of all cells in series, over the parallel strings")
+            }
+            Self::RemainingEnergy => (
+                "remaining_energy",
+                "kWh",
+                "energy of a discharge from full at the configured load, until the weakest cell is empty",
+            ),
+            Self::StateOfCertifiedEnergy => {
+                ("state_of_certified_energy", "%", "remaining energy over the certified energy")
+            }
+        }
+    }
+
+    /// Its place in a passport; `None` = the standard has none.
+    pub(super) const fn place(self, standard: Standard) -> Option<Place> {
+        let (idta, catena_x) = match self {
+            Self::FullCycles => {
+                (Some(("NumberOfFullCycles", "NumberOfFullCyclesValue")), Some("performance.dynamic.fullCycles"))
+            }
+            Self::CapacityThroughput => (
+                Some(("CapacityThroughput", "CapacityThroughputValue")),
+                Some("performance.dynamic.capacity.throughput"),
+            ),
+            Self::EnergyThroughput => {
+                (Some(("EnergyThroughput", "EnergyThroughputValue")), Some("performance.dynamic.energy.throughput"))
+            }
+            Self::StateOfCharge => {
+                (Some(("StateOfCharge", "StateOfChargeValue")), Some("performance.dynamic.stateOfCharge"))
+            }
+            Self::Temperature => (Some(("TemperatureInformation", "MeasuredTemp")), None),
+            Self::RemainingCapacity => {
+                (Some(("RemainingCapacity", "RemainingCapacityValue")), Some("performance.dynamic.capacity.capacity"))
+            }
+            Self::CapacityFade => (None, Some("performance.dynamic.capacity.fade")),
+            Self::CellResistanceIncrease => (None, Some("performance.dynamic.resistance.increase.cell")),
+            Self::PackResistanceIncrease => (None, Some("performance.dynamic.resistance.increase.pack")),
+            Self::CellResistance => (None, Some("performance.dynamic.resistance.remaining.cell")),
+            Self::PackResistance => (None, Some("performance.dynamic.resistance.remaining.pack")),
+            Self::RemainingEnergy => {
+                (Some(("RemainingEnergy", "RemainingEnergyValue")), Some("performance.dynamic.energy.remaining"))
+            }
+            Self::StateOfCertifiedEnergy => (
+                Some(("StateOfCertifiedEnergy", "StateOfCertifiedEnergyValue")),
+                Some("performance.dynamic.energy.soce"),
+            ),
+        };
+        match (standard, idta, catena_x) {
+            (Standard::ProductCondition, Some((group, value)), _) => Some(Place::idta(group, value)),
+            (Standard::BatteryPass, _, Some(group)) => Some(Place::catena_x(group)),
+            _ => None,
+        }
+    }
+
+    /// The number as the passports have it: both standards count whole cycles.
+    pub(super) fn number(self, value: f64) -> Value {
+        match self {
+            // Whole and below 2^53: exact.
+            Self::FullCycles => Value::from(value.floor().max(0.0) as u64),
+            _ => Value::from(rounded(value)),
+        }
+    }
+}
+
+/// To seven digits, far below every deviation; a zero is positive.
+pub(super) fn rounded(value: f64) -> f64 {
+    format!("{value:.6e}").parse().unwrap_or(value) + 0.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cycles_are_whole_and_other_numbers_have_seven_digits() {
+        assert_eq!(Field::FullCycles.number(12.97), Value::from(12));
+        assert_eq!(Field::StateOfCharge.number(12.971_234_56), Value::from(12.971_23));
+        assert_eq!(rounded(0.004_460_274_12), 0.004_460_274);
+        assert_eq!(rounded(-0.0).to_bits(), 0.0_f64.to_bits());
+    }
+
+    #[test]
+    fn every_value_has_a_place_in_at_least_one_standard_and_no_two_share_one() {
+        for standard in [Standard::ProductCondition, Standard::BatteryPass] {
+            let mut groups: Vec<&str> =
+                Field::ALL.iter().filter_map(|field| field.place(standard)).map(|place| place.group).collect();
+            let places = groups.len();
+            groups.sort_unstable();
+            groups.dedup();
+            assert_eq!(groups.len(), places, "{standard:?}");
+        }
+        let has_place = |field: &Field| {
+            [Standard::ProductCondition, Standard::BatteryPass].iter().any(|standard| field.place(*standard).is_some())
+        };
+        assert!(Field::ALL.iter().all(has_place));
+    }
+}

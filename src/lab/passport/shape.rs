@@ -1,0 +1,365 @@
+//! The form that a standard asks of a JSON document, and the check of a document against it.
+//!
+//! In: rows of path and kind, one per leaf, e.g. `identification.codes[].key`. A member that may be missing ends in `?`; `[]` is a
+//! list, `{}` a list without duplicates. Out: every fault with its path, and the required members that are missing. Members that
+//! the standard does not have are faults too: a misspelt name would be lost without a word.
+
+use serde_json::{Map, Value};
+
+/// What a leaf holds.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Kind {
+    /// Any text.
+    Text,
+    /// A text with a character in it.
+    Identifier,
+    /// Any number.
+    Number,
+    /// A number in this range.
+    Within(f64, f64),
+    /// True or false.
+    Flag,
+    /// yyyy-mm-dd.
+    Date,
+    /// Date and time, with or without a time zone.
+    Time,
+    /// A UUID, also as a URN.
+    Uuid,
+    /// A business partner number: these letters and twelve characters.
+    Partner(&'static str),
+    /// One of these texts.
+    Choice(&'static [&'static str]),
+    /// One of these texts, or `customKey:` and a word.
+    LocalKey(&'static [&'static str]),
+    /// A list of documents: content, contentType, header.
+    Documents,
+    /// A list of places: facility, a BPNA.
+    Facilities,
+    /// A measured value: value and time.
+    Reading,
+}
+
+/// Members of a document in a list.
+const DOCUMENT: [(&str, Kind); 3] = [("content", Kind::Text), ("contentType", Kind::Text), ("header", Kind::Text)];
+/// Members of a measured value.
+const READING: [(&str, Kind); 2] = [("value", Kind::Number), ("time", Kind::Time)];
+/// Member of a place in a list.
+const FACILITY: [(&str, Kind); 1] = [("facility", Kind::Partner("BPNA"))];
+
+/// A part of a document.
+#[derive(Debug)]
+pub(super) enum Shape {
+    /// A leaf.
+    Leaf(Kind),
+    /// An object.
+    Object(Vec<Member>),
+    /// A list.
+    List { is_set: bool, item: Box<Shape> },
+}
+
+/// A member of an object.
+#[derive(Debug)]
+pub(super) struct Member {
+    name: String,
+    is_required: bool,
+    shape: Shape,
+}
+
+/// Result of a check.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Verdict {
+    /// What is wrong, each with its path.
+    pub(super) faults: Vec<String>,
+    /// Paths of required members that are missing.
+    pub(super) missing: Vec<String>,
+}
+
+impl Shape {
+    /// The form that these rows describe.
+    pub(super) fn of_rows(rows: &[(&str, Kind)]) -> Self {
+        let mut root = Self::Object(Vec::new());
+        for (path, kind) in rows {
+            root.add(path, *kind);
+        }
+        root
+    }
+
+    /// Adds a leaf below this object.
+    fn add(&mut self, path: &str, kind: Kind) {
+        let (step, rest) = path.split_once('.').unwrap_or((path, ""));
+        let name = step.trim_end_matches(['[', ']', '{', '}', '?']);
+        let Self::Object(members) = self else { return };
+        let position = members.iter().position(|member| member.name == name).unwrap_or_else(|| {
+            let inner = if rest.is_empty() { Self::of_kind(kind) } else { Self::Object(Vec::new()) };
+            let shape = if step.ends_with(']') || step.ends_with('}') {
+                Self::List { is_set: step.ends_with('}'), item: Box::new(inner) }
+            } else {
+                inner
+            };
+            members.push(Member { name: name.to_owned(), is_required: !step.contains('?'), shape });
+            members.len() - 1
+        });
+        if rest.is_empty() {
+            return;
+        }
+        match &mut members[position].shape {
+            Self::List { item, .. } => item.add(rest, kind),
+            shape => shape.add(rest, kind),
+        }
+    }
+
+    fn of_kind(kind: Kind) -> Self {
+        let list = |rows: &[(&str, Kind)]| Self::List { is_set: false, item: Box::new(Self::of_rows(rows)) };
+        match kind {
+            Kind::Documents => list(&DOCUMENT),
+            Kind::Facilities => list(&FACILITY),
+            Kind::Reading => Self::of_rows(&READING),
+            kind => Self::Leaf(kind),
+        }
+    }
+
+    /// Checks a document. An object that is missing is one missing member; `is_opened` says of which its own members are named
+    /// instead.
+    pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
+        let mut verdict = Verdict::default();
+        self.check_at("", document, is_opened, &mut verdict);
+        verdict
+    }
+
+    fn check_at(&self, path: &str, value: &Value, is_opened: &dyn Fn(&str) -> bool, verdict: &mut Verdict) {
+        match self {
+            Self::Leaf(kind) => {
+                if let Some(allowed) = kind.refuses(value) {
+                    verdict.faults.push(format!("{path}: found {value}, must be {allowed}"));
+                }
+            }
+            Self::Object(members) => match value.as_object() {
+                Some(object) => check_object(path, members, object, is_opened, verdict),
+                None => verdict.faults.push(format!("{}: found {}, must be an object", named(path), short(value))),
+            },
+            Self::List { is_set, item } => match value.as_array() {
+                Some(list) => {
+                    for (index, one) in list.iter().enumerate() {
+                        item.check_at(&format!("{path}[{index}]"), one, is_opened, verdict);
+                        if *is_set && list[..index].contains(one) {
+                            verdict.faults.push(format!("{path}[{index}]: found twice, must be there once"));
+                        }
+                    }
+                }
+                None => verdict.faults.push(format!("{path}: found {}, must be a list", short(value))),
+            },
+        }
+    }
+}
+
+fn check_object(
+    path: &str,
+    members: &[Member],
+    object: &Map<String, Value>,
+    is_opened: &dyn Fn(&str) -> bool,
+    verdict: &mut Verdict,
+) {
+    for member in members {
+        let path = joined(path, &member.name);
+        match (object.get(&member.name), &member.shape) {
+            (Some(value), shape) => shape.check_at(&path, value, is_opened, verdict),
+            (None, Shape::Object(members)) if member.is_required && is_opened(&path) => {
+                check_object(&path, members, &Map::new(), is_opened, verdict);
+            }
+            (None, _) if member.is_required => verdict.missing.push(path),
+            (None, _) => {}
+        }
+    }
+    for name in object.keys().filter(|name| members.iter().all(|member| member.name != **name)) {
+        let known: Vec<&str> = members.iter().map(|member| member.name.as_str()).collect();
+        verdict.faults.push(format!("{}: not in the standard, which has {}", joined(path, name), known.join(", ")));
+    }
+}
+
+/// The path of a member.
+pub(super) fn joined(path: &str, name: &str) -> String {
+    if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
+}
+
+fn named(path: &str) -> &str {
+    if path.is_empty() { "the document" } else { path }
+}
+
+/// What a value of the wrong type is; a long one is not printed.
+fn short(value: &Value) -> String {
+    match value {
+        Value::Object(_) => "an object".to_owned(),
+        Value::Array(_) => "a list".to_owned(),
+        other => other.to_string(),
+    }
+}
+
+impl Kind {
+    /// What is allowed, if the value is not.
+    fn refuses(self, value: &Value) -> Option<String> {
+        let number = |is_good: &dyn Fn(f64) -> bool| value.as_f64().is_some_and(is_good);
+        let text = |is_good: &dyn Fn(&str) -> bool| value.as_str().is_some_and(is_good);
+        let (is_good, allowed) = match self {
+            Self::Text => (value.is_string(), "a text".to_owned()),
+            Self::Identifier => (text(&|text| !text.is_empty()), "a text that is not empty".to_owned()),
+            Self::Number => (value.is_number(), "a number".to_owned()),
+            Self::Within(low, high) => {
+                let allowed = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
+                (number(&|number| (low..=high).contains(&number)), allowed)
+            }
+            Self::Flag => (value.is_boolean(), "true or false".to_owned()),
+            Self::Date => (text(&is_date), "a date as 2026-01-31".to_owned()),
+            Self::Time => (text(&is_time), "a time as 2026-01-31T12:00:00Z".to_owned()),
+            Self::Uuid => (text(&is_uuid), "a UUID, with or without urn:uuid: in front".to_owned()),
+            Self::Partner(letters) => {
+                (text(&|text| is_partner(text, letters)), format!("{letters} and twelve letters or digits"))
+            }
+            Self::Choice(all) => (text(&|text| all.contains(&text)), format!("one of {}", all.join(", "))),
+            Self::LocalKey(all) => {
+                let is_key = |text: &str| all.contains(&text) || text.strip_prefix("customKey:").is_some_and(is_word);
+                (text(&is_key), format!("one of {}, customKey:WORD", all.join(", ")))
+            }
+            // Never leaves.
+            Self::Documents | Self::Facilities | Self::Reading => (true, String::new()),
+        };
+        (!is_good).then_some(allowed)
+    }
+}
+
+/// Whether the text has this form: `0` stands for a digit, all else for itself.
+fn has_form(text: &str, form: &str) -> bool {
+    let fits = |(byte, expected): (u8, u8)| if expected == b'0' { byte.is_ascii_digit() } else { byte == expected };
+    text.len() == form.len() && text.bytes().zip(form.bytes()).all(fits)
+}
+
+fn is_date(text: &str) -> bool {
+    has_form(text, "0000-00-00")
+}
+
+/// Years of four digits, seconds with or without parts, `Z`, an offset or nothing behind.
+fn is_time(text: &str) -> bool {
+    let Some((date, clock)) = text.split_once('T') else { return false };
+    let zone_at = clock.find(['Z', '+', '-']).unwrap_or(clock.len());
+    let (clock, zone) = clock.split_at(zone_at);
+    let (whole, part) = clock.split_once('.').unwrap_or((clock, "0"));
+    let at_most =
+        |text: &str, from: usize, most: u8| text.get(from..from + 2).and_then(|two| two.parse().ok()) <= Some(most);
+    let is_zone =
+        matches!(zone, "" | "Z") || (has_form(&zone[1..], "00:00") && at_most(zone, 1, 14) && at_most(zone, 4, 59));
+    is_date(date)
+        && (1..=12).contains(&date[5..7].parse().unwrap_or(0))
+        && (1..=31).contains(&date[8..].parse().unwrap_or(0))
+        && has_form(whole, "00:00:00")
+        && at_most(whole, 0, 23)
+        && at_most(whole, 3, 59)
+        && at_most(whole, 6, 59)
+        && !part.is_empty()
+        && part.bytes().all(|byte| byte.is_ascii_digit())
+        && is_zone
+}
+
+fn is_uuid(text: &str) -> bool {
+    let digits = text.strip_prefix("urn:uuid:").unwrap_or(text);
+    let lengths = digits.split('-').map(str::len).collect::<Vec<_>>() == [8, 4, 4, 4, 12];
+    lengths && digits.bytes().all(|byte| byte == b'-' || byte.is_ascii_hexdigit())
+}
+
+fn is_partner(text: &str, letters: &str) -> bool {
+    let rest = text.strip_prefix(letters).unwrap_or_default();
+    rest.len() == 12 && rest.bytes().all(|byte| byte.is_ascii_alphanumeric())
+}
+
+fn is_word(text: &str) -> bool {
+    !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || c == '_')
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn shape() -> Shape {
+        Shape::of_rows(&[
+            ("name", Kind::Identifier),
+            ("size.width?", Kind::Within(0.0, 100.0)),
+            ("size.unit", Kind::Choice(&["mm", "m"])),
+            ("keys?{}", Kind::Text),
+            ("papers", Kind::Documents),
+            ("made?[].on", Kind::Date),
+            ("use.cycles", Kind::Reading),
+        ])
+    }
+
+    fn check(document: &Value) -> Verdict {
+        shape().check(document, &|path| path == "use")
+    }
+
+    #[test]
+    fn a_good_document_has_no_fault() {
+        let paper = json!({ "content": "", "contentType": "URL", "header": "x" });
+        let document = json!({
+            "name": "a", "size": { "unit": "mm", "width": 100 }, "keys": ["a", "b"], "papers": [paper], "made": [{ "on": "2026-01-31" }],
+            "use": { "cycles": { "value": 1, "time": "2026-01-31T23:59:59.5+01:00" } },
+        });
+        assert_eq!(check(&document), Verdict::default());
+    }
+
+    #[test]
+    fn each_fault_names_its_path_and_what_is_allowed() {
+        let paper = json!({ "content": 1, "contentType": "URL", "heading": "x" });
+        let document = json!({
+            "name": "", "size": { "unit": "cm", "width": 101 }, "keys": ["a", "a"], "papers": [paper], "made": [{ "on": "31.1.2026" }],
+            "use": { "cycles": 3 },
+        });
+        let verdict = check(&document);
+        assert_eq!(
+            verdict.faults,
+            [
+                "name: found \"\", must be a text that is not empty",
+                "size.width: found 101, must be 0 to 100",
+                "size.unit: found \"cm\", must be one of mm, m",
+                "keys[1]: found twice, must be there once",
+                "papers[0].content: found 1, must be a text",
+                "papers[0].heading: not in the standard, which has content, contentType, header",
+                "made[0].on: found \"31.1.2026\", must be a date as 2026-01-31",
+                "use.cycles: found 3, must be an object",
+            ]
+        );
+        assert_eq!(verdict.missing, ["papers[0].header"]);
+        assert_eq!(check(&json!([])).faults, ["the document: found a list, must be an object"]);
+    }
+
+    #[test]
+    fn a_missing_object_is_named_once_and_an_opened_one_by_its_members() {
+        assert_eq!(check(&json!({})).missing, ["name", "size", "papers", "use.cycles"]);
+    }
+
+    #[test]
+    fn texts_of_a_form_are_checked_whole() {
+        let refused = |kind: Kind, texts: &[&str]| texts.iter().all(|text| kind.refuses(&json!(text)).is_some());
+        let taken = |kind: Kind, texts: &[&str]| texts.iter().all(|text| kind.refuses(&json!(text)).is_none());
+        assert!(taken(Kind::Time, &["2008-04-02T13:08:17Z", "2008-04-02T13:08:17", "2008-04-02T13:08:17.25-05:30"]));
+        assert!(refused(
+            Kind::Time,
+            &[
+                "2008-04-02",
+                "2008-04-02T24:08:17Z",
+                "2008-04-02T13:60:17Z",
+                "2008-13-02T13:08:17Z",
+                "2008-04-02T13:08:17.Z",
+                "2008-04-02T13:08:17+1",
+                "T"
+            ]
+        ));
+        assert!(taken(
+            Kind::Uuid,
+            &["550e8400-e29b-41d4-a716-446655440000", "urn:uuid:550e8400-e29b-41d4-a716-446655440000"]
+        ));
+        assert!(refused(Kind::Uuid, &["550e8400e29b41d4a716446655440000", "550e8400-e29b-41d4-a716-44665544000g"]));
+        assert!(taken(Kind::Partner("BPNL"), &["BPNL0123456789ZZ"]));
+        assert!(refused(Kind::Partner("BPNL"), &["BPNL0123456789Z", "BPNA0123456789ZZ", "BPNL0123456789Z-"]));
+        assert!(taken(Kind::LocalKey(&["van"]), &["van", "customKey:a_1"]));
+        assert!(refused(Kind::LocalKey(&["van"]), &["vans", "customKey:", "customKey:a b"]));
+    }
+}

@@ -1,0 +1,522 @@
+//! `packwatch passport` as its user runs it: values against the store's own numbers, what is unknown, the forms of both standards.
+//!
+//! Peers: IDTA's template through `aas-submodel-validate`, where `PACKWATCH_PYTHON` names a Python that has it; the published JSON
+//! schemas, where `PACKWATCH_SCHEMAS` names a folder with `ProductConditionBattery-schema.json` (1.0.1) and `BatteryPass-schema.json` (6.0.0)
+//! as well. Without them a test says that it was skipped.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use assert_cmd::Command;
+use serde_json::{Value, json};
+
+/// Strings of the simulated pack: each carries half of its current.
+const STRINGS: f64 = 2.0;
+const RATED_AH: f64 = 2.0;
+
+/// What Catena-X's part `performance.dynamic` has of packwatch, and its unit.
+const MEASURED: [(&str, &str); 12] = [
+    ("/stateOfCharge", "%"),
+    ("/fullCycles", "1"),
+    ("/capacity/fade", "%"),
+    ("/capacity/throughput", "Ah"),
+    ("/capacity/capacity", "Ah"),
+    ("/resistance/increase/cell", "%"),
+    ("/resistance/increase/pack", "%"),
+    ("/resistance/remaining/cell", "ohm"),
+    ("/resistance/remaining/pack", "ohm"),
+    ("/energy/soce", "%"),
+    ("/energy/remaining", "kWh"),
+    ("/energy/throughput", "kWh"),
+];
+
+fn packwatch(args: &[&str]) -> Output {
+    let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+    command.env("RUNTIME_DIRECTORY", "/nonexistent").args(args).output().expect("it runs")
+}
+
+fn good(args: &[&str]) -> String {
+    let output = packwatch(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("text")
+}
+
+/// What a refused command says; it writes nothing.
+fn refused(args: &[&str]) -> String {
+    let output = packwatch(args);
+    assert_eq!(output.status.code(), Some(1), "{args:?}: {}", String::from_utf8_lossy(&output.stdout));
+    assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
+    String::from_utf8(output.stderr).expect("text")
+}
+
+fn passport(args: &[&str]) -> Value {
+    serde_json::from_str(&good(&[&["passport"], args].concat())).expect("JSON")
+}
+
+fn shipped(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
+}
+
+/// The manufacturer's part of the measured cell.
+fn cell_part() -> Value {
+    let text = fs::read_to_string(shipped("tests/integration/passport_cli/manufacturer.json")).expect("a file");
+    serde_json::from_str(&text).expect("JSON")
+}
+
+/// The same of the simulated pack, of two such cells.
+fn manufacturer() -> Value {
+    let mut part = cell_part();
+    part["performance"]["rated"]["capacity"]["value"] = json!(4.0);
+    part["performance"]["rated"]["energy"]["value"] = json!(0.014);
+    part
+}
+
+fn close(a: f64, b: f64) -> bool {
+    (a - b).abs() <= 1e-6 * b.abs().max(1.0)
+}
+
+/// A simulated life of a pack of one cell in series and two strings, with a store.
+struct Life(tempfile::TempDir);
+
+impl Life {
+    fn new() -> Self {
+        let life = Self::configured("");
+        life.simulate("life.log", "1700000000", &["--cycles", "3"]);
+        life.replay(&["life.log"]);
+        life
+    }
+
+    /// A place with a configuration; `more` is added to it.
+    fn configured(more: &str) -> Self {
+        let life = Self(tempfile::tempdir().expect("a folder"));
+        let mut text = fs::read_to_string(shipped("config/measured.toml")).expect("a file");
+        for name in ["cells/nasa_b0005.toml", "measured.dbc"] {
+            text = text.replace(&format!("\"{name}\""), &format!("{:?}", shipped("config").join(name)));
+        }
+        let text =
+            text.replace("cells = 1\n", "cells = 1\nstrings = 2\n").replace("current_a = 2.0", "current_a = 1.0");
+        fs::write(life.path("pack.toml"), text + more).expect("written");
+        fs::write(life.path("accidents.json"), r#"{ "InformationOnAccidents": [] }"#).expect("written");
+        life
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).display().to_string()
+    }
+
+    fn simulate(&self, log: &str, start_s: &str, more: &[&str]) {
+        let args = [
+            "simulate",
+            "paper",
+            "-c",
+            &self.path("pack.toml"),
+            "-o",
+            &self.path(log),
+            "--start",
+            start_s,
+            "--capacity-ah",
+            "1.9",
+        ];
+        good(&[&args, more].concat());
+    }
+
+    fn replay(&self, logs: &[&str]) {
+        let logs: Vec<String> = logs.iter().map(|log| self.path(log)).collect();
+        let logs: Vec<&str> = logs.iter().map(String::as_str).collect();
+        good(&[&["replay", "-c", &self.path("pack.toml"), "--state", &self.path("state")], &logs[..]].concat());
+    }
+
+    /// Arguments of a passport from the store, of a battery recorded since new.
+    fn of_store(&self) -> Vec<String> {
+        let args = ["-c", &self.path("pack.toml"), "--state", &self.path("state"), "--throughput-before-ah", "0"];
+        args.map(str::to_owned).to_vec()
+    }
+
+    fn write(&self, name: &str, document: &Value) -> String {
+        fs::write(self.path(name), document.to_string()).expect("written");
+        self.path(name)
+    }
+}
+
+fn with<'a>(args: &'a [String], more: &[&'a str]) -> Vec<&'a str> {
+    args.iter().map(String::as_str).chain(more.iter().copied()).collect()
+}
+
+#[test]
+fn values_are_those_of_the_store_and_the_same_bytes_come_again() {
+    let life = Life::new();
+    let (args, accidents, details) = (life.of_store(), life.path("accidents.json"), life.path("details.json"));
+    let args = with(&args, &["--static", &accidents, "--details", &details]);
+    let condition = passport(&args);
+    let details: Value = serde_json::from_str(&fs::read_to_string(&details).expect("a file")).expect("JSON");
+    let rows: Value =
+        serde_json::from_str(&good(&["history", "--state", &life.path("state"), "--json", "--limit", "0"]))
+            .expect("JSON");
+    let rows: Vec<&Value> = rows["rows"].as_array().expect("rows").iter().collect();
+    let of = |kind: &str| rows.iter().filter(|row| row["kind"] == kind).copied().collect::<Vec<&Value>>();
+    let moved_ah: f64 =
+        STRINGS * of("half_cycle").iter().map(|row| row["charge_ah"].as_f64().expect("a number")).sum::<f64>();
+    assert!(moved_ah > 5.0, "{moved_ah} Ah");
+    assert!(close(condition["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap(), moved_ah));
+    let cycles = moved_ah / (2.0 * STRINGS * RATED_AH);
+    assert_eq!(condition["NumberOfFullCycles"]["NumberOfFullCyclesValue"], json!(cycles.floor() as u64));
+    let detail = |name: &str| details["values"].as_array().unwrap().iter().find(|one| one["name"] == name).cloned();
+    assert!(close(detail("full_cycles").unwrap()["value"].as_f64().unwrap(), cycles));
+    let last = of("capacity").last().copied().cloned().expect("learned");
+    let number = |name: &str| last[name].as_f64().expect("a number");
+    let capacity = &condition["RemainingCapacity"]["RemainingCapacityValue"];
+    assert!(close(capacity.as_f64().unwrap(), STRINGS * number("capacity_ah")));
+    let known = detail("remaining_capacity").unwrap();
+    assert!(close(known["std"].as_f64().unwrap(), STRINGS * number("capacity_std_ah")));
+    assert_eq!(known["time"], condition["RemainingCapacity"]["LastUpdate"]);
+    let increase = detail("cell_resistance_increase").unwrap();
+    assert!(close(increase["value"].as_f64().unwrap(), 100.0 * (number("resistance_ratio") - 1.0)));
+    assert_eq!(increase["path"], Value::Null, "IDTA has no member for it");
+    let soc = condition["StateOfCharge"]["StateOfChargeValue"].as_f64().unwrap();
+    assert!((0.0..=100.0).contains(&soc), "{soc}");
+    assert!((10.0..40.0).contains(&condition["TemperatureInformation"]["MeasuredTemp"].as_f64().unwrap()));
+    for absent in ["EnergyThroughput", "StateOfCertifiedEnergy", "NegativeEvents", "CurrentSelfDischargingRate"] {
+        assert!(condition.get(absent).is_none(), "{absent}: {condition}");
+    }
+    let why = |name: &str| {
+        details["absent"].as_array().unwrap().iter().find(|one| one["name"] == name).unwrap()["reason"].to_string()
+    };
+    assert!(why("state_of_certified_energy").contains("--certified-energy-kwh"), "{details}");
+    assert!(why("energy_throughput").contains("a store keeps no voltages"), "{details}");
+    assert_eq!(good(&[&["passport"], &args[..]].concat()), good(&[&["passport"], &args[..]].concat()));
+}
+
+#[test]
+fn a_replay_gives_what_its_store_gives_and_the_energy() {
+    let life = Life::new();
+    let (args, accidents, log) = (life.of_store(), life.path("accidents.json"), life.path("life.log"));
+    let stored = passport(&with(&args, &["--static", &accidents]));
+    let config = life.path("pack.toml");
+    let replayed =
+        |before: &str| passport(&["-c", &config, &log, "--static", &accidents, "--throughput-before-ah", before]);
+    let mut whole = replayed("0");
+    let energy = whole.as_object_mut().unwrap().remove("EnergyThroughput").expect("a replay has voltages");
+    let energy_wh = 1e3 * energy["EnergyThroughputValue"].as_f64().unwrap();
+    // The last charge, of some 2.3 Ah, is not complete: its energy has been counted, its charge not yet.
+    let moved_ah = stored["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
+    assert!((3.5 * moved_ah..4.3 * (moved_ah + 2.3)).contains(&energy_wh), "{energy_wh} Wh, {moved_ah} Ah");
+    for group in stored.as_object().unwrap().keys() {
+        let pairs = stored[group].as_object().into_iter().flatten();
+        for (name, value) in pairs.filter(|(name, _)| *name != "LastUpdate") {
+            let (one, other) = (value.as_f64().unwrap(), whole[group][name].as_f64().unwrap());
+            // The store keeps rows in full and its last state rounded to what matters.
+            assert!((one - other).abs() <= 1e-3 * one.abs().max(1.0), "{group}.{name}: {one} and {other}");
+        }
+    }
+    let later = replayed("100");
+    assert!(later.get("EnergyThroughput").is_none(), "not since new");
+    let moved = |document: &Value| document["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
+    assert!(close(moved(&later), moved(&whole) + 100.0));
+}
+
+#[test]
+fn what_is_required_and_unknown_is_refused_with_the_reason() {
+    let life = Life::new();
+    let (config, state, accidents) = (life.path("pack.toml"), life.path("state"), life.path("accidents.json"));
+    let base = ["passport", "-c", &config, "--state", &state];
+    let said = refused(&[&base[..], &["--static", &accidents]].concat());
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(
+        said.contains("NumberOfFullCycles: required, but not known") && said.contains("--throughput-before-ah, 0"),
+        "{said}"
+    );
+    let out = life.path("passport.json");
+    let said = refused(&[&base[..], &["--throughput-before-ah", "0", "-o", &out]].concat());
+    assert_eq!(said, "InformationOnAccidents: required, and no record holds it: --static gives it\n");
+    assert!(!Path::new(&out).exists());
+    let given = passport(&with(
+        &["-c", &config, "--state", &state].map(str::to_owned),
+        &["--static", &accidents, "--throughput-ah", "400"],
+    ));
+    assert_eq!(given["NumberOfFullCycles"]["NumberOfFullCyclesValue"], 50);
+}
+
+#[test]
+fn the_state_of_certified_energy_needs_the_certified_energy() {
+    let life = Life::new();
+    let (args, accidents) = (life.of_store(), life.path("accidents.json"));
+    let condition = passport(&with(&args, &["--static", &accidents, "--certified-energy-kwh", "0.014"]));
+    let energy_kwh = condition["RemainingEnergy"]["RemainingEnergyValue"].as_f64().unwrap();
+    let soce = condition["StateOfCertifiedEnergy"]["StateOfCertifiedEnergyValue"].as_f64().unwrap();
+    // 3.8 Ah at some 3.6 V.
+    assert!((0.011..0.0150).contains(&energy_kwh), "{energy_kwh} kWh");
+    assert!((soce - 100.0 * energy_kwh / 0.014).abs() < 0.01, "{soce} %");
+    let path = life.write("manufacturer.json", &manufacturer());
+    let said =
+        refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--form", "battery-pass", "--static", &path]));
+    assert_eq!(
+        said,
+        "performance.dynamic.energy.soce: required, but not known: the certified energy is not given (--certified-energy-kwh)\n"
+    );
+}
+
+#[test]
+fn a_battery_pass_has_every_measured_value_with_its_time_and_its_static_part_unchanged() {
+    let life = Life::new();
+    let (log, config, details) = (life.path("life.log"), life.path("pack.toml"), life.path("details.json"));
+    let path = life.write("manufacturer.json", &manufacturer());
+    let args = [
+        "-c",
+        &config,
+        &log,
+        "--throughput-before-ah",
+        "0",
+        "--certified-energy-kwh",
+        "0.014",
+        "--form",
+        "battery-pass",
+    ];
+    let mut pass = passport(&[&args[..], &["--static", &path, "--details", &details]].concat());
+    let details: Value = serde_json::from_str(&fs::read_to_string(details).expect("a file")).expect("JSON");
+    assert_eq!(details["absent"].as_array().unwrap().len(), 0, "{details}");
+    for (pointer, unit) in MEASURED {
+        let reading = pass.pointer(&format!("/performance/dynamic{pointer}")).unwrap_or_else(|| panic!("no {pointer}"));
+        let path = format!("performance.dynamic{}.value", pointer.replace('/', "."));
+        let detail = details["values"].as_array().unwrap().iter().find(|one| one["path"] == path).expect("a detail");
+        assert_eq!(detail["unit"], unit, "{pointer}");
+        assert_eq!(detail["time"], reading["time"], "{pointer}");
+        assert!(detail["std"].as_f64().is_some_and(|std| std > 0.0), "{pointer}: {detail}");
+        let (value, full) = (reading["value"].as_f64().unwrap(), detail["value"].as_f64().unwrap());
+        assert!(if pointer == "/fullCycles" { value == full.floor() } else { value == full }, "{pointer}");
+    }
+    let dynamic = pass.pointer_mut("/performance/dynamic").and_then(Value::as_object_mut).unwrap();
+    for measured in ["stateOfCharge", "fullCycles", "capacity", "resistance", "energy"] {
+        dynamic.remove(measured);
+    }
+    assert_eq!(pass, manufacturer(), "nothing else was added or changed");
+}
+
+/// Pointers to every member of objects in a document.
+fn members(document: &Value, at: &str, found: &mut Vec<String>) {
+    match document {
+        Value::Object(object) => object.iter().for_each(|(name, value)| {
+            found.push(format!("{at}/{name}"));
+            members(value, &format!("{at}/{name}"), found);
+        }),
+        Value::Array(list) => {
+            list.iter().enumerate().for_each(|(i, value)| members(value, &format!("{at}/{i}"), found))
+        }
+        _ => {}
+    }
+}
+
+/// Removes a member; its path as a fault names it.
+fn removed(document: &mut Value, pointer: &str) -> String {
+    let (parent, name) = pointer.rsplit_once('/').unwrap();
+    document.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(name);
+    let steps = pointer[1..].split('/').map(|step| if step == "0" { "[0]".to_owned() } else { format!(".{step}") });
+    steps.collect::<String>().trim_start_matches('.').to_owned()
+}
+
+#[test]
+fn each_missing_member_of_the_manufacturers_part_is_named() {
+    let life = Life::new();
+    let args = life.of_store();
+    let optional = [
+        "serial",
+        "classificationDescription",
+        "intoServiceDate",
+        "manufacturingDate",
+        "height",
+        "width",
+        "sustainabilityReport",
+        "performanceClass",
+        "other",
+        "temperature",
+        "performanceDocument",
+        "testReport",
+        "negativeEvents",
+        "operatingEnvironment",
+        "declarationOfConformityId",
+        "document",
+        "safeDischarging",
+        "removalFromAppliance",
+        "sources",
+        "status",
+        "registrationIdentifier",
+        "lastModification",
+        "placedOnMarket",
+        "energy",
+    ];
+    let mut pointers = Vec::new();
+    members(&manufacturer(), "", &mut pointers);
+    // One document stands for all of them.
+    let is_wanted = |pointer: &&String| !pointer.contains("/0/c") && !pointer.contains("/0/header");
+    let mut document = manufacturer();
+    let mut expected = Vec::new();
+    // From the deepest on, so that each is missing by itself; those above others are removed in tests of the module.
+    for pointer in pointers.iter().rev().filter(is_wanted) {
+        let is_leaf = manufacturer().pointer(pointer).is_some_and(|value| !value.is_object() && !value.is_array());
+        let (_, name) = pointer.rsplit_once('/').unwrap();
+        let is_temperature = name == "temperature" && pointer.contains("cycleLifeTesting");
+        let is_status = name == "status" && pointer.contains("sustainability");
+        if is_leaf && (is_temperature || is_status || !optional.contains(&name)) {
+            expected.push(removed(&mut document, pointer));
+        }
+    }
+    assert!(expected.len() > 90, "{} members", expected.len());
+    let path = life.write("manufacturer.json", &document);
+    let more = ["--form", "battery-pass", "--certified-energy-kwh", "0.014", "--static", &path];
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
+    for path in &expected {
+        let line = format!("{path}: required, and no record holds it: --static gives it");
+        assert!(said.lines().any(|one| one == line), "{path} in {said}");
+    }
+    assert_eq!(said.lines().count(), expected.len(), "nothing else is missing: {said}");
+}
+
+#[test]
+fn faults_of_the_static_part_are_named_by_their_paths() {
+    let life = Life::new();
+    let args = life.of_store();
+    let mut document = manufacturer();
+    document["identification"]["category"] = json!("car");
+    document["metadata"]["issued"] = json!("2026-01-31");
+    document["performance"]["rated"]["voltage"]["min"] = json!("2.7");
+    document["performance"]["dynamic"]["stateOfCharge"] = json!({ "value": 50.0 });
+    let path = life.write("manufacturer.json", &document);
+    let more = ["--form", "battery-pass", "--certified-energy-kwh", "0.014", "--static", &path];
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &more));
+    for expected in [
+        "identification.category: found \"car\", must be one of SLI, LMT, EV, industrial, portable, incorporated",
+        "metadata.issued: not in the standard, which has version, status",
+        "performance.rated.voltage.min: found \"2.7\", must be a number",
+        "performance.dynamic.stateOfCharge.value: stated in the static part, but measured",
+    ] {
+        assert!(said.contains(expected), "{expected:?} in {said}");
+    }
+    assert_eq!(said.lines().count(), 4, "{said}");
+    fs::write(&path, "{").expect("written");
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &path]));
+    assert!(said.contains("manufacturer.json: ") && said.contains("line 1"), "{said}");
+}
+
+#[test]
+fn a_new_pack_has_no_learned_value_and_a_record_without_dates_no_passport() {
+    let life = Life::configured("");
+    life.simulate("life.log", "1700000000", &["--duration", "300"]);
+    let (config, log, accidents) = (life.path("pack.toml"), life.path("life.log"), life.path("accidents.json"));
+    let args = ["-c", &config, &log, "--static", &accidents, "--throughput-before-ah", "0"];
+    let condition = passport(&args);
+    assert_eq!(condition["NumberOfFullCycles"]["NumberOfFullCyclesValue"], 0);
+    assert!(condition.get("RemainingCapacity").is_none() && condition.get("RemainingEnergy").is_none(), "{condition}");
+    let said = refused(&[&["passport"], &args[..], &["--form", "battery-pass"]].concat());
+    assert!(
+        said.contains(
+            "performance.dynamic.capacity.capacity: required, but not known: nothing has been learned of cell 1 yet"
+        ),
+        "{said}"
+    );
+    let rows = (0..400).map(|second| format!("{second},2.0,3.9,24.0\n")).collect::<String>();
+    fs::write(life.path("cell.csv"), format!("time_s,current_a,voltage_v,temperature_c\n{rows}")).expect("written");
+    let said = refused(&[
+        "passport",
+        "-c",
+        &config,
+        &life.path("cell.csv"),
+        "--static",
+        &accidents,
+        "--throughput-before-ah",
+        "0",
+    ]);
+    assert!(said.contains("the record has no dates"), "{said}");
+}
+
+#[test]
+fn a_sum_with_deleted_half_cycles_is_not_known() {
+    let life = Life::configured("\n[store]\nkeep_years = 0.1\n");
+    life.simulate("old.log", "1700000000", &["--cycles", "2"]);
+    // Two months later: the old half-cycles are beyond their age.
+    life.simulate("new.log", "1706000000", &["--cycles", "2"]);
+    life.replay(&["old.log", "new.log"]);
+    let (args, accidents) = (life.of_store(), life.path("accidents.json"));
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
+    assert!(said.contains("half-cycles were deleted from the store") && said.contains("--throughput-ah"), "{said}");
+}
+
+/// What a peer says of a passport; `None`, said on the output, where there is none.
+#[expect(clippy::print_stdout, reason = "a skipped test says so")]
+fn peer(arguments: &[&str]) -> Option<String> {
+    let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
+        println!("SKIPPED: PACKWATCH_PYTHON names no Python, no peer was asked");
+        return None;
+    };
+    let mut command = std::process::Command::new(python);
+    let output = command.arg(shipped("tests/tools/passport_peer.py")).args(arguments).output().expect("it runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    Some(String::from_utf8(output.stdout).expect("text"))
+}
+
+/// What the published schema says.
+#[expect(clippy::print_stdout, reason = "a skipped test says so")]
+fn schema(name: &str, document: &str) -> Option<String> {
+    let Some(folder) = std::env::var_os("PACKWATCH_SCHEMAS") else {
+        println!("SKIPPED: PACKWATCH_SCHEMAS names no folder, {name} was not asked");
+        return None;
+    };
+    peer(&["schema", &Path::new(&folder).join(name).display().to_string(), document])
+}
+
+/// Both passports of a record, in files.
+fn both(life: &Life, args: &[&str], (part, certified_kwh): (&Value, &str)) -> (String, String) {
+    let (condition, pass) = (life.path("condition.json"), life.path("battery_pass.json"));
+    let (accidents, path) = (life.path("accidents.json"), life.write("manufacturer.json", part));
+    let args = [args, &["--certified-energy-kwh", certified_kwh, "--throughput-before-ah", "0"]].concat();
+    good(&[&["passport"], &args[..], &["--static", &accidents, "-o", &condition]].concat());
+    good(&[&["passport"], &args[..], &["--static", &path, "--form", "battery-pass", "-o", &pass]].concat());
+    (condition, pass)
+}
+
+fn assert_valid(condition: &str, pass: &str) {
+    let faults = [
+        peer(&["submodel", condition]),
+        schema("ProductConditionBattery-schema.json", condition),
+        schema("BatteryPass-schema.json", pass),
+    ];
+    for faults in faults.into_iter().flatten() {
+        assert_eq!(faults, "");
+    }
+}
+
+#[test]
+fn peers_find_no_fault_in_a_passport_and_one_in_a_broken_one() {
+    let life = Life::new();
+    let (condition, pass) =
+        both(&life, &["-c", &life.path("pack.toml"), &life.path("life.log")], (&manufacturer(), "0.014"));
+    assert_valid(&condition, &pass);
+    let mut broken: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
+    broken["StateOfCharge"].as_object_mut().unwrap().remove("LastUpdate");
+    broken["NumberOfFullCycles"]["NumberOfFullCyclesValue"] = json!("many");
+    let broken = life.write("broken.json", &broken);
+    let said = [peer(&["submodel", &broken]), schema("ProductConditionBattery-schema.json", &broken)];
+    assert!(said.into_iter().flatten().all(|faults| faults.contains("LastUpdate") && faults.lines().count() == 2));
+}
+
+#[test]
+fn a_measured_life_gives_both_passports_from_a_replay_and_from_its_store() {
+    let Some(log) = crate::support::measured::file("nasa_pcoe_aging/B0005.csv.gz") else { return };
+    let life = Life::configured("");
+    let (config, log) = (shipped("config/measured.toml").display().to_string(), log.display().to_string());
+    let starts = log.replace(".csv.gz", "_cycles.csv");
+    let (condition, pass) = both(&life, &["-c", &config, &log, "--start-times", &starts], (&cell_part(), "0.0068"));
+    assert_valid(&condition, &pass);
+    let of_replay: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
+    // 168 discharges of 1.86 to 1.29 Ah, as their publishers measured them, and as many charges.
+    let moved_ah = of_replay["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
+    assert!((480.0..560.0).contains(&moved_ah), "{moved_ah} Ah");
+    assert_eq!(of_replay["NumberOfFullCycles"]["NumberOfFullCyclesValue"], json!((moved_ah / 4.0).floor() as u64));
+    assert!(of_replay["RemainingCapacity"]["LastUpdate"].as_str().unwrap().starts_with("2008-05-"));
+    let state = life.path("state");
+    good(&["replay", "-c", &config, &log, "--start-times", &starts, "--state", &state]);
+    let (condition, pass) = both(&life, &["-c", &config, "--state", &state], (&cell_part(), "0.0068"));
+    assert_valid(&condition, &pass);
+    let of_store: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
+    assert_eq!(of_store["CapacityThroughput"], of_replay["CapacityThroughput"]);
+    assert_eq!(of_store["RemainingCapacity"], of_replay["RemainingCapacity"]);
+}
