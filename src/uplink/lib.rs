@@ -6,8 +6,10 @@
 //!
 //! | module | what lives there |
 //! | --- | --- |
+//! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
 //! | `settings` | the file of `-c`: TOML to checked settings |
 //! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
 
+pub mod mqtt;
 pub mod settings;
 pub mod status_stream;

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use packwatch_host::status::standard_path;
 use serde::Deserialize;
 
+use crate::mqtt::settings::MqttSettings;
+
 /// Longest file, bytes: a hundred times what a person writes.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -17,6 +19,8 @@ const MAX_BYTES: u64 = 1 << 20;
 pub struct Settings {
     /// Where the daemon's status comes from.
     pub status: StatusSettings,
+    /// The MQTT broker; `None` = `packwatch mqtt` has nothing to do.
+    pub mqtt: Option<MqttSettings>,
 }
 
 /// The daemon's status.
@@ -53,7 +57,10 @@ impl Settings {
         toml::from_str(text).map_err(|error| {
             let start = error.span().map_or(0, |span| span.start);
             let line = 1 + text.as_bytes().iter().take(start).filter(|byte| **byte == b'\n').count();
-            format!("{line}: {}", error.message().replace('\n', ", "))
+            let found = text.lines().nth(line - 1).unwrap_or_default().trim();
+            let message = error.message().replace('\n', ", ");
+            // A value outside its range: the line shows its key and what was found.
+            if message.starts_with("must ") { format!("{line}: {found}, {message}") } else { format!("{line}: {message}") }
         })
     }
 }
@@ -65,6 +72,15 @@ mod tests {
     #[test]
     fn an_empty_file_is_the_standard_daemon() {
         assert_eq!(Settings::parse("").unwrap(), Settings::default());
+    }
+
+    #[test]
+    fn a_value_outside_its_range_is_shown_with_its_key() {
+        let fault = |text: &str| Settings::parse(text).unwrap_err();
+        assert_eq!(fault("[mqtt]\nperiod_s = 0\n"), "2: period_s = 0, must be 1 to 3600");
+        assert_eq!(fault("[mqtt.history]\nmax_bytes = -1"), "2: max_bytes = -1, must be 100000 to 100000000000");
+        assert!(fault("[mqtt]\ntopic = \"a/#\"").starts_with("2: topic = \"a/#\", must be a topic"));
+        assert!(fault("[mqtt]\nport = 70000").starts_with("2: "), "{}", fault("[mqtt]\nport = 70000"));
     }
 
     #[test]
