@@ -60,7 +60,11 @@ impl Settings {
             let found = text.lines().nth(line - 1).unwrap_or_default().trim();
             let message = error.message().replace('\n', ", ");
             // A value outside its range: the line shows its key and what was found.
-            if message.starts_with("must ") { format!("{line}: {found}, {message}") } else { format!("{line}: {message}") }
+            if message.starts_with("must ") {
+                format!("{line}: {found}, {message}")
+            } else {
+                format!("{line}: {message}")
+            }
         })
     }
 }

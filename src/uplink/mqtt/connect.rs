@@ -60,9 +60,9 @@ fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
 /// Why a connection failed, and what to do where that is clear.
 pub fn explain(error: &ConnectionError) -> String {
     match error {
-        ConnectionError::ConnectionRefused(ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized) => {
-            "the broker refuses user or password (mqtt.user, mqtt.password_file)".to_owned()
-        }
+        ConnectionError::ConnectionRefused(
+            ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+        ) => "the broker refuses user or password (mqtt.user, mqtt.password_file)".to_owned(),
         ConnectionError::ConnectionRefused(code) => format!("the broker refuses the connection: {code:?}"),
         ConnectionError::Timeout(_) => format!("no answer within {CONNECT_LIMIT_S} s"),
         // "TLS: I/O: ..." names the certificate's fault.

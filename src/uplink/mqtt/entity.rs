@@ -96,7 +96,9 @@ pub const ENTITIES: &[Entity] = &[
     measured("SOC_reported", "SoC (reported by the pack)", SOC, |d| percent(d.pack.reported_soc)),
     measured("state_of_health", "State of Health", SOC, |d| percent(d.pack.soh)),
     measured("state_of_health_std", "State of Health Standard Deviation", PERCENT, |d| percent(soh_std(&d.pack))),
-    measured("state_of_health_reported", "State of Health (reported by the pack)", SOC, |d| percent(d.pack.reported_soh)),
+    measured("state_of_health_reported", "State of Health (reported by the pack)", SOC, |d| {
+        percent(d.pack.reported_soh)
+    }),
     measured("temperature_min", "Temperature Min", CELSIUS, |d| rounded(least(d, |cell| cell.temperature_c), 1)),
     measured("temperature_max", "Temperature Max", CELSIUS, |d| rounded(d.pack.temperature_max_c, 1)),
     measured("stat_batt_power", "Battery Power", ("W", "power", 0), |d| rounded(power_w(&d.pack), 0)),
@@ -104,9 +106,12 @@ pub const ENTITIES: &[Entity] = &[
     measured("battery_current_offset", "Battery Current Sensor Offset", ("A", "current", 3), |d| {
         rounded(d.pack.current_offset_a.map(|a| -a), 3)
     }),
-    measured("battery_current_offset_std", "Battery Current Sensor Offset Standard Deviation", ("A", "current", 3), |d| {
-        rounded(d.pack.current_offset_std_a, 3)
-    }),
+    measured(
+        "battery_current_offset_std",
+        "Battery Current Sensor Offset Standard Deviation",
+        ("A", "current", 3),
+        |d| rounded(d.pack.current_offset_std_a, 3),
+    ),
     measured("cell_max_voltage", "Cell Max Voltage", VOLTS, |d| rounded(greatest(d, |cell| cell.voltage_v), 3)),
     measured("cell_min_voltage", "Cell Min Voltage", VOLTS, |d| rounded(least(d, |cell| cell.voltage_v), 3)),
     measured("cell_voltage_delta", "Cell Voltage Delta", ("mV", "voltage", 0), |d| rounded(spread_mv(d), 0)),

@@ -69,7 +69,12 @@ impl Link<'_> {
             }
             // Once for each reason, not at each attempt.
             if error != latest {
-                tracing::warn!(broker = self.broker(), error, waiting = self.queue.fill().messages, "no connection to the broker");
+                tracing::warn!(
+                    broker = self.broker(),
+                    error,
+                    waiting = self.queue.fill().messages,
+                    "no connection to the broker"
+                );
                 latest = error;
             }
             tokio::select! {
@@ -154,7 +159,10 @@ impl Link<'_> {
             match publish(client, messages).await {
                 Ok(()) => self.queue.remove(&batch)?,
                 Err(error) => {
-                    tracing::error!(error, "the broker refuses messages of the queue: they wait for the next connection");
+                    tracing::error!(
+                        error,
+                        "the broker refuses messages of the queue: they wait for the next connection"
+                    );
                     std::future::pending::<()>().await;
                 }
             }
@@ -244,7 +252,9 @@ fn uplink(fill: Fill) -> String {
 async fn drive(events: &mut EventLoop) -> String {
     loop {
         match events.poll().await {
-            Ok(Event::Incoming(Packet::Disconnect(packet))) => return format!("the broker disconnects: {:?}", packet.reason_code),
+            Ok(Event::Incoming(Packet::Disconnect(packet))) => {
+                return format!("the broker disconnects: {:?}", packet.reason_code);
+            }
             Ok(_) => {}
             Err(error) => return connect::explain(&error),
         }
@@ -256,7 +266,8 @@ async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Result<(), Str
     let mut notices = Vec::with_capacity(messages.len());
     for Message { topic, text, is_retained } in messages {
         let options = PublishOptions::new(QoS::AtLeastOnce).retain(is_retained);
-        let notice = client.publish_tracked(topic.clone(), text, options).await.map_err(|error| format!("{topic}: {error}"))?;
+        let notice =
+            client.publish_tracked(topic.clone(), text, options).await.map_err(|error| format!("{topic}: {error}"))?;
         notices.push((topic, notice));
     }
     for (topic, notice) in notices {

@@ -13,8 +13,7 @@ use super::entity::{ENTITIES, percent, rounded};
 
 /// The pack: every entity, and `alarms` with the state of each rule that has a threshold.
 pub fn info(document: &StatusDocument) -> Value {
-    let mut info: Map<_, _> =
-        ENTITIES.iter().map(|entity| (entity.key.to_owned(), entity.value(document))).collect();
+    let mut info: Map<_, _> = ENTITIES.iter().map(|entity| (entity.key.to_owned(), entity.value(document))).collect();
     let alarms = document.alarms.rules.iter().map(|&rule| (rule.name().to_owned(), alarm(&document.alarms, rule)));
     info.insert("alarms".to_owned(), alarms.collect::<Map<_, _>>().into());
     info.into()
@@ -69,11 +68,11 @@ pub fn event(document: &StatusDocument, event: &Value) -> Value {
 fn message(name: &str, event: &Value) -> String {
     let text = |key: &str| event.get(key).and_then(Value::as_str).unwrap_or("?");
     let is_alarm = name == "alarm";
-    let mut words =
-        if is_alarm { format!("{} {}", text("rule"), text("change")) } else { name.replace('_', " ") };
+    let mut words = if is_alarm { format!("{} {}", text("rule"), text("change")) } else { name.replace('_', " ") };
     let shown = ["cell", "value", "threshold"];
     for (key, value) in event.as_object().into_iter().flatten() {
-        let is_shown = if is_alarm { shown.contains(&key.as_str()) } else { !["event", "time"].contains(&key.as_str()) };
+        let is_shown =
+            if is_alarm { shown.contains(&key.as_str()) } else { !["event", "time"].contains(&key.as_str()) };
         match (key.as_str(), value) {
             (_, Value::Null) => {}
             ("cell", Value::Number(cell)) => words += &format!(", cell {}", cell.as_u64().unwrap_or_default() + 1),

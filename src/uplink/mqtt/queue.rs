@@ -113,7 +113,12 @@ impl Queue {
         Ok(())
     }
 
-    fn try_add(&self, database: &mut Connection, messages: &[(Class, String)], seen: Option<&str>) -> rusqlite::Result<Fill> {
+    fn try_add(
+        &self,
+        database: &mut Connection,
+        messages: &[(Class, String)],
+        seen: Option<&str>,
+    ) -> rusqlite::Result<Fill> {
         let mut fill = self.fill.get();
         let transaction = database.transaction()?;
         for (class, body) in messages {
@@ -238,7 +243,8 @@ fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
 
 fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
     let dropped = |class: Class| {
-        let count = database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
+        let count =
+            database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
         count.optional().map(Option::unwrap_or_default)
     };
     // In bytes, as `length` counts: of a text, SQLite counts characters.

@@ -48,10 +48,8 @@ impl<'a> Recorder<'a> {
     /// Queues what is new in a document. What the disk does not take is tried again with the next one.
     pub fn take(&mut self, document: &StatusDocument) {
         let news = new_events(&self.events, &document.events);
-        let mut messages: Vec<_> = news
-            .iter()
-            .map(|event| (Class::Event, payload::event(document, event).to_string()))
-            .collect();
+        let mut messages: Vec<_> =
+            news.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
         let next = self.next_due(document.time);
         if next.is_some() {
             messages.push((Class::Sample, payload::sample(document).to_string()));

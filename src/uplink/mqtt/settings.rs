@@ -198,7 +198,9 @@ fn topic<'de, D: Deserializer<'de>>(source: D) -> Result<String, D::Error> {
     let topic = String::deserialize(source)?;
     let has_empty_level = topic.split('/').any(str::is_empty);
     if has_empty_level || topic.starts_with('$') || topic.contains(['+', '#']) || topic.contains(char::is_control) {
-        return Err(de::Error::custom("must be a topic: levels between '/', not empty, without '+' and '#', no '$' in front"));
+        return Err(de::Error::custom(
+            "must be a topic: levels between '/', not empty, without '+' and '#', no '$' in front",
+        ));
     }
     if topic.len() > MAX_TOPIC_BYTES {
         return Err(de::Error::custom(format!("must be at most {MAX_TOPIC_BYTES} bytes")));
