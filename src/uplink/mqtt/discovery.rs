@@ -147,3 +147,6 @@ impl<'a> Device<'a> {
         self.message("sensor", key, &config)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -106,3 +106,6 @@ pub fn stamp(time: Timestamp) -> String {
     let millis = time.nanos().div_euclid(1_000_000).rem_euclid(1000);
     format!("{}.{millis:03}Z", format_utc(time).trim_end_matches('Z'))
 }
+
+#[cfg(test)]
+mod tests;

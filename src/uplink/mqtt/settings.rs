@@ -207,3 +207,38 @@ fn topic<'de, D: Deserializer<'de>>(source: D) -> Result<String, D::Error> {
     }
     Ok(topic)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_topic_with_levels_is_one_word_in_identifiers() {
+        let settings = MqttSettings { topic: "fleet/Bus 12/pack-1".to_owned(), ..MqttSettings::default() };
+        assert_eq!(
+            (settings.node().as_str(), settings.topic("info").as_str()),
+            ("fleet_Bus_12_pack-1", "fleet/Bus 12/pack-1/info")
+        );
+        assert_eq!(settings.client_id(), "packwatch-fleet_Bus_12_pack-1");
+    }
+
+    #[test]
+    fn the_port_follows_tls() {
+        let tls = MqttSettings { tls: Some(TlsSettings::default()), ..MqttSettings::default() };
+        assert_eq!((MqttSettings::default().port(), tls.port()), (1883, 8883));
+    }
+
+    #[test]
+    fn a_password_ends_before_its_line_end_and_may_not_be_empty() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let settings = MqttSettings { password_file: Some(file.path().to_owned()), ..MqttSettings::default() };
+        for (text, password) in [("a b", "a b"), ("a b\n", "a b"), ("a b\r\n", "a b"), (" a\n\n", " a")] {
+            std::fs::write(file.path(), text).unwrap();
+            assert_eq!(settings.password().unwrap().unwrap(), password.as_bytes());
+        }
+        std::fs::write(file.path(), "\n").unwrap();
+        assert!(settings.password().unwrap_err().ends_with("no password in it"));
+        std::fs::remove_file(file.path()).unwrap();
+        assert!(settings.password().unwrap_err().contains("No such file"));
+    }
+}
