@@ -210,7 +210,7 @@ impl Published {
             news.push(Message::retained(settings.topic(topic::INFO), payload::info(document).to_string()));
             news.push(Message::retained(settings.topic(topic::CELLS), payload::spec_data(document).to_string()));
         }
-        // After the values, so that nobody reads earlier ones as current.
+        // After the values, so that no reader takes earlier ones as current.
         if self.is_online.replace(document.is_some()) != Some(document.is_some()) {
             let word = if document.is_some() { ONLINE } else { OFFLINE };
             news.push(Message::retained(settings.topic(topic::DAEMON), word));
