@@ -88,6 +88,22 @@ mod tests {
     }
 
     #[test]
+    fn the_example_shows_every_key_with_its_default() {
+        let example = include_str!("../../config/uplink.toml");
+        let shown = Settings { mqtt: Some(MqttSettings::default()), ..Settings::default() };
+        assert_eq!(Settings::parse(example).unwrap(), shown);
+        // The keys that are comments exist too.
+        let is_key = |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+        let uncomment = |line| match str::strip_prefix(line, "# ") {
+            Some(key) if is_key(key) => key,
+            _ => line,
+        };
+        let all: Vec<&str> = example.lines().map(uncomment).collect();
+        let mqtt = Settings::parse(&all.join("\n")).unwrap().mqtt.unwrap();
+        assert!(mqtt.tls.unwrap().key_file.is_some() && mqtt.discovery.device_name.is_some() && mqtt.user.is_some());
+    }
+
+    #[test]
     fn a_fault_names_its_line_and_what_is_allowed() {
         let fault = Settings::parse("[status]\nsocket = \"/run/a.sock\"\nsokcet = 1\n").unwrap_err();
         assert_eq!(fault, "3: unknown field `sokcet`, expected `socket`");

@@ -65,6 +65,9 @@ pub fn explain(error: &ConnectionError) -> String {
         ) => "the broker refuses user or password (mqtt.user, mqtt.password_file)".to_owned(),
         ConnectionError::ConnectionRefused(code) => format!("the broker refuses the connection: {code:?}"),
         ConnectionError::Timeout(_) => format!("no answer within {CONNECT_LIMIT_S} s"),
+        ConnectionError::Io(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
+            format!("{error}: a firewall forbids it, or the unit (IPAddressAllow=)")
+        }
         // "TLS: I/O: ..." names the certificate's fault.
         other => other.to_string(),
     }
