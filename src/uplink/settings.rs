@@ -93,7 +93,8 @@ mod tests {
         let shown = Settings { mqtt: Some(MqttSettings::default()), ..Settings::default() };
         assert_eq!(Settings::parse(example).unwrap(), shown);
         // The keys that are comments exist too.
-        let is_key = |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+        let is_key =
+            |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
         let uncomment = |line| match str::strip_prefix(line, "# ") {
             Some(key) if is_key(key) => key,
             _ => line,

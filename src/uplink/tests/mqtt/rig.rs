@@ -1,5 +1,7 @@
 //! What the tests run the uplink against: a broker, a reader, a daemon's status socket.
 
+#![expect(clippy::unwrap_used, reason = "a step that fails ends the test")]
+
 use std::cell::RefCell;
 use std::fs;
 use std::io::{BufRead as _, BufReader, Write as _};
