@@ -49,6 +49,7 @@ mod score;
 mod simulate;
 mod status;
 mod test_alarm;
+mod uplink;
 #[cfg(feature = "lab")]
 mod whatif;
 
@@ -75,6 +76,15 @@ enum Command {
     Status(status::Args),
     /// Serve the status of the running daemon as metrics for Prometheus
     Exporter(exporter::Args),
+    /// Send the status of the running daemon to an MQTT broker (program packwatch-uplink)
+    #[command(disable_help_flag = true)]
+    Mqtt(uplink::Args),
+    /// Send the status of the running daemon to a KUKSA databroker (program packwatch-uplink)
+    #[command(disable_help_flag = true)]
+    Kuksa(uplink::Args),
+    /// Write the overlay of the vehicle signal specification for KUKSA (program packwatch-uplink)
+    #[command(disable_help_flag = true)]
+    Vss(uplink::Args),
     /// Show the alarms of the running daemon
     Alarms(alarms::Args),
     /// Acknowledge alarms of the running daemon
@@ -181,6 +191,9 @@ pub fn main() -> ExitCode {
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Exporter(args) => exporter::run(&args),
+        Command::Mqtt(args) => uplink::run("mqtt", &args),
+        Command::Kuksa(args) => uplink::run("kuksa", &args),
+        Command::Vss(args) => uplink::run("vss", &args),
         Command::Alarms(args) => alarms::run(&args),
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),

@@ -24,7 +24,7 @@ pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
 static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 
 /// Crates of this program that log, besides `packwatch` itself.
-const MEMBER_CRATES: [&str; 3] = ["packwatch_core", "packwatch_host", "packwatch_lab"];
+const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch_lab", "packwatch_uplink"];
 
 /// Counts a line that is in no log.
 fn note_left_out() {

@@ -334,8 +334,11 @@ fn cell(view: CellView) -> CellStatus {
 fn alarms(monitor: &Monitor) -> AlarmStatus {
     let engine = monitor.alarms();
     let list = answer::alarm_list(engine, monitor.now(), false);
+    let mut rules: Vec<_> = engine.thresholds().map(|threshold| threshold.rule).collect();
+    rules.dedup();
     AlarmStatus {
         thresholds: list.thresholds,
+        rules,
         raised: engine.count(),
         highest_severity: engine.highest_severity(),
         unknown: list.unknown,

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
-use crate::alarm::{Alarm, Severity};
+use crate::alarm::{Alarm, Rule, Severity};
 use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::Chemistry;
@@ -270,6 +270,9 @@ pub struct CellStatus {
 pub struct AlarmStatus {
     /// Thresholds configured.
     pub thresholds: usize,
+    /// Rules with a threshold, each once; empty in documents of earlier programs.
+    #[serde(default)]
+    pub rules: Vec<Rule>,
     /// Alarms raised now.
     pub raised: usize,
     /// The highest severity among them.

@@ -220,6 +220,7 @@ fn alarms() -> AlarmStatus {
     let past = Alarm { value: Some(0.632), threshold: 0.1, probability: None, is_acknowledged: true, ..past };
     AlarmStatus {
         thresholds: 4,
+        rules: vec![Rule::CapacityLow, Rule::RechargePeriodLow, Rule::SocLow],
         raised: 1,
         highest_severity: Some(Severity::Severe),
         unknown: vec![UnknownAlarms { rule: Rule::RechargePeriodLow, severity: Severity::Warning, alarms: 1 }],

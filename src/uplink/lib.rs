@@ -1,0 +1,15 @@
+//! What the daemon knows, for other software of the vehicle and outside: MQTT brokers (`mqtt`) and KUKSA (`kuksa`).
+//!
+//! A program of its own, which reads the daemon's status stream like the exporter: a broker that is slow, gone or hostile does
+//! not delay an estimate, and the vehicle program has no network library. `packwatch mqtt`, `packwatch kuksa` and
+//! `packwatch vss` start it.
+//!
+//! | module | what lives there |
+//! | --- | --- |
+//! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
+//! | `settings` | the file of `-c`: TOML to checked settings |
+//! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
+
+pub mod mqtt;
+pub mod settings;
+pub mod status_stream;

@@ -1,0 +1,89 @@
+//! `packwatch mqtt`: the daemon's status for an MQTT broker and Home Assistant, with a queue for a lost link.
+//!
+//! | module | what lives there |
+//! | --- | --- |
+//! | `settings` | table `[mqtt]` |
+//! | `entity`, `payload` | the table of entities; the documents that are published |
+//! | `discovery` | messages for Home Assistant |
+//! | `queue` | messages that wait, on disk |
+//! | `recorder` | what becomes a message of the queue |
+//! | `connect`, `link` | a connection; publishing and forwarding |
+//!
+//! Recorder and link share one thread and the queue. The recorder does not wait for the link.
+
+pub mod connect;
+pub mod discovery;
+pub mod entity;
+pub mod link;
+pub mod payload;
+pub mod queue;
+pub mod recorder;
+pub mod settings;
+
+use packwatch_host::io::stop::Stop;
+use tokio::sync::watch;
+
+use crate::settings::Settings;
+use crate::status_stream::follow;
+use link::Link;
+use queue::Queue;
+use recorder::Recorder;
+
+/// Topics below the base topic: `info`, `spec_data`, `events` and `status` are Battery-Emulator's.
+pub mod topic {
+    /// Whether the uplink is online: retained, and the last will.
+    pub const STATUS: &str = "status";
+    /// Whether the daemon is online: retained.
+    pub const DAEMON: &str = "daemon";
+    /// Current values of the pack: retained.
+    pub const INFO: &str = "info";
+    /// Current values of the cells: retained.
+    pub const CELLS: &str = "spec_data";
+    /// Events, each once, in order.
+    pub const EVENTS: &str = "events";
+    /// Samples, each once, in order.
+    pub const HISTORY: &str = "history";
+    /// How full the queue is: retained.
+    pub const UPLINK: &str = "uplink";
+}
+
+/// Payload while available, as Home Assistant expects it.
+pub const ONLINE: &str = "online";
+/// Payload while not.
+pub const OFFLINE: &str = "offline";
+
+/// Runs until SIGTERM or SIGINT.
+///
+/// # Errors
+/// When the settings have no broker, or the queue cannot be opened.
+pub fn run(settings: &Settings) -> Result<(), String> {
+    let mqtt = settings.mqtt.as_ref().ok_or("no table [mqtt]")?;
+    if mqtt.password_file.is_some() && mqtt.tls.is_none() && !is_this_computer(&mqtt.host) {
+        tracing::warn!(host = mqtt.host, "the password is sent in plain text: add a table [mqtt.tls]");
+    }
+    let queue = Queue::open(&mqtt.history)?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    runtime.block_on(async {
+        let mut stop = Stop::new(None).map_err(|error| format!("signals: {error}"))?;
+        let documents = follow(&settings.status.socket);
+        let (stopping, stopped) = watch::channel(false);
+        let recorder = Recorder::new(&queue, mqtt.history.period_s).run(documents.clone());
+        let link = Link { settings: mqtt, queue: &queue, documents };
+        let waits_for_stop = async {
+            stop.wait().await;
+            stopping.send_replace(true);
+            std::future::pending::<()>().await;
+        };
+        tokio::select! {
+            () = link.run(stopped) => {}
+            () = recorder => {}
+            () = waits_for_stop => {}
+        }
+        Ok(())
+    })
+}
+
+fn is_this_computer(host: &str) -> bool {
+    host == "localhost" || host.parse().is_ok_and(|address: std::net::IpAddr| address.is_loopback())
+}

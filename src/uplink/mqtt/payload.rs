@@ -1,0 +1,111 @@
+//! The documents that are published: `info`, `spec_data`, a sample of the history, an event.
+//!
+//! In: the daemon's status. Out: JSON. The same status gives the same bytes. What is not known is `null`.
+
+use packwatch_host::alarm::Rule;
+use packwatch_host::io::stamp::format_utc;
+use packwatch_host::quantity::Timestamp;
+use packwatch_host::status::document::{AlarmStatus, CellStatus, StatusDocument};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+
+use super::entity::{ENTITIES, percent, rounded};
+
+/// The pack: every entity, and `alarms` with the state of each rule that has a threshold.
+pub fn info(document: &StatusDocument) -> Value {
+    let mut info: Map<_, _> = ENTITIES.iter().map(|entity| (entity.key.to_owned(), entity.value(document))).collect();
+    let alarms = document.alarms.rules.iter().map(|&rule| (rule.name().to_owned(), alarm(&document.alarms, rule)));
+    info.insert("alarms".to_owned(), alarms.collect::<Map<_, _>>().into());
+    info.into()
+}
+
+/// Whether an alarm of the rule is raised; `null` = that is not known of every one.
+fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
+    let is_raised = alarms.list.iter().any(|alarm| alarm.rule == rule && alarm.state.is_raised());
+    let is_known = alarms.omitted == 0 && alarms.unknown.iter().all(|unknown| unknown.rule != rule);
+    if is_raised || is_known { is_raised.into() } else { Value::Null }
+}
+
+/// The cells: voltages in mV and, as Battery-Emulator has them, in V; SOC, capacity and resistance with standard deviations.
+pub fn spec_data(document: &StatusDocument) -> Value {
+    let each = |of: fn(&CellStatus) -> Value| document.cells.iter().map(of).collect::<Vec<_>>();
+    json!({
+        "time": stamp(document.wall_time),
+        "cell_voltages_mv": each(|cell| whole(cell.voltage_v.map(|volts| volts * 1000.0))),
+        "cell_voltages": each(|cell| rounded(cell.voltage_v, 3)),
+        "cell_temperatures": each(|cell| rounded(cell.temperature_c, 1)),
+        "cell_soc": each(|cell| percent(cell.soc)),
+        "cell_soc_std": each(|cell| percent(cell.soc_std)),
+        "cell_capacity": each(|cell| rounded(cell.capacity_ah, 3)),
+        "cell_capacity_std": each(|cell| rounded(cell.capacity_std_ah, 3)),
+        "cell_resistance_ratio": each(|cell| rounded(cell.resistance_ratio, 3)),
+        "cell_resistance_ratio_std": each(|cell| rounded(cell.resistance_ratio_std, 3)),
+        "cell_trusted": each(|cell| cell.trusted.into()),
+    })
+}
+
+/// One sample of the history: what `info` and `spec_data` held.
+pub fn sample(document: &StatusDocument) -> Value {
+    json!({ "time": stamp(document.wall_time), "info": info(document), "spec_data": spec_data(document) })
+}
+
+/// An event of the daemon, with Battery-Emulator's `event_type`, `severity` and `message`. Its time is that of the computer's clock.
+pub fn event(document: &StatusDocument, event: &Value) -> Value {
+    let text = |key: &str| event.get(key).and_then(Value::as_str);
+    let name = text("event").unwrap_or("unknown");
+    let ago_s = event.get("time").and_then(Value::as_i64).map(|time| document.time.since(Timestamp::from_nanos(time)));
+    let time = ago_s.map(|ago_s| stamp(document.wall_time.plus_secs(-ago_s)));
+    json!({
+        "time": time,
+        "event_type": text("rule").filter(|_| name == "alarm").unwrap_or(name),
+        "severity": text("severity").unwrap_or("info"),
+        "message": message(name, event),
+        "data": event,
+    })
+}
+
+/// The event in one line: `capacity_low raised, cell 1, value 2.41, threshold 2.5`, else its name and values.
+fn message(name: &str, event: &Value) -> String {
+    let text = |key: &str| event.get(key).and_then(Value::as_str).unwrap_or("?");
+    let is_alarm = name == "alarm";
+    let mut words = if is_alarm { format!("{} {}", text("rule"), text("change")) } else { name.replace('_', " ") };
+    let shown = ["cell", "value", "threshold"];
+    for (key, value) in event.as_object().into_iter().flatten() {
+        let is_shown =
+            if is_alarm { shown.contains(&key.as_str()) } else { !["event", "time"].contains(&key.as_str()) };
+        match (key.as_str(), value) {
+            (_, Value::Null) => {}
+            ("cell", Value::Number(cell)) => words += &format!(", cell {}", cell.as_u64().unwrap_or_default() + 1),
+            (_, Value::Number(number)) if is_shown => words += &format!(", {key} {}", short(number.as_f64())),
+            (_, Value::String(word)) if is_shown => words += &format!(", {key} {word}"),
+            (_, Value::Bool(flag)) if is_shown => words += &format!(", {key} {flag}"),
+            _ => {}
+        }
+    }
+    words
+}
+
+/// A number with at most four decimals.
+fn short(number: Option<f64>) -> String {
+    rounded(number, 4).to_string()
+}
+
+/// A whole number; `null` = not known, or not finite.
+fn whole(value: Option<f64>) -> Value {
+    #[expect(clippy::cast_possible_truncation, reason = "a voltage in mV is far inside; `as` saturates")]
+    value.filter(|value| value.is_finite()).map_or(Value::Null, |value| Value::from(value.round() as i64))
+}
+
+/// The word that a value of an enumeration has in JSON.
+pub fn word(value: &impl Serialize) -> String {
+    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+}
+
+/// Time as ISO 8601 in UTC with milliseconds.
+pub fn stamp(time: Timestamp) -> String {
+    let millis = time.nanos().div_euclid(1_000_000).rem_euclid(1000);
+    format!("{}.{millis:03}Z", format_utc(time).trim_end_matches('Z'))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,90 @@
+use super::*;
+
+fn document() -> StatusDocument {
+    serde_json::from_str(include_str!("../../tests/data/status.json")).unwrap()
+}
+
+#[test]
+fn percent_outside_and_current_positive_while_charging() {
+    let mut document = document();
+    document.cells.truncate(1);
+    let info = info(&document);
+    for (key, value) in [
+        ("SOC", json!(63.2)),
+        ("SOC_std", json!(1.2)),
+        ("state_of_health", json!(92.8)),
+        ("battery_current", json!(-12.5)),
+        // 7.3 V at 12.5 A of discharge.
+        ("stat_batt_power", json!(-91.0)),
+        ("charging_state", json!("Discharging")),
+        ("battery_current_offset", json!(0.034)),
+        ("cell_max_voltage", json!(3.6)),
+        ("cell_voltage_delta", json!(0.0)),
+        ("min_cell_number", json!(1)),
+        ("limiting_cell", json!(1)),
+        ("time", json!("2027-01-15T08:00:00.000Z")),
+        ("validity", json!("valid")),
+        ("event_level", json!("severe")),
+        ("lithium_loss_std", json!(1.2)),
+    ] {
+        assert_eq!(info[key], value, "{key}");
+    }
+}
+
+#[test]
+fn what_is_not_known_is_null_everywhere() {
+    let mut document = document();
+    let pack: Map<_, _> = serde_json::to_value(&document.pack).unwrap().as_object().unwrap().clone();
+    let without = |(key, value): (String, Value)| {
+        let is_number = value.is_number();
+        (key, if is_number { Value::Null } else { value })
+    };
+    document.pack = serde_json::from_value(pack.into_iter().map(without).collect::<Map<_, _>>().into()).unwrap();
+    document.cells.remove(0);
+    let info = info(&document);
+    let known = [
+        "alarms",
+        "alarms_raised",
+        "charging_state",
+        "event_level",
+        "late_ticks",
+        "software_version",
+        "time",
+        "uptime",
+        "validity",
+    ];
+    for (key, value) in info.as_object().unwrap() {
+        assert_eq!(!value.is_null(), known.contains(&key.as_str()), "{key} = {value}");
+    }
+    let cells = spec_data(&document);
+    for (key, value) in cells.as_object().unwrap().iter().filter(|(key, _)| *key != "time") {
+        assert_eq!(value, &json!([null]), "{key}");
+    }
+}
+
+#[test]
+fn an_alarm_that_may_be_raised_is_not_shown_as_healthy() {
+    let mut document = document();
+    let of = |document: &StatusDocument, rule: &str| info(document)["alarms"][rule].clone();
+    assert_eq!(of(&document, "soc_low"), json!(false));
+    // The list had no room for all.
+    document.alarms.omitted = 1;
+    assert_eq!((of(&document, "soc_low"), of(&document, "capacity_low")), (Value::Null, json!(true)));
+    // A rule without a threshold has no state.
+    assert_eq!(info(&document)["alarms"].get("cell_leak"), None);
+}
+
+#[test]
+fn an_alarm_event_has_its_rule_severity_and_time_on_the_computers_clock() {
+    let mut document = document();
+    document.wall_time = document.time.plus_secs(100.0);
+    let raised = json!({
+        "time": document.time.plus_secs(-5.0).nanos(), "event": "alarm", "rule": "capacity_low", "cell": 2, "change": "raised",
+        "state": "active", "active": true, "severity": "warning", "value": 2.412_345, "probability": null, "threshold": 2.5,
+    });
+    let event = event(&document, &raised);
+    assert_eq!(event["time"], "2027-01-15T08:01:35.000Z");
+    assert_eq!((&event["event_type"], &event["severity"]), (&json!("capacity_low"), &json!("warning")));
+    assert_eq!(event["message"], "capacity_low raised, cell 3, threshold 2.5, value 2.4123");
+    assert_eq!(event["data"], raised);
+}

@@ -1,0 +1,274 @@
+//! The queue on disk: messages that the broker has not acknowledged yet, oldest first.
+//!
+//! In: messages of the recorder. Out: the oldest messages in order, until they are removed. A message that was accepted survives a
+//! power cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. When it is
+//! full, the oldest samples are dropped, and the oldest events only when no sample is left. Drops are counted for ever. A
+//! file that is damaged is put aside and a new one begun.
+
+use std::cell::{Cell, RefCell};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use rusqlite::{Connection, OptionalExtension as _, Transaction, params};
+use tokio::sync::Notify;
+
+use super::settings::HistorySettings;
+
+const FILE: &str = "queue.db";
+const LOCK: &str = "queue.lock";
+/// Layout of the file.
+const VERSION: i64 = 1;
+/// A page of a message of one MB: a WAL of this many pages is copied back into the file.
+const CHECKPOINT_PAGES: i64 = 256;
+
+/// What is dropped first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Class {
+    /// A periodic sample.
+    Sample = 0,
+    /// An event, alarms among them: dropped only when no sample is left.
+    Event = 1,
+}
+
+/// A message in the queue.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stored {
+    /// Its number: rises by one with each message, also over restarts.
+    pub sequence: i64,
+    /// Its class.
+    pub class: Class,
+    /// Its text.
+    pub body: String,
+}
+
+/// How full the queue is, and what fell out of it since it was created.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Fill {
+    /// Messages.
+    pub messages: u64,
+    /// Bytes of messages.
+    pub bytes: u64,
+    /// Samples dropped.
+    pub dropped_samples: u64,
+    /// Events dropped.
+    pub dropped_events: u64,
+}
+
+/// The queue.
+#[derive(Debug)]
+pub struct Queue {
+    database: RefCell<Connection>,
+    max_messages: u64,
+    max_bytes: u64,
+    fill: Cell<Fill>,
+    added: Notify,
+    _lock: File,
+}
+
+impl Queue {
+    /// Opens the queue in its folder, and creates what is missing.
+    ///
+    /// # Errors
+    /// When the folder cannot be written, or another uplink uses it.
+    pub fn open(settings: &HistorySettings) -> Result<Self, String> {
+        let folder = &settings.folder;
+        let at = |error: &dyn std::fmt::Display| format!("{}: {error}", folder.display());
+        std::fs::create_dir_all(folder).map_err(|error| at(&error))?;
+        let lock = File::create(folder.join(LOCK)).map_err(|error| at(&error))?;
+        lock.try_lock().map_err(|_| at(&"used by another uplink"))?;
+        let path = folder.join(FILE);
+        let database = match prepare(&path) {
+            Ok(database) => database,
+            Err(error) => {
+                let aside = put_aside(&path).map_err(|error| at(&error))?;
+                tracing::error!(%error, aside = %aside.display(), "the queue is damaged: put aside, a new one begins");
+                prepare(&path).map_err(|error| at(&error))?
+            }
+        };
+        let fill = read_fill(&database).map_err(|error| at(&error))?;
+        let (max_messages, max_bytes) = (settings.max_messages, settings.max_bytes);
+        let database = RefCell::new(database);
+        Ok(Self { database, max_messages, max_bytes, fill: Cell::new(fill), added: Notify::new(), _lock: lock })
+    }
+
+    /// How full it is.
+    pub fn fill(&self) -> Fill {
+        self.fill.get()
+    }
+
+    /// Waits until a message is added.
+    pub async fn wait(&self) {
+        self.added.notified().await;
+    }
+
+    /// Adds messages and notes `seen` for [`Self::seen`], all or nothing. On return they are on disk.
+    ///
+    /// # Errors
+    /// When the disk does not take them.
+    pub fn add(&self, messages: &[(Class, String)], seen: Option<&str>) -> Result<(), String> {
+        let mut database = self.database.borrow_mut();
+        let fill = self.try_add(&mut database, messages, seen).map_err(|error| error.to_string())?;
+        self.fill.set(fill);
+        self.added.notify_one();
+        Ok(())
+    }
+
+    fn try_add(
+        &self,
+        database: &mut Connection,
+        messages: &[(Class, String)],
+        seen: Option<&str>,
+    ) -> rusqlite::Result<Fill> {
+        let mut fill = self.fill.get();
+        let transaction = database.transaction()?;
+        for (class, body) in messages {
+            transaction
+                .prepare_cached("INSERT INTO message (class, body) VALUES (?, ?)")?
+                .execute(params![*class as i64, body])?;
+            fill.messages += 1;
+            fill.bytes += length(body);
+        }
+        while fill.messages > self.max_messages || fill.bytes > self.max_bytes {
+            if !drop_oldest(&transaction, &mut fill)? {
+                break;
+            }
+        }
+        if let Some(seen) = seen {
+            transaction.execute("INSERT OR REPLACE INTO seen VALUES (0, ?)", [seen])?;
+        }
+        transaction.commit()?;
+        Ok(fill)
+    }
+
+    /// What the latest [`Self::add`] with `seen` noted.
+    pub fn seen(&self) -> Option<String> {
+        let database = self.database.borrow();
+        let seen = database.query_row("SELECT text FROM seen", [], |row| row.get(0)).optional();
+        seen.unwrap_or_else(|error| {
+            tracing::error!(%error, "the queue cannot be read");
+            None
+        })
+    }
+
+    /// The oldest messages, at most `count`.
+    ///
+    /// # Errors
+    /// When the disk cannot be read.
+    pub fn oldest(&self, count: usize) -> Result<Vec<Stored>, String> {
+        let database = self.database.borrow();
+        let read = || {
+            let mut query = database.prepare_cached("SELECT id, class, body FROM message ORDER BY id LIMIT ?")?;
+            let rows = query.query_map([i64::try_from(count).unwrap_or(i64::MAX)], |row| {
+                let class = if row.get::<_, i64>(1)? == Class::Event as i64 { Class::Event } else { Class::Sample };
+                Ok(Stored { sequence: row.get(0)?, class, body: row.get(2)? })
+            })?;
+            rows.collect::<rusqlite::Result<Vec<_>>>()
+        };
+        read().map_err(|error| error.to_string())
+    }
+
+    /// Removes messages that the broker has. One that was dropped meanwhile is no fault.
+    ///
+    /// # Errors
+    /// When the disk does not take it: they are sent again then.
+    pub fn remove(&self, messages: &[Stored]) -> Result<(), String> {
+        let mut database = self.database.borrow_mut();
+        let mut fill = self.fill.get();
+        let mut remove = || {
+            let transaction = database.transaction()?;
+            for message in messages {
+                let mut delete = transaction.prepare_cached("DELETE FROM message WHERE id = ?")?;
+                if delete.execute([message.sequence])? == 1 {
+                    fill.messages -= 1;
+                    fill.bytes -= length(&message.body);
+                }
+            }
+            transaction.commit()
+        };
+        remove().map_err(|error: rusqlite::Error| error.to_string())?;
+        self.fill.set(fill);
+        Ok(())
+    }
+}
+
+/// A column that is never negative.
+fn count(row: &rusqlite::Row<'_>, column: usize) -> rusqlite::Result<u64> {
+    row.get::<_, i64>(column).map(i64::unsigned_abs)
+}
+
+fn length(body: &str) -> u64 {
+    body.len() as u64
+}
+
+/// Opens the file, checks it and creates its tables.
+fn prepare(path: &Path) -> rusqlite::Result<Connection> {
+    let database = Connection::open(path)?;
+    database.pragma_update(None, "journal_mode", "wal")?;
+    database.pragma_update(None, "synchronous", "full")?;
+    database.pragma_update(None, "wal_autocheckpoint", CHECKPOINT_PAGES)?;
+    let check: String = database.query_row("PRAGMA quick_check(1)", [], |row| row.get(0))?;
+    let version: i64 = database.query_row("PRAGMA user_version", [], |row| row.get(0))?;
+    if check != "ok" || version > VERSION {
+        return Err(rusqlite::Error::InvalidParameterName(format!("check {check}, layout {version}")));
+    }
+    // AUTOINCREMENT: no number is used twice, also when the queue was empty meanwhile.
+    database.execute_batch(&format!(
+        "CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);
+         CREATE INDEX IF NOT EXISTS message_class ON message (class, id);
+         CREATE TABLE IF NOT EXISTS dropped (class INTEGER PRIMARY KEY, count INTEGER NOT NULL);
+         CREATE TABLE IF NOT EXISTS seen (one INTEGER PRIMARY KEY CHECK (one = 0), text TEXT NOT NULL);
+         PRAGMA user_version = {VERSION};"
+    ))?;
+    Ok(database)
+}
+
+/// Renames the file, over an earlier one that was put aside; its log belongs to it.
+fn put_aside(path: &Path) -> std::io::Result<PathBuf> {
+    let aside = path.with_extension("damaged");
+    for suffix in ["", "-wal", "-shm"] {
+        let (from, to) = (with_suffix(path, suffix), with_suffix(&aside, suffix));
+        match std::fs::rename(&from, &to) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+    }
+    Ok(aside)
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
+}
+
+fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
+    let dropped = |class: Class| {
+        let count =
+            database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
+        count.optional().map(Option::unwrap_or_default)
+    };
+    // In bytes, as `length` counts: of a text, SQLite counts characters.
+    let size = "SELECT count(*), coalesce(sum(length(CAST(body AS BLOB))), 0) FROM message";
+    let (messages, bytes) = database.query_row(size, [], |row| Ok((count(row, 0)?, count(row, 1)?)))?;
+    Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
+}
+
+/// Drops the oldest sample, else the oldest event; `false` = the queue is empty.
+fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Result<bool> {
+    let oldest = "DELETE FROM message WHERE id = (SELECT id FROM message ORDER BY class, id LIMIT 1)
+                  RETURNING class, length(CAST(body AS BLOB))";
+    let dropped = transaction
+        .prepare_cached(oldest)?
+        .query_row([], |row| Ok((row.get::<_, i64>(0)?, count(row, 1)?)))
+        .optional()?;
+    let Some((class, bytes)) = dropped else { return Ok(false) };
+    let count = "INSERT INTO dropped VALUES (?, 1) ON CONFLICT (class) DO UPDATE SET count = count + 1";
+    transaction.prepare_cached(count)?.execute([class])?;
+    fill.messages -= 1;
+    fill.bytes -= bytes;
+    *(if class == Class::Event as i64 { &mut fill.dropped_events } else { &mut fill.dropped_samples }) += 1;
+    Ok(true)
+}
+
+#[cfg(test)]
+mod tests;

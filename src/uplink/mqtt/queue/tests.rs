@@ -1,0 +1,89 @@
+use super::*;
+
+fn settings(folder: &Path, max_messages: u64, max_bytes: u64) -> HistorySettings {
+    HistorySettings { folder: folder.to_owned(), max_messages, max_bytes, ..HistorySettings::default() }
+}
+
+fn texts(queue: &Queue) -> Vec<String> {
+    queue.oldest(100).unwrap().into_iter().map(|stored| stored.body).collect()
+}
+
+fn sample(text: &str) -> (Class, String) {
+    (Class::Sample, text.to_owned())
+}
+
+fn event(text: &str) -> (Class, String) {
+    (Class::Event, text.to_owned())
+}
+
+#[test]
+fn messages_come_out_in_order_and_survive_a_restart() {
+    let folder = tempfile::tempdir().unwrap();
+    let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
+    queue.add(&[event("{e1}"), sample("{s1 ä}")], Some("[1]")).unwrap();
+    queue.add(&[sample("{s2}")], None).unwrap();
+    let before = queue.fill();
+    assert_eq!((before.messages, before.bytes), (3, 4 + 7 + 4));
+    drop(queue);
+    let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
+    assert_eq!((queue.fill(), queue.seen().as_deref()), (before, Some("[1]")));
+    let oldest = queue.oldest(2).unwrap();
+    assert_eq!(
+        oldest.iter().map(|it| (it.sequence, it.class)).collect::<Vec<_>>(),
+        [(1, Class::Event), (2, Class::Sample)]
+    );
+    queue.remove(&oldest).unwrap();
+    // Twice is no fault: it may have been dropped meanwhile.
+    queue.remove(&oldest).unwrap();
+    assert_eq!((texts(&queue), queue.fill().bytes), (vec!["{s2}".to_owned()], 4));
+}
+
+#[test]
+fn numbers_are_never_used_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
+    queue.add(&[sample("a")], None).unwrap();
+    queue.remove(&queue.oldest(1).unwrap()).unwrap();
+    drop(queue);
+    let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
+    queue.add(&[sample("b")], None).unwrap();
+    assert_eq!(queue.oldest(1).unwrap()[0].sequence, 2);
+}
+
+#[test]
+fn samples_are_dropped_before_events_and_both_are_counted_for_ever() {
+    let folder = tempfile::tempdir().unwrap();
+    let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
+    queue.add(&[event("e1"), sample("s1"), sample("s2"), event("e2")], None).unwrap();
+    assert_eq!(texts(&queue), ["e1", "s2", "e2"]);
+    queue.add(&[event("e3"), event("e4")], None).unwrap();
+    assert_eq!(texts(&queue), ["e2", "e3", "e4"]);
+    let fill = queue.fill();
+    assert_eq!((fill.messages, fill.bytes, fill.dropped_samples, fill.dropped_events), (3, 6, 2, 1));
+    drop(queue);
+    assert_eq!(Queue::open(&settings(folder.path(), 3, 1000)).unwrap().fill(), fill);
+}
+
+#[test]
+fn the_bound_in_bytes_holds_for_a_message_that_is_longer_than_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let queue = Queue::open(&settings(folder.path(), 100, 10)).unwrap();
+    queue.add(&[sample("12345"), sample("67890")], None).unwrap();
+    assert_eq!(queue.fill().messages, 2);
+    queue.add(&[sample("a longer one than ten bytes")], None).unwrap();
+    assert_eq!((queue.fill().bytes, queue.fill().messages, queue.fill().dropped_samples), (0, 0, 3));
+}
+
+#[test]
+fn a_second_uplink_is_refused_and_a_damaged_file_is_put_aside() {
+    let folder = tempfile::tempdir().unwrap();
+    let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
+    let refusal = Queue::open(&settings(folder.path(), 3, 1000)).unwrap_err();
+    assert!(refusal.ends_with("used by another uplink"), "{refusal}");
+    drop(queue);
+    std::fs::write(folder.path().join(FILE), "no database, but long enough to look like one".repeat(100)).unwrap();
+    let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
+    queue.add(&[sample("a")], None).unwrap();
+    assert_eq!(queue.fill().messages, 1);
+    assert!(folder.path().join("queue.damaged").exists());
+}

@@ -1,0 +1,103 @@
+//! The recorder: which of the daemon's documents become samples, and which of its events are new.
+//!
+//! In: the daemon's documents. Out: messages in the [`Queue`], whether the broker can be reached or not. A sample is due by the
+//! daemon's clock. The document lists the latest events; those that an earlier document listed are recognised by their place in that
+//! list, also over a restart of this program. Events that leave the list while this program is not running are not seen.
+
+use std::cell::Cell;
+
+use packwatch_host::quantity::Timestamp;
+use packwatch_host::status::document::StatusDocument;
+use serde_json::Value;
+
+use super::payload;
+use super::queue::{Class, Queue};
+use crate::status_stream::Documents;
+
+/// A document that comes this much before a sample is due is taken: the daemon's documents come about once a second.
+const TOLERANCE_S: f64 = 0.5;
+
+/// State of the recorder.
+#[derive(Debug)]
+pub struct Recorder<'a> {
+    queue: &'a Queue,
+    period_s: u64,
+    due: Option<Timestamp>,
+    events: Vec<Value>,
+    works: Cell<bool>,
+}
+
+impl<'a> Recorder<'a> {
+    /// A recorder that takes a sample every `period_s` seconds, none for 0.
+    pub fn new(queue: &'a Queue, period_s: u64) -> Self {
+        let events = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok()).unwrap_or_default();
+        Self { queue, period_s, due: None, events, works: Cell::new(true) }
+    }
+
+    /// Takes documents, for ever.
+    pub async fn run(mut self, mut documents: Documents) {
+        while documents.changed().await.is_ok() {
+            let document = documents.borrow_and_update().clone();
+            if let Some(document) = document {
+                self.take(&document);
+            }
+        }
+        std::future::pending().await
+    }
+
+    /// Queues what is new in a document. What the disk does not take is tried again with the next one.
+    pub fn take(&mut self, document: &StatusDocument) {
+        let news = new_events(&self.events, &document.events);
+        let mut messages: Vec<_> =
+            news.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
+        let next = self.next_due(document.time);
+        if next.is_some() {
+            messages.push((Class::Sample, payload::sample(document).to_string()));
+        }
+        if messages.is_empty() {
+            return;
+        }
+        let seen = (!news.is_empty()).then(|| Value::from(document.events.clone()).to_string());
+        let result = self.queue.add(&messages, seen.as_deref());
+        if self.works.replace(result.is_ok()) != result.is_ok() {
+            match &result {
+                Ok(()) => tracing::info!("the queue can be written again"),
+                Err(error) => tracing::error!(error, "the queue cannot be written: samples are lost until it can"),
+            }
+        }
+        if result.is_ok() {
+            self.due = next.or(self.due);
+            self.events.clone_from(&document.events);
+        }
+    }
+
+    /// When the next sample is due, if one is due `now`. After a pause or a step of the clock the rhythm begins again.
+    fn next_due(&self, now: Timestamp) -> Option<Timestamp> {
+        if self.period_s == 0 {
+            return None;
+        }
+        #[expect(clippy::cast_precision_loss, reason = "at most 86,400")]
+        let period_s = self.period_s as f64;
+        let Some(due) = self.due else { return Some(now.plus_secs(period_s)) };
+        let late_s = now.since(due);
+        let is_in_rhythm = (-TOLERANCE_S..period_s).contains(&late_s);
+        let is_other_clock = late_s < -period_s - TOLERANCE_S;
+        match (is_in_rhythm, late_s >= period_s || is_other_clock) {
+            (true, _) => Some(due.plus_secs(period_s)),
+            (false, true) => Some(now.plus_secs(period_s)),
+            (false, false) => None,
+        }
+    }
+}
+
+/// Events of `now` that `before` did not list: `now` begins with the end of `before`, because the daemon drops the oldest.
+fn new_events<'a>(before: &[Value], now: &'a [Value]) -> &'a [Value] {
+    let kept = (0..=before.len()).find_map(|dropped| {
+        let end = &before[dropped..];
+        now.starts_with(end).then_some(end.len())
+    });
+    &now[kept.unwrap_or(0)..]
+}
+
+#[cfg(test)]
+mod tests;

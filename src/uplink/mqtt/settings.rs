@@ -1,0 +1,244 @@
+//! Table `[mqtt]` of the uplink's settings: the broker, what is published when, and how much waits for a lost link.
+//!
+//! In: TOML. Out: checked settings; a number or text outside its range is a fault of its line. Files are read at each connection,
+//! so that a new certificate or password needs no restart.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Deserializer, de};
+
+/// Environment variable with systemd's folder of credentials.
+const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
+/// Longest password or certificate file, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+/// Longest topic, bytes: MQTT's own limit of 65,535 less what is appended, by far.
+const MAX_TOPIC_BYTES: usize = 200;
+
+/// The broker and what it gets.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MqttSettings {
+    /// Host name or address of the broker.
+    #[serde(deserialize_with = "text")]
+    pub host: String,
+    /// Its port; `None` = 1883, or 8883 with TLS.
+    pub port: Option<u16>,
+    /// Name of this client at the broker, one for each uplink; `None` = `packwatch-` and the topic.
+    pub client_id: Option<String>,
+    /// User name; `None` = anonymous.
+    pub user: Option<String>,
+    /// File with the password. A relative path is below `CREDENTIALS_DIRECTORY`, if systemd set that.
+    pub password_file: Option<PathBuf>,
+    /// Base of all topics of this pack.
+    #[serde(deserialize_with = "topic")]
+    pub topic: String,
+    /// Time between current values, s.
+    #[serde(deserialize_with = "whole::<1, 3600, _>")]
+    pub period_s: u64,
+    /// Longest silence on the connection, s; the broker publishes the last will after one and a half of it.
+    #[serde(deserialize_with = "whole::<5, 3600, _>")]
+    pub keep_alive_s: u64,
+    /// Longest pause between two attempts to connect, s.
+    #[serde(deserialize_with = "whole::<1, 3600, _>")]
+    pub retry_max_s: u64,
+    /// TLS; `None` = the connection is plain.
+    pub tls: Option<TlsSettings>,
+    /// Discovery by Home Assistant.
+    pub discovery: DiscoverySettings,
+    /// What is kept for a lost link.
+    pub history: HistorySettings,
+}
+
+/// TLS to the broker.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TlsSettings {
+    /// PEM file of the authorities that may sign the broker's certificate; `None` = those of the system.
+    pub ca_file: Option<PathBuf>,
+    /// PEM file with the client's certificate; `None` = none is shown.
+    pub certificate_file: Option<PathBuf>,
+    /// PEM file with the key of that certificate.
+    pub key_file: Option<PathBuf>,
+}
+
+/// Discovery by Home Assistant.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DiscoverySettings {
+    /// Whether it is published.
+    pub enabled: bool,
+    /// First part of its topics.
+    #[serde(deserialize_with = "topic")]
+    pub prefix: String,
+    /// Whether each cell's voltage is an entity.
+    pub cells: bool,
+    /// Name of the device; `None` = the vehicle as the daemon's configuration names it, else the topic.
+    pub device_name: Option<String>,
+}
+
+/// What is kept for a lost link.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HistorySettings {
+    /// Time between samples, s of the daemon's clock; 0 = none.
+    #[serde(deserialize_with = "whole::<0, 86_400, _>")]
+    pub period_s: u64,
+    /// Folder of the queue.
+    pub folder: PathBuf,
+    /// Most messages in the queue.
+    #[serde(deserialize_with = "whole::<1, 10_000_000, _>")]
+    pub max_messages: u64,
+    /// Most bytes of messages in the queue.
+    #[serde(deserialize_with = "whole::<100_000, 100_000_000_000, _>")]
+    pub max_bytes: u64,
+}
+
+impl Default for MqttSettings {
+    fn default() -> Self {
+        Self {
+            host: "127.0.0.1".to_owned(),
+            port: None,
+            client_id: None,
+            user: None,
+            password_file: None,
+            topic: "packwatch".to_owned(),
+            period_s: 5,
+            keep_alive_s: 30,
+            retry_max_s: 60,
+            tls: None,
+            discovery: DiscoverySettings::default(),
+            history: HistorySettings::default(),
+        }
+    }
+}
+
+impl Default for DiscoverySettings {
+    fn default() -> Self {
+        Self { enabled: true, prefix: "homeassistant".to_owned(), cells: true, device_name: None }
+    }
+}
+
+impl Default for HistorySettings {
+    fn default() -> Self {
+        Self {
+            period_s: 10,
+            folder: PathBuf::from("/var/lib/packwatch-mqtt"),
+            max_messages: 100_000,
+            max_bytes: 64 << 20,
+        }
+    }
+}
+
+impl MqttSettings {
+    /// The broker's port.
+    pub fn port(&self) -> u16 {
+        self.port.unwrap_or(if self.tls.is_some() { 8883 } else { 1883 })
+    }
+
+    /// Name of this client at the broker.
+    pub fn client_id(&self) -> String {
+        self.client_id.clone().unwrap_or_else(|| format!("packwatch-{}", self.node()))
+    }
+
+    /// The topic `name` of this pack.
+    pub fn topic(&self, name: &str) -> String {
+        format!("{}/{name}", self.topic)
+    }
+
+    /// The topic as one word of letters, digits, `-` and `_`: what Home Assistant allows in its topics and identifiers.
+    pub fn node(&self) -> String {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+        self.topic.chars().map(|c| if allowed(c) { c } else { '_' }).collect()
+    }
+
+    /// Reads the password; the line end after it does not belong to it.
+    ///
+    /// # Errors
+    /// When the file cannot be read or is empty.
+    pub fn password(&self) -> Result<Option<Vec<u8>>, String> {
+        let Some(path) = &self.password_file else { return Ok(None) };
+        let mut password = read(path)?;
+        while matches!(password.last(), Some(b'\n' | b'\r')) {
+            password.pop();
+        }
+        if password.is_empty() {
+            return Err(format!("{}: no password in it", path.display()));
+        }
+        Ok(Some(password))
+    }
+}
+
+/// Reads a file of the settings; a relative path is below systemd's credentials, if there are any.
+///
+/// # Errors
+/// With the file's name, when it cannot be read or is too long.
+pub fn read(path: &Path) -> Result<Vec<u8>, String> {
+    let folder = std::env::var_os(CREDENTIALS).map(PathBuf::from).unwrap_or_default();
+    let path = folder.join(path);
+    let at = path.display();
+    let bytes = std::fs::metadata(&path).map_err(|error| format!("{at}: {error}"))?.len();
+    if bytes > MAX_FILE_BYTES {
+        return Err(format!("{at}: {bytes} bytes, must be at most {MAX_FILE_BYTES}"));
+    }
+    std::fs::read(&path).map_err(|error| format!("{at}: {error}"))
+}
+
+fn whole<'de, const LEAST: u64, const MOST: u64, D: Deserializer<'de>>(source: D) -> Result<u64, D::Error> {
+    let value = i64::deserialize(source)?;
+    let allowed = u64::try_from(value).ok().filter(|value| (LEAST..=MOST).contains(value));
+    allowed.ok_or_else(|| de::Error::custom(format!("must be {LEAST} to {MOST}")))
+}
+
+fn text<'de, D: Deserializer<'de>>(source: D) -> Result<String, D::Error> {
+    let text = String::deserialize(source)?;
+    if text.is_empty() { Err(de::Error::custom("must not be empty")) } else { Ok(text) }
+}
+
+fn topic<'de, D: Deserializer<'de>>(source: D) -> Result<String, D::Error> {
+    let topic = String::deserialize(source)?;
+    let has_empty_level = topic.split('/').any(str::is_empty);
+    if has_empty_level || topic.starts_with('$') || topic.contains(['+', '#']) || topic.contains(char::is_control) {
+        return Err(de::Error::custom(
+            "must be a topic: levels between '/', not empty, without '+' and '#', no '$' in front",
+        ));
+    }
+    if topic.len() > MAX_TOPIC_BYTES {
+        return Err(de::Error::custom(format!("must be at most {MAX_TOPIC_BYTES} bytes")));
+    }
+    Ok(topic)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_topic_with_levels_is_one_word_in_identifiers() {
+        let settings = MqttSettings { topic: "fleet/Bus 12/pack-1".to_owned(), ..MqttSettings::default() };
+        assert_eq!(
+            (settings.node().as_str(), settings.topic("info").as_str()),
+            ("fleet_Bus_12_pack-1", "fleet/Bus 12/pack-1/info")
+        );
+        assert_eq!(settings.client_id(), "packwatch-fleet_Bus_12_pack-1");
+    }
+
+    #[test]
+    fn the_port_follows_tls() {
+        let tls = MqttSettings { tls: Some(TlsSettings::default()), ..MqttSettings::default() };
+        assert_eq!((MqttSettings::default().port(), tls.port()), (1883, 8883));
+    }
+
+    #[test]
+    fn a_password_ends_before_its_line_end_and_may_not_be_empty() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let settings = MqttSettings { password_file: Some(file.path().to_owned()), ..MqttSettings::default() };
+        for (text, password) in [("a b", "a b"), ("a b\n", "a b"), ("a b\r\n", "a b"), (" a\n\n", " a")] {
+            std::fs::write(file.path(), text).unwrap();
+            assert_eq!(settings.password().unwrap().unwrap(), password.as_bytes());
+        }
+        std::fs::write(file.path(), "\n").unwrap();
+        assert!(settings.password().unwrap_err().ends_with("no password in it"));
+        std::fs::remove_file(file.path()).unwrap();
+        assert!(settings.password().unwrap_err().contains("No such file"));
+    }
+}

@@ -1,0 +1,116 @@
+//! The uplink's settings: one TOML file, apart from the daemon's configuration, so that another broker changes neither the
+//! daemon nor the digest of its configuration.
+//!
+//! In: the file of `-c`. Out: checked settings. A fault names file, line, key and what is allowed.
+
+use std::path::{Path, PathBuf};
+
+use packwatch_host::status::standard_path;
+use serde::Deserialize;
+
+use crate::mqtt::settings::MqttSettings;
+
+/// Longest file, bytes: a hundred times what a person writes.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// What the file may hold.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Where the daemon's status comes from.
+    pub status: StatusSettings,
+    /// The MQTT broker; `None` = `packwatch mqtt` has nothing to do.
+    pub mqtt: Option<MqttSettings>,
+}
+
+/// The daemon's status.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StatusSettings {
+    /// The daemon's status socket; the stream socket is next to it.
+    pub socket: PathBuf,
+}
+
+impl Default for StatusSettings {
+    fn default() -> Self {
+        Self { socket: standard_path() }
+    }
+}
+
+impl Settings {
+    /// Reads the file at `path`.
+    ///
+    /// # Errors
+    /// When it cannot be read, or with file, line and reason what is wrong in it.
+    pub fn read(path: &Path) -> Result<Self, String> {
+        let at = path.display();
+        let size = std::fs::metadata(path).map_err(|error| format!("{at}: {error}"))?.len();
+        if size > MAX_BYTES {
+            return Err(format!("{at}: {size} bytes, must be at most {MAX_BYTES}"));
+        }
+        let text = std::fs::read_to_string(path).map_err(|error| format!("{at}: {error}"))?;
+        Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))
+    }
+
+    /// Parses the text of a file; a fault begins with its line.
+    fn parse(text: &str) -> Result<Self, String> {
+        toml::from_str(text).map_err(|error| {
+            let start = error.span().map_or(0, |span| span.start);
+            let line = 1 + text.as_bytes().iter().take(start).filter(|byte| **byte == b'\n').count();
+            let found = text.lines().nth(line - 1).unwrap_or_default().trim();
+            let message = error.message().replace('\n', ", ");
+            // A value outside its range: the line shows its key and what was found.
+            if message.starts_with("must ") {
+                format!("{line}: {found}, {message}")
+            } else {
+                format!("{line}: {message}")
+            }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_empty_file_is_the_standard_daemon() {
+        assert_eq!(Settings::parse("").unwrap(), Settings::default());
+    }
+
+    #[test]
+    fn a_value_outside_its_range_is_shown_with_its_key() {
+        let fault = |text: &str| Settings::parse(text).unwrap_err();
+        assert_eq!(fault("[mqtt]\nperiod_s = 0\n"), "2: period_s = 0, must be 1 to 3600");
+        assert_eq!(fault("[mqtt.history]\nmax_bytes = -1"), "2: max_bytes = -1, must be 100000 to 100000000000");
+        assert!(fault("[mqtt]\ntopic = \"a/#\"").starts_with("2: topic = \"a/#\", must be a topic"));
+        assert!(fault("[mqtt]\nport = 70000").starts_with("2: "), "{}", fault("[mqtt]\nport = 70000"));
+    }
+
+    #[test]
+    fn the_example_shows_every_key_with_its_default() {
+        let example = include_str!("../../config/uplink.toml");
+        let shown = Settings { mqtt: Some(MqttSettings::default()), ..Settings::default() };
+        assert_eq!(Settings::parse(example).unwrap(), shown);
+        // The keys that are comments exist too.
+        let is_key =
+            |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+        let uncomment = |line| match str::strip_prefix(line, "# ") {
+            Some(key) if is_key(key) => key,
+            _ => line,
+        };
+        let all: Vec<&str> = example.lines().map(uncomment).collect();
+        let mqtt = Settings::parse(&all.join("\n")).unwrap().mqtt.unwrap();
+        assert!(mqtt.tls.unwrap().key_file.is_some() && mqtt.discovery.device_name.is_some() && mqtt.user.is_some());
+    }
+
+    #[test]
+    fn a_fault_names_its_line_and_what_is_allowed() {
+        let fault = Settings::parse("[status]\nsocket = \"/run/a.sock\"\nsokcet = 1\n").unwrap_err();
+        assert_eq!(fault, "3: unknown field `sokcet`, expected `socket`");
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "[statsu]\n").unwrap();
+        let fault = Settings::read(file.path()).unwrap_err();
+        assert!(fault.starts_with(&format!("{}:1: unknown field `statsu`", file.path().display())), "{fault}");
+    }
+}

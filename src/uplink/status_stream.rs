@@ -1,0 +1,77 @@
+//! The daemon's status, one document a second.
+//!
+//! In: the daemon's stream socket. Out: [`StatusDocument`]s, and `None` once when the daemon stops sending: nothing for
+//! [`SILENCE`], the end of the stream, or a document that this program cannot read. Connects again every [`RETRY`], for ever.
+//! A reader that is slower than the daemon gets the newest document; older ones are dropped, never queued.
+
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use packwatch_host::status::client::{MAX_DOCUMENT_BYTES, explain, parse};
+use packwatch_host::status::document::StatusDocument;
+use packwatch_host::status::stream_path;
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
+use tokio::net::UnixStream;
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+
+/// Longest time without a document before the daemon counts as silent: the daemon itself serves none older than 3 s.
+pub const SILENCE: Duration = Duration::from_secs(5);
+/// Pause before the next attempt to connect.
+pub const RETRY: Duration = Duration::from_secs(1);
+
+/// The newest document, as a value that changes; `None` = the daemon is silent.
+pub type Documents = watch::Receiver<Option<Box<StatusDocument>>>;
+
+/// Reads the stream next to the status socket `socket`, in a task of the current runtime, until the last receiver is dropped.
+pub fn follow(socket: &Path) -> Documents {
+    let (sender, receiver) = watch::channel(None);
+    let path = stream_path(socket);
+    tokio::spawn(async move {
+        tokio::select! {
+            () = read_for_ever(&path, &sender) => {}
+            () = sender.closed() => {}
+        }
+    });
+    receiver
+}
+
+async fn read_for_ever(path: &Path, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
+    let mut was_up = None;
+    loop {
+        let error = match read(path, sender, &mut was_up).await {
+            Ok(()) => explain(path, &io::ErrorKind::UnexpectedEof.into()),
+            Err(error) => explain(path, &error),
+        };
+        if was_up != Some(false) {
+            tracing::warn!(error, "no status of the daemon");
+        }
+        was_up = Some(false);
+        sender.send_if_modified(|document| document.take().is_some());
+        sleep(RETRY).await;
+    }
+}
+
+/// Reads one connection until its end.
+async fn read(
+    path: &Path,
+    sender: &watch::Sender<Option<Box<StatusDocument>>>,
+    was_up: &mut Option<bool>,
+) -> io::Result<()> {
+    let mut stream = BufReader::new(timeout(SILENCE, UnixStream::connect(path)).await??);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        let limit = u64::try_from(MAX_DOCUMENT_BYTES).unwrap_or(u64::MAX);
+        if timeout(SILENCE, (&mut stream).take(limit).read_until(b'\n', &mut line)).await?? == 0 {
+            return Ok(());
+        }
+        let document = parse(&line).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
+        if *was_up != Some(true) {
+            tracing::info!("the daemon reports its status");
+        }
+        *was_up = Some(true);
+        sender.send_replace(Some(Box::new(document)));
+    }
+}

@@ -1,0 +1,193 @@
+//! `packwatch-uplink mqtt` as its user runs it: the program, a real broker (Debian's mosquitto) on a port of the loopback, a reader
+//! (mosquitto_sub) with a session of its own, and a status socket fed by the test.
+
+mod rig;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::time::Duration;
+
+use rig::{Broker, Daemon, Reader, Uplink, document, fill, wait_for};
+use serde_json::Value;
+
+/// A link that tries again every second and takes every document as a sample.
+const EAGER: &str = "period_s = 1\nretry_max_s = 1\n[mqtt.history]\nperiod_s = 1\n";
+
+#[test]
+fn ninety_six_cells_are_published_in_millivolts_and_kept_for_late_readers() {
+    let (broker, daemon) = (Broker::start(""), Daemon::start());
+    let _uplink = Uplink::start(&broker, &daemon, EAGER);
+    let mut pack = document(96, 0);
+    pack["cells"][95]["voltage_v"] = Value::Null;
+    daemon.send(&pack);
+    wait_for("discovery", || Reader::retained(&broker, "homeassistant/#").len() == 153);
+    // Connects only now: what it gets is what the broker keeps.
+    let kept: BTreeMap<_, _> = Reader::retained(&broker, "packwatch/#").into_iter().collect();
+    assert_eq!(
+        kept.keys().collect::<Vec<_>>(),
+        ["packwatch/daemon", "packwatch/info", "packwatch/spec_data", "packwatch/status", "packwatch/uplink"]
+    );
+    assert_eq!((kept["packwatch/status"].as_str(), kept["packwatch/daemon"].as_str()), ("online", "online"));
+    let cells: Value = serde_json::from_str(&kept["packwatch/spec_data"]).unwrap();
+    let expected: Vec<Value> = (0..95).map(|cell| Value::from(3600 + cell)).chain([Value::Null]).collect();
+    assert_eq!(cells["cell_voltages_mv"], Value::from(expected));
+    assert_eq!((&cells["cell_voltages"][94], &cells["cell_voltages"][95]), (&Value::from(3.694), &Value::Null));
+    let info: Value = serde_json::from_str(&kept["packwatch/info"]).unwrap();
+    assert_eq!(
+        (&info["SOC"], &info["SOC_std"], &info["battery_current"]),
+        (&63.2.into(), &1.2.into(), &(-12.5).into())
+    );
+    // One voltage is not known: then the least and the greatest are not either.
+    assert_eq!((&info["cell_max_voltage"], &info["SOC_reported"]), (&Value::Null, &Value::Null));
+    assert_eq!(
+        info["alarms"],
+        serde_json::json!({ "capacity_low": true, "recharge_period_low": null, "soc_low": false })
+    );
+}
+
+#[test]
+fn the_last_will_says_that_the_uplink_is_gone_and_the_daemons_topic_that_it_is_silent() {
+    let (broker, daemon) = (Broker::start(""), Daemon::start());
+    let mut uplink = Uplink::start(&broker, &daemon, EAGER);
+    let status = |topic: &str| Reader::retained(&broker, topic).pop().map(|(_, text)| text).unwrap_or_default();
+    wait_for("online", || status("packwatch/status") == "online" && status("packwatch/daemon") == "offline");
+    daemon.send(&document(1, 0));
+    wait_for("a daemon", || status("packwatch/daemon") == "online");
+    daemon.hang_up();
+    wait_for("a silent daemon", || status("packwatch/daemon") == "offline" && status("packwatch/status") == "online");
+    uplink.kill();
+    wait_for("the last will", || status("packwatch/status") == "offline");
+
+    let mut uplink = Uplink::start(&broker, &daemon, EAGER);
+    wait_for("online again", || status("packwatch/status") == "online");
+    uplink.terminate();
+    assert_eq!(status("packwatch/status"), "offline");
+}
+
+#[test]
+fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
+    const HOUR: i64 = 3600;
+    let (mut broker, daemon) = (Broker::start(""), Daemon::start());
+    let reader = Reader::start(&broker, &["packwatch/history", "packwatch/events", "packwatch/info"]);
+    let mut uplink = Uplink::start(&broker, &daemon, EAGER);
+    daemon.send(&document(96, 0));
+    reader.wait_for_messages(4);
+    broker.stop();
+    for second in 1..=HOUR {
+        if second == HOUR / 2 {
+            uplink.kill();
+            uplink = uplink.restart();
+        }
+        let before = fill(&uplink).written;
+        daemon.send(&document(96, second));
+        wait_for("the disk", || fill(&uplink).written > before);
+    }
+    assert_eq!(fill(&uplink).messages, HOUR as u64, "all wait");
+    broker.restart();
+    wait_for("half of the queue", || fill(&uplink).messages < HOUR as u64 / 2);
+    uplink.kill();
+    let uplink = uplink.restart();
+    wait_for("the rest", || fill(&uplink).messages == 0);
+    daemon.send(&document(96, HOUR + 1));
+    reader.wait_for_topic_time("packwatch/info", HOUR + 1);
+
+    let messages = reader.messages();
+    let samples: Vec<&Value> =
+        messages.iter().filter(|(topic, _)| topic == "packwatch/history").map(|(_, value)| value).collect();
+    let mut latest = (0, 0);
+    for sample in &samples {
+        let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
+        // Once or more, none left out: the next one follows, or an earlier one is repeated.
+        assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
+        latest = latest.max(now);
+    }
+    assert_eq!((latest.1, samples.len() >= HOUR as usize), (HOUR + 1, true));
+    // Two power cuts repeat at most a window of messages each.
+    assert!(samples.len() <= HOUR as usize + 2 + 2 * 20, "{} samples", samples.len());
+    let current: Vec<i64> = messages
+        .iter()
+        .filter(|(topic, _)| topic == "packwatch/info")
+        .map(|(_, value)| rig::second_of(value))
+        .collect();
+    assert!(current.is_sorted(), "a current value is older than one before it: {current:?}");
+    assert_eq!(
+        messages.iter().filter(|(topic, _)| topic == "packwatch/events").count(),
+        2,
+        "events of the document, once"
+    );
+}
+
+#[test]
+fn a_full_queue_drops_the_oldest_samples_first_and_counts_them() {
+    let (mut broker, daemon) = (Broker::start(""), Daemon::start());
+    let reader = Reader::start(&broker, &["packwatch/history", "packwatch/events"]);
+    broker.stop();
+    let uplink = Uplink::start(&broker, &daemon, &format!("{EAGER}max_messages = 50\n"));
+    for second in 0..200 {
+        let before = fill(&uplink).written;
+        let mut pack = document(2, second);
+        pack["events"] = (0..=second / 10)
+            .map(|number| serde_json::json!({ "event": "gap", "seconds": number, "time": number }))
+            .collect();
+        daemon.send(&pack);
+        wait_for("the disk", || fill(&uplink).written > before);
+    }
+    assert_eq!(fill(&uplink).messages, 50);
+    broker.restart();
+    reader.wait_for_messages(50);
+    let messages = reader.messages();
+    let events: Vec<&Value> = messages
+        .iter()
+        .filter(|(topic, _)| topic == "packwatch/events")
+        .map(|(_, value)| &value["data"]["seconds"])
+        .collect();
+    assert_eq!(events, (0..20).map(Value::from).collect::<Vec<_>>().iter().collect::<Vec<_>>(), "no event is lost");
+    let samples: Vec<i64> = messages
+        .iter()
+        .filter(|(topic, _)| topic == "packwatch/history")
+        .map(|(_, value)| rig::second_of(value))
+        .collect();
+    assert_eq!(samples, (170..200).collect::<Vec<_>>(), "the newest samples are left");
+    wait_for("the count", || {
+        let uplink = Reader::retained(&broker, "packwatch/uplink").pop().map(|(_, text)| text).unwrap_or_default();
+        uplink == "{\"dropped_events\":0,\"dropped_samples\":170,\"queue_bytes\":0,\"queue_messages\":0}"
+    });
+}
+
+#[test]
+fn tls_needs_the_right_authority_and_a_wrong_password_is_said_and_tried_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    rig::make_certificates(folder.path());
+    fs::write(at("password"), "wrong\n").unwrap();
+    rig::make_password_file(folder.path(), "car", "s3cret");
+    let (ca, cert, key, passwords) = (at("ca.pem"), at("broker.pem"), at("broker.key"), at("passwords"));
+    let broker = Broker::start(&format!(
+        "cafile {ca}\ncertfile {cert}\nkeyfile {key}\npassword_file {passwords}\nallow_anonymous false\n"
+    ));
+    let daemon = Daemon::start();
+    let with = |ca: &str| {
+        format!(
+            "user = \"car\"\npassword_file = \"{}\"\nretry_max_s = 1\n[mqtt.tls]\nca_file = \"{ca}\"\n",
+            at("password")
+        )
+    };
+    let uplink = Uplink::start(&broker, &daemon, &with(&ca));
+    wait_for("the broker's refusal", || {
+        uplink.log().contains("the broker refuses user or password (mqtt.user, mqtt.password_file)")
+    });
+    std::thread::sleep(Duration::from_millis(2500));
+    assert_eq!(
+        uplink.log().matches("no connection to the broker").count(),
+        1,
+        "once, not at each attempt: {}",
+        uplink.log()
+    );
+    // With a line end, as an editor writes it. It is read again at each attempt.
+    fs::write(at("password"), "s3cret\r\n").unwrap();
+    wait_for("a connection", || uplink.log().contains("connected broker"));
+
+    let other = Uplink::start(&broker, &daemon, &with(&at("other.pem")));
+    wait_for("the fault of the certificate", || other.log().contains("UnknownIssuer"));
+    assert!(!other.log().contains("connected broker"));
+}
