@@ -79,6 +79,7 @@
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
 //! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
 //! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
+//! | a package: its files; its program and processor; all of them | `/systemd/tree`; `/systemd/program`, `/systemd/architectures`; `/systemd/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //!
 //! # Invariants

@@ -25,7 +25,8 @@ fn recipe() -> (String, String) {
 
 /// The words of the value of a variable, without the quotes.
 fn words<'a>(text: &'a str, variable: &str) -> Vec<&'a str> {
-    let (_, rest) = text.split_once(&format!("\n{variable} = \"")).unwrap_or_else(|| panic!("the recipe has no {variable}"));
+    let (_, rest) =
+        text.split_once(&format!("\n{variable} = \"")).unwrap_or_else(|| panic!("the recipe has no {variable}"));
     rest.split('"').next().unwrap().split_whitespace().filter(|word| *word != "\\").collect()
 }
 
