@@ -82,6 +82,7 @@
 //! | a value of a battery passport, its place in a standard; what a standard requires | `lab/passport/field.rs`, `lab/passport/condition.rs`; `lab/passport/standards.rs` |
 //! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
 //! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
+//! | a package: its files; its program and processor; all of them | `/systemd/tree`; `/systemd/program`, `/systemd/architectures`; `/systemd/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //!
 //! # Invariants

@@ -11,11 +11,17 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt;
+use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::time::FormatTime;
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
 use journald::Journal;
 use limit::RateLimit;
+
+use crate::io::clock::Reading;
+use crate::io::stamp::format_utc_micros;
+use crate::quantity::Timestamp;
 
 /// Environment variable with the filter, where `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
@@ -50,11 +56,20 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
-            let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi);
+            let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi).with_timer(WallClock);
             registry.with(lines.with_filter(RateLimit::default())).try_init()
         }
     };
     Ok(())
+}
+
+/// The time of a line, UTC to the microsecond. Not tracing's own: std's `SystemTime::now` panics from 2038 on processors of 32 bits with musl.
+struct WallClock;
+
+impl FormatTime for WallClock {
+    fn format_time(&self, line: &mut Writer<'_>) -> std::fmt::Result {
+        line.write_str(&format_utc_micros(Timestamp::from_nanos(Reading::now().realtime_ns)))
+    }
 }
 
 /// Reads a filter; `packwatch::MODULE` stands for that module of every member crate.

@@ -81,3 +81,4 @@ mod store_cli;
 mod support;
 #[cfg(feature = "lab")]
 mod whatif_cli;
+mod yocto_recipe;

@@ -1,0 +1,51 @@
+# The vehicle's program, built from the source tree that this layer lies in (EXTERNALSRC: another tree).
+#
+# The list of crates is generated, and not part of the sources: once, and after each change of Cargo.lock,
+#
+#   bitbake -c update_crates packwatch
+#
+# writes packwatch-crates.inc beside this file. tests/integration/yocto_recipe.rs holds this file to the sources.
+SUMMARY = "Battery health monitoring over SocketCAN, with alarms as CAN frames"
+DESCRIPTION = "Keeps an estimate of the state of charge of each cell, learns the capacity of each cell, and reports to other ECUs \
+in CAN frames when capacity or recharge period have fallen below a threshold."
+SECTION = "base"
+LICENSE = "MIT OR Apache-2.0"
+LIC_FILES_CHKSUM = "file://LICENSE-MIT;md5=c4f23983d45446869c7be3f69df2656b \
+                    file://LICENSE-APACHE;md5=3b83ef96387f14655fc854ddc3c6bd57"
+
+inherit cargo cargo-update-recipe-crates externalsrc systemd
+
+EXTERNALSRC ?= "${@os.path.realpath(d.getVar('THISDIR') + '/../../../../..')}"
+# Not `require`: the task that writes it must be able to run before.
+include ${BPN}-crates.inc
+
+# The profile and the features of the Debian package. The symbols stay here: bitbake itself moves them to packwatch-dbg.
+CARGO_PROFILE = "vehicle"
+export CARGO_PROFILE_VEHICLE_STRIP = "false"
+CARGO_BUILD_FLAGS:append = " --package packwatch --no-default-features"
+RUSTFLAGS:append = " --remap-path-prefix=${S}=/packwatch"
+
+do_configure:prepend() {
+    [ -e "${THISDIR}/${BPN}-crates.inc" ] || bbfatal "no list of crates, run: bitbake -c update_crates ${PN}"
+}
+
+# SQLite and zstd of the crates, with which the program is tested, and not those of the distribution.
+cargo_do_compile:prepend() {
+    unset LIBSQLITE3_SYS_USE_PKG_CONFIG ZSTD_SYS_USE_PKG_CONFIG
+}
+
+do_install:append() {
+    install -d ${D}${sysconfdir}/packwatch/cells ${D}${datadir}/packwatch/cells ${D}${systemd_system_unitdir}
+    install -m 0644 ${S}/config/example.toml ${D}${sysconfdir}/packwatch/packwatch.toml
+    install -m 0644 ${S}/config/pack96.dbc ${D}${sysconfdir}/packwatch/
+    install -m 0644 ${S}/config/cells/example_nmc_2600.toml ${D}${sysconfdir}/packwatch/cells/
+    install -m 0644 ${S}/config/packwatch.dbc ${D}${datadir}/packwatch/
+    install -m 0644 ${S}/config/cells/*.toml ${D}${datadir}/packwatch/cells/
+    install -m 0644 ${S}/systemd/packwatch.service ${S}/systemd/packwatch@.service ${S}/systemd/packwatch-exporter.service \
+        ${D}${systemd_system_unitdir}/
+}
+
+# The service has a dynamic user. As with the Debian package, nothing is enabled by installing.
+SYSTEMD_SERVICE:${PN} = "packwatch.service packwatch@.service packwatch-exporter.service"
+SYSTEMD_AUTO_ENABLE = "disable"
+CONFFILES:${PN} = "${sysconfdir}/packwatch/packwatch.toml ${sysconfdir}/packwatch/pack96.dbc ${sysconfdir}/packwatch/cells/example_nmc_2600.toml"
