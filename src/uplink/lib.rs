@@ -6,8 +6,16 @@
 //!
 //! | module | what lives there |
 //! | --- | --- |
+//! | `failure` | why a command ended, and its exit code |
+//! | `kuksa` | provider of a KUKSA databroker |
 //! | `settings` | the file of `-c`: TOML to checked settings |
 //! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
+//! | `vss` | the overlay of the vehicle signal specification |
 
+mod failure;
+pub mod kuksa;
 pub mod settings;
 pub mod status_stream;
+pub mod vss;
+
+pub use failure::Failure;

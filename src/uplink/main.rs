@@ -1,8 +1,10 @@
 //! The binary: parse, dispatch, exit code.
+#![expect(clippy::print_stderr, reason = "talking to the terminal is this program's work")]
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use packwatch_uplink::{kuksa, vss};
 
 /// What packwatch knows, for other software.
 #[derive(Debug, Parser)]
@@ -13,8 +15,23 @@ struct Cli {
 }
 
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    /// Provide the status of the running daemon to a KUKSA databroker
+    Kuksa(kuksa::Args),
+    /// Write the overlay of the vehicle signal specification for KUKSA
+    Vss(vss::Args),
+}
 
 fn main() -> ExitCode {
-    match Cli::parse().command {}
+    let result = match Cli::parse().command {
+        Command::Kuksa(args) => kuksa::run(&args),
+        Command::Vss(args) => vss::run(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("{}", failure.message);
+            ExitCode::from(failure.code)
+        }
+    }
 }

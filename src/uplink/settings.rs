@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use packwatch_host::status::standard_path;
 use serde::Deserialize;
 
+use crate::kuksa::settings::KuksaSettings;
+
 /// Longest file, bytes: a hundred times what a person writes.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -17,6 +19,8 @@ const MAX_BYTES: u64 = 1 << 20;
 pub struct Settings {
     /// Where the daemon's status comes from.
     pub status: StatusSettings,
+    /// The KUKSA databroker.
+    pub kuksa: KuksaSettings,
 }
 
 /// The daemon's status.
@@ -45,7 +49,9 @@ impl Settings {
             return Err(format!("{at}: {size} bytes, must be at most {MAX_BYTES}"));
         }
         let text = std::fs::read_to_string(path).map_err(|error| format!("{at}: {error}"))?;
-        Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))
+        let settings = Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))?;
+        settings.kuksa.check().map_err(|fault| format!("{at}: {fault}"))?;
+        Ok(settings)
     }
 
     /// Parses the text of a file; a fault begins with its line.
