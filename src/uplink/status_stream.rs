@@ -5,7 +5,7 @@
 //! A reader that is slower than the daemon gets the newest document; older ones are dropped, never queued.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use packwatch_host::status::client::{MAX_DOCUMENT_BYTES, explain, parse};
@@ -37,7 +37,7 @@ pub fn follow(socket: &Path) -> Documents {
     receiver
 }
 
-async fn read_for_ever(path: &PathBuf, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
+async fn read_for_ever(path: &Path, sender: &watch::Sender<Option<Box<StatusDocument>>>) {
     let mut was_up = None;
     loop {
         let error = match read(path, sender, &mut was_up).await {

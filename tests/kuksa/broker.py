@@ -4,6 +4,7 @@ Both are given the same VSS files, and both are read by kuksa-client. The strict
 """
 
 import concurrent.futures
+import contextlib
 import json
 import os
 import queue
@@ -70,6 +71,8 @@ class StrictBroker:
         self.changed = threading.Condition()
         self.provider: "queue.Queue | None" = None
         self.answers: queue.Queue = queue.Queue()
+        # The databroker 0.7 takes no values while a question waits for its answer.
+        self.lock = threading.Lock()
         self.pool = concurrent.futures.ThreadPoolExecutor(max_workers=16)
         # A fixed window of 64 KiB: what a provider can send to a broker that does not read.
         options = [("grpc.so_reuseport", 0), ("grpc.http2.bdp_probe", 0), ("grpc.http2.lookahead_bytes", 65_536)]
@@ -171,14 +174,16 @@ class V2(rpc_v2.VALServicer):
             for request in requests:
                 action = request.WhichOneof("action")
                 if action == "provide_signal_request":
-                    claimed |= set(request.provide_signal_request.signals_sample_intervals)
+                    with broker.lock:
+                        claimed |= set(request.provide_signal_request.signals_sample_intervals)
                     if unknown := claimed - set(broker.paths):
                         broker.violate(context, f"unknown ids {unknown}")
                     broker.provider = outgoing
                     outgoing.put(val_v2.OpenProviderStreamResponse(provide_signal_response=val_v2.ProvideSignalResponse()))
                     broker.may_read.wait()
                 elif action == "publish_values_request":
-                    broker.publish(request.publish_values_request.data_points, claimed, context)
+                    with broker.lock:
+                        broker.publish(request.publish_values_request.data_points, claimed, context)
                 elif action == "get_provider_value_response":
                     answer = request.get_provider_value_response
                     for number, point in answer.entries.items():
@@ -192,19 +197,20 @@ class V2(rpc_v2.VALServicer):
         outgoing.put(None)
 
     def GetValue(self, request, context):
-        """Asks the provider, as the databroker 0.7 does: its answer is the value."""
+        """As the databroker 0.7 does it: the provider's answer is the value, and without one within a second, the value it has.
+
+        An answer that comes later is taken for that to the next question.
+        """
         broker = self.broker
         broker.check_token(context)
-        path, provider = request.signal_id.path, broker.provider
-        if provider is not None:
-            question = val_v2.GetProviderValueRequest(request_id=0, signal_ids=[broker.ids[path]])
-            provider.put(val_v2.OpenProviderStreamResponse(get_provider_value_request=question))
-            answer = broker.answers.get(timeout=1)
-            if list(answer.entries) == [broker.ids[path]]:
-                return val_v2.GetValueResponse(data_point=answer.entries[broker.ids[path]])
-            if list(answer.entries):
-                broker.violate(context, f"asked for {path}, answered {answer.entries}")
-        return val_v2.GetValueResponse(data_point=broker.points[path])
+        path = request.signal_id.path
+        with broker.lock:
+            if (provider := broker.provider) is not None:
+                question = val_v2.GetProviderValueRequest(request_id=0, signal_ids=[broker.ids[path]])
+                provider.put(val_v2.OpenProviderStreamResponse(get_provider_value_request=question))
+                with contextlib.suppress(queue.Empty):
+                    return val_v2.GetValueResponse(data_point=next(iter(broker.answers.get(timeout=1).entries.values())))
+            return val_v2.GetValueResponse(data_point=broker.points[path])
 
     def Subscribe(self, request, context):
         broker = self.broker
@@ -253,17 +259,14 @@ class RealBroker:
 
     violations: list[str] = []
 
-    def __init__(self, port: int, files: list[Path], key: Path | None = None, tls: tuple[Path, Path] | None = None):
-        self.port = port
+    def __init__(self, port: int, files: list[Path], key: Path | None = None, tls: tuple[Path, Path] | None = None,
+                 unix: Path | None = None):
         command = [os.environ["PACKWATCH_DATABROKER"], "--address", "127.0.0.1", "--port", str(port), "--vss", ",".join(map(str, files))]
         command += ["--jwt-public-key", str(key)] if key else ["--disable-authorization"]
         command += ["--tls-cert", str(tls[0]), "--tls-private-key", str(tls[1])] if tls else ["--insecure"]
+        command += ["--unix-socket", str(unix)] if unix else []
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self.nodes = leaves(files)
-
-    def ids(self, client) -> dict[str, int]:
-        request = val_v2.ListMetadataRequest(root="Vehicle")
-        return {entry.path: entry.id for entry in client.client_stub_v2.ListMetadata(request).metadata}
 
     def stop(self) -> None:
         self.process.terminate()

@@ -65,8 +65,8 @@ impl Journal {
         }
     }
 
-    pub(crate) fn note_answer(&mut self, is_sent: bool) {
-        self.counts.unanswered += u64::from(!is_sent);
+    pub(crate) fn note_unanswered(&mut self, questions: u64) {
+        self.counts.unanswered += questions;
     }
 
     /// Logs the counts.

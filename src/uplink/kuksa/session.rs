@@ -10,16 +10,15 @@ use std::time::Duration;
 
 use packwatch_host::status::document::StatusDocument;
 use tokio::sync::watch;
-use tokio::time::{Instant, timeout};
+use tokio::time::{Instant, sleep_until, timeout};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint};
 use tonic::{Code, Status, Streaming};
 
 use super::journal::Journal;
-use super::messages::{
-    Client, Event, FromBroker, GetProviderValueRequest, GetProviderValueResponse, PublishValuesRequest,
-};
+use super::messages::{Client, Event, FromBroker, GetProviderValueResponse, PublishValuesRequest};
 use super::outgoing::Outbox;
+use super::questions::Questions;
 use super::routes::Routes;
 use super::settings::KuksaSettings;
 use super::signals::STANDARD_BRANCH;
@@ -56,9 +55,10 @@ pub(crate) async fn run(
                 let document = documents.borrow_and_update();
                 session.publish(document.as_deref(), journal);
             }
+            () = wait_until(session.questions.due()) => session.handle_time()?,
             message = session.incoming.message() => match message.map_err(|status| words(&status))? {
                 None => return Err("the broker ended the stream".to_owned()),
-                Some(message) => session.handle(&message, documents.borrow().as_deref(), journal),
+                Some(message) => session.handle(message, documents.borrow().as_deref(), journal),
             }
         }
     }
@@ -71,6 +71,7 @@ struct Session {
     routes: Routes,
     outbox: Outbox,
     incoming: Streaming<FromBroker>,
+    questions: Questions,
     request_id: u32,
 }
 
@@ -92,8 +93,7 @@ impl Session {
         let mut incoming = call("OpenProviderStream", client.open_provider_stream(messages)).await?;
         call("ProvideSignalRequest", accepted(&mut incoming)).await?;
         journal.note_connected(&settings.address, routes.len());
-        let session = Self { routes, outbox, incoming, request_id: 0 };
-        Ok(session)
+        Ok(Self { routes, outbox, incoming, questions: Questions::default(), request_id: 0 })
     }
 
     /// Sends a value of every signal; without a document, that there is none.
@@ -101,25 +101,37 @@ impl Session {
         let points = self.routes.points(document);
         journal.note_published(&points);
         self.request_id = self.request_id.wrapping_add(1);
+        self.questions.note_batch(self.request_id);
         self.outbox.publish(PublishValuesRequest { request_id: self.request_id, data_points: points.by_id });
     }
 
-    fn handle(&self, message: &FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
-        match &message.event {
-            Some(Event::Asked(question)) => self.answer(question, document, journal),
+    fn handle(&mut self, message: FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
+        let now = Instant::now();
+        match message.event {
+            Some(Event::Asked(question)) => journal.note_unanswered(u64::from(!self.questions.ask(question, now))),
+            Some(Event::Provided(_)) => self.questions.note_read(self.outbox.acknowledge()),
             Some(Event::Rejected(rejected)) => {
                 for (id, rejection) in &rejected.status {
                     journal.note_rejected(self.routes.name(*id).unwrap_or("an unknown id"), &rejection.message);
                 }
             }
-            Some(Event::Provided(_)) | None => {}
+            None => {}
+        }
+        let (questions, expired) = self.questions.take(now);
+        journal.note_unanswered(expired);
+        for (_, question) in questions {
+            let entries = self.routes.points_of(&question.signal_ids, document).by_id;
+            let answer = GetProviderValueResponse { request_id: question.request_id, entries };
+            journal.note_unanswered(u64::from(!self.outbox.answer(answer)));
         }
     }
 
-    fn answer(&self, question: &GetProviderValueRequest, document: Option<&StatusDocument>, journal: &mut Journal) {
-        let entries = self.routes.points_of(&question.signal_ids, document).by_id;
-        let answer = GetProviderValueResponse { request_id: question.request_id, entries };
-        journal.note_answer(self.outbox.answer(Instant::now(), answer));
+    /// Asks for the receipt of an answer when that is due.
+    fn handle_time(&mut self) -> Result<(), String> {
+        if self.questions.handle_time(Instant::now())? && !self.outbox.check() {
+            return Err("the broker reads no answers".to_owned());
+        }
+        Ok(())
     }
 
     /// Withdraws every value, and waits until the broker has had time to read that.
@@ -129,6 +141,14 @@ impl Session {
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
         // A broker that keeps its side open has read everything by then.
         let _ = timeout(FAREWELL, until_end).await;
+    }
+}
+
+/// Waits until then; for ever without a time.
+async fn wait_until(time: Option<Instant>) {
+    match time {
+        Some(time) => sleep_until(time).await,
+        None => std::future::pending().await,
     }
 }
 
