@@ -25,6 +25,7 @@
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, fleets, plots, import, discover (feature `lab`) |
+//! | `src/uplink` | `kuksa`, `vss` | program `packwatch-uplink`: the status for a KUKSA databroker, the overlay of VSS |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -61,6 +62,8 @@
 //! | what identifies the vehicle | `host/config/vehicle.rs` |
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
+//! | a signal of VSS or of its overlay | `uplink/kuksa/signals/standard.rs`, `own.rs` (the page: `packwatch vss --reference`) |
+//! | when a question of the databroker is answered; what is sent in which order | `uplink/kuksa/questions.rs`; `uplink/kuksa/outgoing.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
 //! | what is saved of a damaged database | `host/store/carve.rs` (rows by their layout), `host/store/salvage.rs` (checks, order) |
 //! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |

@@ -1,16 +1,19 @@
 //! `vss`: writes the overlay of the vehicle signal specification: the signals that VSS does not have.
 //!
 //! In: the settings' branch. Out: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and `packwatch.json`,
-//! which a databroker reads beside VSS's own file (`--vss vss.json,packwatch.json`).
+//! which a databroker reads beside VSS's own file (`--vss vss.json,packwatch.json`). `--reference` prints every signal as Markdown:
+//! the manual's page.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::path::PathBuf;
 
 use serde_json::{Map, Value, json};
 
 use crate::Failure;
-use crate::kuksa::signals::{self, STANDARD_BRANCH, Signal};
+use crate::kuksa::settings::KuksaSettings;
+use crate::kuksa::signals::{self, Origin, STANDARD_BRANCH, Signal};
 use crate::settings::Settings;
 
 /// Name of both files, before the ending.
@@ -20,11 +23,14 @@ const FILE_NAME: &str = "packwatch";
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Settings of the uplink
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
+    #[arg(short, long, value_name = "FILE", required_unless_present = "reference")]
+    config: Option<PathBuf>,
     /// Folder for packwatch.vspec and packwatch.json
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
+    /// Print every signal, those of VSS too, as a page of the manual, and write no file
+    #[arg(long)]
+    reference: bool,
 }
 
 /// Runs the command.
@@ -32,7 +38,12 @@ pub struct Args {
 /// # Errors
 /// When the settings are not usable, or a file cannot be written.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let branch = Settings::read(&args.config).map_err(Failure::config)?.kuksa.branch;
+    let Some(config) = args.config.as_ref().filter(|_| !args.reference) else {
+        return std::io::stdout()
+            .write_all(reference().as_bytes())
+            .map_err(|error| Failure::new(format!("output: {error}")));
+    };
+    let branch = Settings::read(config).map_err(Failure::config)?.kuksa.branch;
     for (ending, text) in [("vspec", vspec(&branch)), ("json", json_text(&branch))] {
         let path = args.output.join(format!("{FILE_NAME}.{ending}"));
         std::fs::write(&path, text).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
@@ -129,6 +140,30 @@ fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
             &mut parent["children"][name]
         }
     }
+}
+
+/// The page: a table of VSS's signals and one of the overlay's.
+fn reference() -> String {
+    let mut page = "# VSS signals\n\nA page of `packwatch vss --reference`. A signal has no value while the daemon is silent, while one of its fields \
+                    in the [status document](status.md) is unknown, or where a column says so. Cells count from 0; an array has a value only \
+                    when that of every cell is known, because VSS has no unknown number.\n"
+        .to_owned();
+    for (title, origin) in [("Of VSS itself", Origin::Standard), ("Of the overlay", Origin::Overlay)] {
+        let branch =
+            if origin == Origin::Standard { STANDARD_BRANCH.to_owned() } else { KuksaSettings::default().branch };
+        let _ = write!(page, "\n## {title}\n\nBelow `{branch}`.\n\n");
+        page.push_str("| signal | datatype | unit | status field | remark |\n| --- | --- | --- | --- | --- |\n");
+        for signal in signals::all().filter(|signal| signal.origin == origin) {
+            let Signal { name, data_type, fields, description, .. } = signal;
+            let _ = writeln!(
+                page,
+                "| `{name}` | {} | {} | `{fields}` | {description} |",
+                data_type.name(),
+                signal.unit.unwrap_or("")
+            );
+        }
+    }
+    page
 }
 
 #[cfg(test)]

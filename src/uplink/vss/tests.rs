@@ -60,3 +60,10 @@ fn names_follow_the_rules_of_vss() {
         assert_ne!(branch, Some(description("")), "{} has a branch without a description", signal.name);
     }
 }
+
+#[test]
+fn the_manual_has_every_signal() {
+    let page =
+        std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/src/reference/vss.md")).unwrap();
+    assert!(page == reference(), "regenerate it: packwatch vss --reference > docs/src/reference/vss.md");
+}
