@@ -25,7 +25,7 @@
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
-//! | `src/uplink` | `mqtt` | program `packwatch-uplink`: the status for MQTT brokers; no part of the vehicle's program |
+//! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -63,6 +63,8 @@
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | an entity of MQTT; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
+//! | a signal of VSS or of its overlay | `uplink/kuksa/signals/standard.rs`, `own.rs` (the page: `packwatch vss --reference`) |
+//! | when a question of the databroker is answered; what is sent in which order | `uplink/kuksa/questions.rs`; `uplink/kuksa/outgoing.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
 //! | what is saved of a damaged database | `host/store/carve.rs` (rows by their layout), `host/store/salvage.rs` (checks, order) |
 //! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use packwatch_host::status::standard_path;
 use serde::Deserialize;
 
+use crate::kuksa::settings::KuksaSettings;
 use crate::mqtt::settings::MqttSettings;
 
 /// Longest file, bytes: a hundred times what a person writes.
@@ -21,6 +22,8 @@ pub struct Settings {
     pub status: StatusSettings,
     /// The MQTT broker; `None` = `packwatch mqtt` has nothing to do.
     pub mqtt: Option<MqttSettings>,
+    /// The KUKSA databroker.
+    pub kuksa: KuksaSettings,
 }
 
 /// The daemon's status.
@@ -49,7 +52,9 @@ impl Settings {
             return Err(format!("{at}: {size} bytes, must be at most {MAX_BYTES}"));
         }
         let text = std::fs::read_to_string(path).map_err(|error| format!("{at}: {error}"))?;
-        Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))
+        let settings = Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))?;
+        settings.kuksa.check().map_err(|fault| format!("{at}: {fault}"))?;
+        Ok(settings)
     }
 
     /// Parses the text of a file; a fault begins with its line.
@@ -100,7 +105,10 @@ mod tests {
             _ => line,
         };
         let all: Vec<&str> = example.lines().map(uncomment).collect();
-        let mqtt = Settings::parse(&all.join("\n")).unwrap().mqtt.unwrap();
+        // A certificate is for an encrypted connection only.
+        let Settings { mqtt, kuksa, .. } = Settings::parse(&all.join("\n").replace("http://", "https://")).unwrap();
+        let mqtt = mqtt.unwrap();
+        assert!(kuksa.ca_file.is_some() && kuksa.server_name.is_some() && kuksa.token_file.is_some());
         assert!(mqtt.tls.unwrap().key_file.is_some() && mqtt.discovery.device_name.is_some() && mqtt.user.is_some());
     }
 

@@ -20,6 +20,7 @@ mkdir -p "$units"
 # systemd_prepare CONFIG: config/CONFIG becomes packwatch.toml. The units get no dependencies on a whole system.
 systemd_prepare() {
     install -D "${PACKWATCH_BIN:?names the program under test}" /usr/bin/packwatch
+    [[ ! -x ${PACKWATCH_BIN%/*}/packwatch-uplink ]] || install -D "${PACKWATCH_BIN%/*}/packwatch-uplink" /usr/bin/packwatch-uplink
     mkdir -p /etc/packwatch
     cp -r "$repository/config/." /etc/packwatch/
     cp "$repository/config/$1" /etc/packwatch/packwatch.toml

@@ -25,9 +25,11 @@ use tokio::sync::watch;
 
 use crate::settings::Settings;
 use crate::status_stream::follow;
+use crate::{Failure, Options};
 use link::Link;
 use queue::Queue;
 use recorder::Recorder;
+use settings::MqttSettings;
 
 /// Topics below the base topic: `info`, `spec_data`, `events` and `status` are Battery-Emulator's.
 pub mod topic {
@@ -55,9 +57,15 @@ pub const OFFLINE: &str = "offline";
 /// Runs until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// When the settings have no broker, or the queue cannot be opened.
-pub fn run(settings: &Settings) -> Result<(), String> {
-    let mqtt = settings.mqtt.as_ref().ok_or("no table [mqtt]")?;
+/// When the settings are not usable or have no broker, or the queue cannot be opened.
+pub fn run(options: &Options) -> Result<(), Failure> {
+    let settings = options.start()?;
+    let config = options.config.display();
+    let mqtt = settings.mqtt.as_ref().ok_or_else(|| Failure::config(format!("{config}: no table [mqtt]")))?;
+    serve(&settings, mqtt).map_err(|error| Failure::new(format!("{config}: {error}")))
+}
+
+fn serve(settings: &Settings, mqtt: &MqttSettings) -> Result<(), String> {
     if mqtt.password_file.is_some() && mqtt.tls.is_none() && !is_this_computer(&mqtt.host) {
         tracing::warn!(host = mqtt.host, "the password is sent in plain text: add a table [mqtt.tls]");
     }

@@ -1,0 +1,81 @@
+//! What is counted and logged: changes once, counts at the end of each connection.
+
+use std::collections::HashSet;
+
+use super::routes::{Points, Skipped};
+
+/// Most reasons that are remembered as logged: all signals, with a few reasons each. A broker that invents more is not logged further.
+const MAX_LOGGED: usize = 1000;
+
+/// Counts since the start of the program.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Connections whose claim was accepted.
+    pub(crate) connections: u64,
+    /// Batches made.
+    pub(crate) batches: u64,
+    /// Signals that a connection did not provide, over all connections.
+    pub(crate) skipped: u64,
+    /// Values withheld because they were outside the broker's limits.
+    pub(crate) withheld: u64,
+    /// Values rejected by the broker.
+    pub(crate) rejected: u64,
+    /// Questions of the broker without an answer.
+    pub(crate) unanswered: u64,
+}
+
+/// Counts, and what was logged.
+#[derive(Debug, Default)]
+pub(crate) struct Journal {
+    pub(crate) counts: Counts,
+    logged: HashSet<String>,
+    /// Signals outside the broker's limits in the latest batch.
+    outside: HashSet<&'static str>,
+}
+
+impl Journal {
+    pub(crate) fn note_connected(&mut self, address: &str, signals: usize) {
+        self.counts.connections += 1;
+        tracing::info!(address, signals, "the databroker takes values");
+    }
+
+    pub(crate) fn note_skipped(&mut self, skipped: Vec<Skipped>) {
+        for Skipped { path, reason } in skipped {
+            self.counts.skipped += 1;
+            if self.is_new(format!("{path} {reason}")) {
+                tracing::warn!(path, reason, "signal skipped");
+            }
+        }
+    }
+
+    pub(crate) fn note_published(&mut self, points: &Points) {
+        self.counts.batches += 1;
+        let outside: HashSet<_> = points.withheld.iter().copied().collect();
+        self.counts.withheld += u64::try_from(outside.len()).unwrap_or_default();
+        for signal in outside.difference(&self.outside) {
+            tracing::warn!(signal, "value outside the databroker's limits: sent as no value");
+        }
+        self.outside = outside;
+    }
+
+    pub(crate) fn note_rejected(&mut self, signal: &str, message: &str) {
+        self.counts.rejected += 1;
+        if self.is_new(format!("{signal} {message}")) {
+            tracing::warn!(signal, message, "the databroker rejects a value");
+        }
+    }
+
+    pub(crate) fn note_unanswered(&mut self, questions: u64) {
+        self.counts.unanswered += questions;
+    }
+
+    /// Logs the counts.
+    pub(crate) fn summarise(&self) {
+        let Counts { connections, batches, skipped, withheld, rejected, unanswered } = self.counts;
+        tracing::info!(connections, batches, skipped, withheld, rejected, unanswered, "counts since the start");
+    }
+
+    fn is_new(&mut self, text: String) -> bool {
+        self.logged.len() < MAX_LOGGED && self.logged.insert(text)
+    }
+}

@@ -1,0 +1,263 @@
+//! The part of the protocol `kuksa.val.v2` that a provider of values needs: messages and three calls.
+//!
+//! Written by hand: the generated client of the KUKSA project compiles protoc, a C++ program, at every build. Fields that this program
+//! does not read are left out; protobuf skips them. Field numbers are those of the published protocol.
+
+use std::collections::BTreeMap;
+
+use tokio_stream::Stream;
+use tonic::client::Grpc;
+use tonic::codegen::http::uri::PathAndQuery;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::transport::Channel;
+use tonic::{IntoStreamingRequest, Request, Status, Streaming};
+use tonic_prost::ProstCodec;
+
+/// A time stamp: seconds since 1970 and nanoseconds.
+#[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
+pub(crate) struct Timestamp {
+    #[prost(int64, tag = "1")]
+    pub(crate) seconds: i64,
+    #[prost(int32, tag = "2")]
+    pub(crate) nanos: i32,
+}
+
+/// A value with its time; without `value` it says that there is none.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct Datapoint {
+    #[prost(message, optional, tag = "1")]
+    pub(crate) timestamp: Option<Timestamp>,
+    #[prost(message, optional, tag = "2")]
+    pub(crate) value: Option<Value>,
+}
+
+/// A value; without a type it is none.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct Value {
+    #[prost(oneof = "TypedValue", tags = "11, 12, 13, 14, 15, 16, 17, 18, 21, 22, 25, 27")]
+    pub(crate) typed: Option<TypedValue>,
+}
+
+/// The types that this program sends, or reads as limits.
+#[derive(Clone, PartialEq, prost::Oneof)]
+pub(crate) enum TypedValue {
+    #[prost(string, tag = "11")]
+    Text(String),
+    #[prost(bool, tag = "12")]
+    Flag(bool),
+    #[prost(sint32, tag = "13")]
+    Int32(i32),
+    #[prost(sint64, tag = "14")]
+    Int64(i64),
+    #[prost(uint32, tag = "15")]
+    Uint32(u32),
+    #[prost(uint64, tag = "16")]
+    Uint64(u64),
+    #[prost(float, tag = "17")]
+    Float(f32),
+    #[prost(double, tag = "18")]
+    Double(f64),
+    #[prost(message, tag = "21")]
+    Texts(Texts),
+    #[prost(message, tag = "22")]
+    Flags(Flags),
+    #[prost(message, tag = "25")]
+    Numbers(Numbers),
+    #[prost(message, tag = "27")]
+    Floats(Floats),
+}
+
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct Texts {
+    #[prost(string, repeated, tag = "1")]
+    pub(crate) values: Vec<String>,
+}
+
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct Flags {
+    #[prost(bool, repeated, tag = "1")]
+    pub(crate) values: Vec<bool>,
+}
+
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct Numbers {
+    #[prost(uint32, repeated, tag = "1")]
+    pub(crate) values: Vec<u32>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct Floats {
+    #[prost(float, repeated, tag = "1")]
+    pub(crate) values: Vec<f32>,
+}
+
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct ListMetadataRequest {
+    #[prost(string, tag = "1")]
+    pub(crate) root: String,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct ListMetadataResponse {
+    #[prost(message, repeated, tag = "1")]
+    pub(crate) metadata: Vec<Metadata>,
+}
+
+/// What the broker knows of a signal.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct Metadata {
+    #[prost(string, tag = "9")]
+    pub(crate) path: String,
+    /// Valid until the broker's next start.
+    #[prost(int32, tag = "10")]
+    pub(crate) id: i32,
+    /// Number of the VSS datatype.
+    #[prost(int32, tag = "11")]
+    pub(crate) data_type: i32,
+    #[prost(message, optional, tag = "17")]
+    pub(crate) allowed: Option<Value>,
+    #[prost(message, optional, tag = "18")]
+    pub(crate) min: Option<Value>,
+    #[prost(message, optional, tag = "19")]
+    pub(crate) max: Option<Value>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
+pub(crate) struct SampleInterval {
+    #[prost(uint32, tag = "1")]
+    pub(crate) interval_ms: u32,
+}
+
+/// Claims signals: no other program may provide them while the stream is open.
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct ProvideSignalRequest {
+    #[prost(btree_map = "int32, message", tag = "1")]
+    pub(crate) signals: BTreeMap<i32, SampleInterval>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct PublishValuesRequest {
+    #[prost(uint32, tag = "1")]
+    pub(crate) request_id: u32,
+    #[prost(btree_map = "int32, message", tag = "2")]
+    pub(crate) data_points: BTreeMap<i32, Datapoint>,
+}
+
+/// Answer to a question of the broker, see [`GetProviderValueRequest`].
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct GetProviderValueResponse {
+    #[prost(uint32, tag = "1")]
+    pub(crate) request_id: u32,
+    #[prost(btree_map = "int32, message", tag = "2")]
+    pub(crate) entries: BTreeMap<i32, Datapoint>,
+}
+
+/// A message to the broker.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct ToBroker {
+    #[prost(oneof = "Action", tags = "2, 4, 6")]
+    pub(crate) action: Option<Action>,
+}
+
+#[derive(Clone, PartialEq, prost::Oneof)]
+pub(crate) enum Action {
+    #[prost(message, tag = "2")]
+    Publish(PublishValuesRequest),
+    #[prost(message, tag = "4")]
+    Provide(ProvideSignalRequest),
+    #[prost(message, tag = "6")]
+    Answer(GetProviderValueResponse),
+}
+
+/// The broker lacks nothing to accept the claim.
+#[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
+pub(crate) struct ProvideSignalResponse {}
+
+/// Values that the broker rejected; it sends nothing for those that it accepted.
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct PublishValuesResponse {
+    #[prost(uint32, tag = "1")]
+    pub(crate) request_id: u32,
+    #[prost(btree_map = "int32, message", tag = "2")]
+    pub(crate) status: BTreeMap<i32, Rejection>,
+}
+
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct Rejection {
+    #[prost(int32, tag = "1")]
+    pub(crate) code: i32,
+    #[prost(string, tag = "2")]
+    pub(crate) message: String,
+}
+
+/// A reader of the broker asks for values; the broker passes that on and waits a second.
+#[derive(Clone, PartialEq, Eq, prost::Message)]
+pub(crate) struct GetProviderValueRequest {
+    #[prost(uint32, tag = "1")]
+    pub(crate) request_id: u32,
+    #[prost(int32, repeated, tag = "2")]
+    pub(crate) signal_ids: Vec<i32>,
+}
+
+/// A message of the broker. Filters (tag 5) are ignored: every document is published, because other readers see the same values.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct FromBroker {
+    #[prost(oneof = "Event", tags = "2, 4, 6")]
+    pub(crate) event: Option<Event>,
+}
+
+#[derive(Clone, PartialEq, prost::Oneof)]
+pub(crate) enum Event {
+    #[prost(message, tag = "2")]
+    Rejected(PublishValuesResponse),
+    #[prost(message, tag = "4")]
+    Provided(ProvideSignalResponse),
+    #[prost(message, tag = "6")]
+    Asked(GetProviderValueRequest),
+}
+
+/// The calls, over one connection.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    grpc: Grpc<Channel>,
+    authorization: Option<MetadataValue<Ascii>>,
+}
+
+impl Client {
+    /// `authorization` is sent with every call.
+    pub(crate) fn new(channel: Channel, authorization: Option<MetadataValue<Ascii>>) -> Self {
+        Self { grpc: Grpc::new(channel), authorization }
+    }
+
+    /// Lists the signals at and below `root`.
+    pub(crate) async fn list_metadata(&mut self, root: &str) -> Result<Vec<Metadata>, Status> {
+        let mut request = Request::new(ListMetadataRequest { root: root.to_owned() });
+        self.authorize(&mut request);
+        self.ready().await?;
+        let path = PathAndQuery::from_static("/kuksa.val.v2.VAL/ListMetadata");
+        let response = self.grpc.unary(request, path, ProstCodec::<_, ListMetadataResponse>::default()).await?;
+        Ok(response.into_inner().metadata)
+    }
+
+    /// Opens the stream of a provider.
+    pub(crate) async fn open_provider_stream(
+        &mut self,
+        messages: impl Stream<Item = ToBroker> + Send + 'static,
+    ) -> Result<Streaming<FromBroker>, Status> {
+        let mut request = messages.into_streaming_request();
+        self.authorize(&mut request);
+        self.ready().await?;
+        let path = PathAndQuery::from_static("/kuksa.val.v2.VAL/OpenProviderStream");
+        Ok(self.grpc.streaming(request, path, ProstCodec::default()).await?.into_inner())
+    }
+
+    async fn ready(&mut self) -> Result<(), Status> {
+        self.grpc.ready().await.map_err(|error| Status::unavailable(error.to_string()))
+    }
+
+    fn authorize<T>(&self, request: &mut Request<T>) {
+        if let Some(authorization) = &self.authorization {
+            request.metadata_mut().insert("authorization", authorization.clone());
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! Which id of the broker belongs to which signal, for one connection.
+//!
+//! In: the broker's metadata; status documents. Out: the claim and data points by id. A signal has a route only when the broker has its
+//! path with the same datatype under an id of its own. Ids change at each start of the broker, so routes end with their connection.
+//! A value outside the broker's limits is withheld: its data point has no value.
+
+use std::collections::{BTreeMap, HashMap};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use packwatch_host::quantity::Timestamp as StatusTime;
+use packwatch_host::status::document::StatusDocument;
+
+use super::messages::{Datapoint, Metadata, ProvideSignalRequest, SampleInterval, Timestamp, Value};
+use super::signals::{self, Signal};
+use super::value::{Limits, limit, type_name};
+
+/// Period of the values, ms: that of the daemon's documents.
+const PERIOD_MS: u32 = 1000;
+const NANOS_PER_SECOND: i64 = 1_000_000_000;
+
+/// One signal and where its value goes.
+#[derive(Debug)]
+struct Route {
+    signal: &'static Signal,
+    limits: Limits,
+}
+
+/// A signal that this connection does not provide.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Skipped {
+    pub(crate) path: String,
+    /// Why.
+    pub(crate) reason: String,
+}
+
+/// Data points for the broker.
+#[derive(Debug, Default)]
+pub(crate) struct Points {
+    pub(crate) by_id: BTreeMap<i32, Datapoint>,
+    /// Signals whose values are outside the broker's limits.
+    pub(crate) withheld: Vec<&'static str>,
+}
+
+/// The routes of one connection.
+#[derive(Debug)]
+pub(crate) struct Routes {
+    by_id: BTreeMap<i32, Route>,
+}
+
+impl Routes {
+    /// Finds every signal in the broker's metadata; the overlay's are below `branch`.
+    pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<Skipped>) {
+        let mut uses: HashMap<i32, usize> = HashMap::new();
+        let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
+        for entry in metadata {
+            // The overlay's branch may be below the standard one: then its signals are listed twice.
+            if by_path.insert(&entry.path, entry).is_none_or(|earlier| earlier.id != entry.id) {
+                *uses.entry(entry.id).or_default() += 1;
+            }
+        }
+        let (mut by_id, mut skipped) = (BTreeMap::new(), Vec::new());
+        for signal in signals::all() {
+            let path = signal.path(branch);
+            let found = by_path.get(path.as_str()).copied();
+            match found
+                .ok_or_else(|| "the broker does not have it".to_owned())
+                .and_then(|entry| check(signal, entry, &uses))
+            {
+                Ok((id, route)) => drop(by_id.insert(id, route)),
+                Err(reason) => skipped.push(Skipped { path, reason }),
+            }
+        }
+        (Self { by_id }, skipped)
+    }
+
+    /// Number of signals.
+    pub(crate) fn len(&self) -> usize {
+        self.by_id.len()
+    }
+
+    /// Name of the signal with this id.
+    pub(crate) fn name(&self, id: i32) -> Option<&'static str> {
+        self.by_id.get(&id).map(|route| route.signal.name)
+    }
+
+    /// Claims every signal.
+    pub(crate) fn claim(&self) -> ProvideSignalRequest {
+        let interval = SampleInterval { interval_ms: PERIOD_MS };
+        ProvideSignalRequest { signals: self.by_id.keys().map(|id| (*id, interval)).collect() }
+    }
+
+    /// A data point for every signal; without a document none has a value.
+    pub(crate) fn points(&self, document: Option<&StatusDocument>) -> Points {
+        self.points_of(self.by_id.keys(), document)
+    }
+
+    /// A data point for each of these ids that this connection provides.
+    pub(crate) fn points_of<'a>(
+        &self,
+        ids: impl IntoIterator<Item = &'a i32>,
+        document: Option<&StatusDocument>,
+    ) -> Points {
+        let timestamp = Some(document.map_or_else(now, |document| timestamp(document.wall_time)));
+        let mut points = Points::default();
+        for (id, route) in ids.into_iter().filter_map(|id| self.by_id.get_key_value(id)) {
+            let value =
+                document.and_then(route.signal.value).filter(|value| value.data_type() == route.signal.data_type);
+            let is_withheld = value.as_ref().is_some_and(|value| !value.is_within(route.limits));
+            if is_withheld {
+                points.withheld.push(route.signal.name);
+            }
+            let value = value.filter(|_| !is_withheld).map(|value| Value { typed: Some(value.into_message()) });
+            points.by_id.insert(*id, Datapoint { timestamp, value });
+        }
+        points
+    }
+}
+
+/// The route to the broker's entry of the signal's path.
+fn check(signal: &'static Signal, entry: &Metadata, uses: &HashMap<i32, usize>) -> Result<(i32, Route), String> {
+    if entry.data_type != signal.data_type.code() {
+        let (found, expected) = (type_name(entry.data_type), signal.data_type.name());
+        return Err(format!("the broker has it as {found}, this program as {expected}"));
+    }
+    if uses.get(&entry.id).is_some_and(|uses| *uses > 1) {
+        return Err(format!("the broker has its id {} for another signal too", entry.id));
+    }
+    if entry.allowed.as_ref().is_some_and(|allowed| allowed.typed.is_some()) {
+        return Err("the broker allows listed values only, so \"no value\" could not replace one".to_owned());
+    }
+    let limits = Limits { min: limit(entry.min.as_ref()), max: limit(entry.max.as_ref()) };
+    Ok((entry.id, Route { signal, limits }))
+}
+
+fn timestamp(time: StatusTime) -> Timestamp {
+    let nanos = time.nanos();
+    let rest = i32::try_from(nanos.rem_euclid(NANOS_PER_SECOND)).unwrap_or_default();
+    Timestamp { seconds: nanos.div_euclid(NANOS_PER_SECOND), nanos: rest }
+}
+
+fn now() -> Timestamp {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    Timestamp {
+        seconds: i64::try_from(since.as_secs()).unwrap_or(i64::MAX),
+        nanos: i32::try_from(since.subsec_nanos()).unwrap_or_default(),
+    }
+}
+
+#[cfg(test)]
+#[path = "routes/tests.rs"]
+mod tests;

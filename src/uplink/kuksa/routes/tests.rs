@@ -1,0 +1,96 @@
+use packwatch_host::status::client::parse;
+
+use super::super::messages::{Texts, TypedValue};
+use super::*;
+
+const BRANCH: &str = "Vehicle.Powertrain.TractionBattery.Packwatch";
+const HEALTH: &str = "Vehicle.Powertrain.TractionBattery.StateOfHealth";
+const CHARGE: &str = "Vehicle.Powertrain.TractionBattery.StateOfCharge.Current";
+
+fn document() -> StatusDocument {
+    parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap()
+}
+
+fn float(number: f32) -> Value {
+    Value { typed: Some(TypedValue::Float(number)) }
+}
+
+/// Both are percent from 0 to 100.
+fn entry(path: &str, id: i32) -> Metadata {
+    let (min, max) = (Some(float(0.0)), Some(float(100.0)));
+    Metadata { path: path.into(), id, data_type: 11, allowed: None, min, max }
+}
+
+fn reason(metadata: &[Metadata], path: &str) -> String {
+    let (routes, skipped) = Routes::resolve(metadata, BRANCH);
+    assert_eq!(routes.len() + skipped.len(), signals::all().count());
+    skipped.into_iter().find(|skipped| skipped.path == path).map(|skipped| skipped.reason).unwrap_or_default()
+}
+
+fn sent(points: &Points, id: i32) -> Option<f32> {
+    match points.by_id[&id].value.as_ref()?.typed.as_ref()? {
+        TypedValue::Float(number) => Some(*number),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_value_goes_to_the_id_of_its_own_path() {
+    for (health, charge) in [(7, 8), (8, 7)] {
+        let (routes, _) = Routes::resolve(&[entry(HEALTH, health), entry(CHARGE, charge)], BRANCH);
+        let points = routes.points(Some(&document()));
+        assert_eq!((sent(&points, health), sent(&points, charge)), (Some(92.8), Some(63.2)));
+        assert_eq!(routes.claim().signals.keys().copied().collect::<Vec<_>>(), [7, 8]);
+    }
+}
+
+#[test]
+fn a_path_that_is_missing_or_of_another_datatype_is_skipped() {
+    let other = Metadata { data_type: 7, ..entry(HEALTH, 1) };
+    assert_eq!(reason(&[other], HEALTH), "the broker has it as uint8, this program as float");
+    assert_eq!(reason(&[], CHARGE), "the broker does not have it");
+    assert_eq!(reason(&[entry(HEALTH, 1)], HEALTH), "");
+}
+
+#[test]
+fn a_path_whose_value_could_not_be_withdrawn_is_skipped() {
+    let listed = Value { typed: Some(TypedValue::Texts(Texts { values: vec!["valid".into()] })) };
+    let path = format!("{BRANCH}.Validity");
+    let validity = Metadata { path: path.clone(), id: 3, data_type: 1, allowed: Some(listed), min: None, max: None };
+    assert!(reason(&[validity], &path).starts_with("the broker allows listed values only"));
+}
+
+#[test]
+fn an_id_of_two_paths_is_used_for_neither() {
+    let twice = [entry(HEALTH, 5), entry(CHARGE, 5)];
+    assert!(reason(&twice, HEALTH).contains("its id 5 for another signal"));
+    assert!(reason(&twice, CHARGE).contains("its id 5 for another signal"));
+    assert_eq!(reason(&[entry(HEALTH, 5), entry("Vehicle.Speed", 6), entry(HEALTH, 5)], HEALTH), "", "listed twice");
+}
+
+#[test]
+fn a_value_outside_the_limits_is_no_value() {
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7)], BRANCH);
+    let mut status = document();
+    status.pack.soh = Some(1.02);
+    let points = routes.points(Some(&status));
+    assert_eq!((sent(&points, 7), points.withheld), (None, vec!["StateOfHealth"]));
+    status.pack.soh = Some(1.0);
+    let points = routes.points(Some(&status));
+    assert_eq!((sent(&points, 7), points.withheld.len()), (Some(100.0), 0));
+}
+
+#[test]
+fn without_a_document_every_signal_has_a_point_without_a_value() {
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
+    let points = routes.points(None);
+    assert_eq!(points.by_id.len(), 2);
+    assert!(points.by_id.values().all(|point| point.value.is_none() && point.timestamp.is_some()));
+}
+
+#[test]
+fn a_question_is_answered_for_own_ids_only() {
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
+    let points = routes.points_of(&[8, 99], Some(&document()));
+    assert_eq!(points.by_id.keys().copied().collect::<Vec<_>>(), [8]);
+}

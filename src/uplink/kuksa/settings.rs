@@ -1,0 +1,143 @@
+//! The table `[kuksa]`.
+
+use std::net::IpAddr;
+use std::path::PathBuf;
+
+use serde::Deserialize;
+
+use super::signals::STANDARD_BRANCH;
+
+/// Longest branch, bytes: the databroker reads paths of up to 1,000.
+const MAX_BRANCH_BYTES: usize = 200;
+
+/// The databroker, and where the overlay's signals are.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct KuksaSettings {
+    /// `http://HOST:PORT`, `https://HOST:PORT` or `unix:PATH`.
+    pub address: String,
+    /// Certificates (PEM) that the databroker's must descend from; with `https` only, and needed there.
+    pub ca_file: Option<PathBuf>,
+    /// Name in the databroker's certificate, where it is not the host of `address`.
+    pub server_name: Option<String>,
+    /// File with the token (JWT) that allows to provide the signals.
+    pub token_file: Option<PathBuf>,
+    /// Branch of the overlay's signals.
+    pub branch: String,
+}
+
+impl Default for KuksaSettings {
+    fn default() -> Self {
+        Self {
+            address: "http://127.0.0.1:55555".to_owned(),
+            ca_file: None,
+            server_name: None,
+            token_file: None,
+            branch: format!("{STANDARD_BRANCH}.Packwatch"),
+        }
+    }
+}
+
+impl KuksaSettings {
+    /// Checks what one key alone, or several together, may be.
+    ///
+    /// # Errors
+    /// Names the key, what was found and what is allowed.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        let address = &self.address;
+        let (scheme, rest) = address.split_once(':').unwrap_or_default();
+        let host = rest.strip_prefix("//").filter(|host| !host.is_empty() && !host.contains('/'));
+        match (scheme, host) {
+            ("http" | "https", Some(_)) => {}
+            ("unix", _) if rest.trim_start_matches("//").starts_with('/') => {}
+            _ => {
+                return Err(format!(
+                    "kuksa.address = \"{address}\", must be http://HOST:PORT, https://HOST:PORT or unix:/PATH"
+                ));
+            }
+        }
+        let is_tls = scheme == "https";
+        if is_tls != self.ca_file.is_some() {
+            return Err(format!(
+                "kuksa.ca_file must be given with https://, and only then; kuksa.address is \"{address}\""
+            ));
+        }
+        if self.server_name.is_some() && !is_tls {
+            return Err(format!("kuksa.server_name is for https:// only; kuksa.address is \"{address}\""));
+        }
+        if self.token_file.is_some() && scheme == "http" && !host.is_some_and(is_loopback) {
+            return Err(format!(
+                "kuksa.token_file: the network could read the token; kuksa.address = \"{address}\", must be https://"
+            ));
+        }
+        self.check_branch()
+    }
+
+    fn check_branch(&self) -> Result<(), String> {
+        let branch = &self.branch;
+        let is_name = |name: &str| {
+            name.starts_with(|first: char| first.is_ascii_uppercase())
+                && name.chars().all(|letter| letter.is_ascii_alphanumeric())
+        };
+        let is_allowed = branch.starts_with("Vehicle.") && branch.split('.').all(is_name) && branch != STANDARD_BRANCH;
+        if is_allowed && branch.len() <= MAX_BRANCH_BYTES {
+            return Ok(());
+        }
+        Err(format!(
+            "kuksa.branch = \"{branch}\", must be a branch of its own below Vehicle, at most {MAX_BRANCH_BYTES} bytes, each part a \
+             capital letter, then letters and digits"
+        ))
+    }
+}
+
+/// Whether the host of `HOST:PORT` is this computer.
+fn is_loopback(authority: &str) -> bool {
+    let host = authority.rsplit_once(':').map_or(authority, |(host, _)| host);
+    let address: Result<IpAddr, _> = host.trim_start_matches('[').trim_end_matches(']').parse();
+    host == "localhost" || address.is_ok_and(|address| address.is_loopback())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fault(text: &str) -> String {
+        let settings: KuksaSettings = toml::from_str(text).unwrap();
+        settings.check().err().unwrap_or_default()
+    }
+
+    #[test]
+    fn addresses_and_branches_that_work_are_accepted() {
+        for text in [
+            "",
+            "address = 'http://databroker:55555'",
+            "address = 'unix:/run/kuksa/databroker.sock'\ntoken_file = '/t'",
+            "address = 'unix:///run/kuksa/databroker.sock'",
+            "address = 'https://10.0.0.1:55555'\nca_file = '/ca.pem'\nserver_name = 'Server'\ntoken_file = '/t'",
+            "token_file = '/t'",
+            "address = 'http://[::1]:55555'\ntoken_file = '/t'",
+            "branch = 'Vehicle.Private.Packwatch2'",
+        ] {
+            assert_eq!(fault(text), "", "{text}");
+        }
+    }
+
+    #[test]
+    fn a_fault_names_the_key_and_what_is_allowed() {
+        for (text, expected) in [
+            ("address = '127.0.0.1:55555'", "kuksa.address = \"127.0.0.1:55555\", must be"),
+            ("address = 'http://a/b'", "kuksa.address"),
+            ("address = 'unix:relative'", "kuksa.address"),
+            ("address = 'https://a:1'", "kuksa.ca_file must be given with https://"),
+            ("ca_file = '/ca.pem'", "kuksa.ca_file must be given with https://"),
+            ("server_name = 'x'", "kuksa.server_name is for https:// only"),
+            ("address = 'http://10.0.0.1:1'\ntoken_file = '/t'", "kuksa.token_file: the network could read the token"),
+            ("branch = 'Vehicle.Powertrain.TractionBattery'", "kuksa.branch"),
+            ("branch = 'Vehicle.private'", "kuksa.branch"),
+            ("branch = 'Vehicle..A'", "kuksa.branch"),
+            ("branch = 'Car.Battery'", "kuksa.branch"),
+        ] {
+            assert!(fault(text).starts_with(expected), "{text}: {}", fault(text));
+        }
+    }
+}

@@ -1,0 +1,116 @@
+use std::collections::BTreeSet;
+
+use packwatch_host::status::client::parse;
+
+use super::*;
+
+/// The document of the test with real clients: every value is known.
+fn document() -> StatusDocument {
+    parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap()
+}
+
+fn value(document: &StatusDocument, name: &str) -> Option<Value> {
+    let signal = all().find(|signal| signal.name == name).unwrap();
+    (signal.value)(document)
+}
+
+#[test]
+fn every_signal_has_a_value_of_its_datatype_when_everything_is_known() {
+    let document = document();
+    let mut names = BTreeSet::new();
+    for signal in all() {
+        let value = (signal.value)(&document);
+        assert_eq!(value.map(|value| value.data_type()), Some(signal.data_type), "{}", signal.name);
+        assert!(names.insert((signal.name, signal.origin == Origin::Standard)), "{} twice", signal.name);
+    }
+}
+
+#[test]
+fn currents_have_the_sign_of_vss() {
+    let mut document = document();
+    assert_eq!(value(&document, "CurrentCurrent"), Some(Value::Float(-12.5)));
+    let Some(Value::Float(power_w)) = value(&document, "CurrentPower") else { panic!("no power") };
+    assert!(power_w < -180.0, "a discharge takes power out of the battery: {power_w}");
+    assert_eq!(value(&document, "CurrentSensor.Offset"), Some(Value::Float(0.034)));
+    assert_eq!(
+        value(&document, "Cells.Current")
+            .map(|value| matches!(value, Value::Floats(all) if all.iter().all(|a| *a < 0.0))),
+        Some(true)
+    );
+    document.pack.current_a = Some(0.0);
+    let Some(Value::Float(rest_a)) = value(&document, "CurrentCurrent") else { panic!("no current") };
+    assert!(rest_a.is_sign_positive(), "-0 A");
+}
+
+#[test]
+fn one_unknown_cell_leaves_no_number_of_all_cells() {
+    let mut document = document();
+    document.cells[2].voltage_v = None;
+    for name in
+        ["CellVoltage.CellVoltages", "CellVoltage.Min", "CellVoltage.IdMin", "CellVoltage.Max", "CellVoltage.IdMax"]
+    {
+        assert_eq!(value(&document, name), None, "{name}");
+    }
+    assert!(value(&document, "Temperature.CellTemperature").is_some());
+    document.cells[1].temperature_c = None;
+    for name in ["Temperature.CellTemperature", "Temperature.Average", "Temperature.Min"] {
+        assert_eq!(value(&document, name), None, "{name}");
+    }
+}
+
+#[test]
+fn a_cell_that_is_missing_does_not_move_the_others_to_its_place() {
+    let mut document = document();
+    document.cells.remove(1);
+    for signal in all().filter(|signal| matches!(signal.data_type, DataType::Floats | DataType::Flags)) {
+        assert_eq!((signal.value)(&document), None, "{}", signal.name);
+    }
+    document.cells.clear();
+    assert_eq!(value(&document, "Cells.Capacity"), None);
+}
+
+#[test]
+fn the_extreme_cells_are_the_first_of_their_voltage() {
+    let mut document = document();
+    for (cell, voltage_v) in document.cells.iter_mut().zip([3.5, 3.25, 3.75, 3.25]) {
+        cell.voltage_v = Some(voltage_v);
+    }
+    assert_eq!(value(&document, "CellVoltage.Min"), Some(Value::Float(3.25)));
+    assert_eq!(value(&document, "CellVoltage.IdMin"), Some(Value::Uint16(1)));
+    assert_eq!(value(&document, "CellVoltage.Max"), Some(Value::Float(3.75)));
+    assert_eq!(value(&document, "CellVoltage.IdMax"), Some(Value::Uint16(2)));
+}
+
+#[test]
+fn no_alarm_means_healthy_only_when_every_threshold_is_judged() {
+    let mut document = document();
+    assert_eq!(value(&document, "ErrorCodes"), Some(Value::Texts(vec!["capacity_low:severe:cell0".into()])));
+    let unknown = parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap().alarms.list[0];
+    document.alarms.list.clear();
+    document.alarms.raised = 0;
+    document.alarms.highest_severity = None;
+    assert_eq!(value(&document, "ErrorCodes"), Some(Value::Texts(Vec::new())));
+    assert_eq!(value(&document, "Alarms.HighestSeverity"), Some(Value::Text("none".into())));
+    document.alarms.unknown = vec![packwatch_host::control::protocol::UnknownAlarms {
+        rule: unknown.rule,
+        severity: unknown.severity,
+        alarms: 1,
+    }];
+    assert_eq!(value(&document, "ErrorCodes"), None);
+    assert_eq!(value(&document, "Alarms.HighestSeverity"), None);
+    document.alarms.unknown.clear();
+    document.alarms.thresholds = 0;
+    assert_eq!(value(&document, "ErrorCodes"), None, "nothing is watched");
+}
+
+#[test]
+fn without_estimates_nothing_looks_healthy() {
+    let mut document = document();
+    document.findings.clear();
+    assert_eq!(value(&document, "Findings"), Some(Value::Texts(Vec::new())));
+    document.pack.soc = None;
+    assert_eq!(value(&document, "Findings"), None);
+    document.pack.current_a = None;
+    assert_eq!(value(&document, "CurrentSensor.IsFrozen"), None);
+    assert_eq!(value(&document, "CurrentPower"), None);
+}

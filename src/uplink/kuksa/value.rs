@@ -1,0 +1,194 @@
+//! Values and their VSS datatypes.
+//!
+//! In: numbers of the status document, limits of the broker. Out: values of the protocol. A number that its datatype cannot hold, or
+//! that is outside the broker's limits, is no value: nothing is clamped.
+
+use super::messages::{Flags, Floats, Texts, TypedValue};
+
+/// A VSS datatype.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum DataType {
+    Text,
+    Flag,
+    Uint16,
+    Float,
+    Texts,
+    Flags,
+    Floats,
+}
+
+impl DataType {
+    /// As VSS writes it.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Text => "string",
+            Self::Flag => "boolean",
+            Self::Uint16 => "uint16",
+            Self::Float => "float",
+            Self::Texts => "string[]",
+            Self::Flags => "boolean[]",
+            Self::Floats => "float[]",
+        }
+    }
+
+    /// Its number in the protocol.
+    pub(crate) const fn code(self) -> i32 {
+        match self {
+            Self::Text => 1,
+            Self::Flag => 2,
+            Self::Uint16 => 8,
+            Self::Float => 11,
+            Self::Texts => 20,
+            Self::Flags => 21,
+            Self::Floats => 30,
+        }
+    }
+}
+
+/// The name of the datatype with this number, of all that the protocol has.
+pub(crate) fn type_name(code: i32) -> String {
+    const SINGLE: [&str; 13] = [
+        "string",
+        "boolean",
+        "int8",
+        "int16",
+        "int32",
+        "int64",
+        "uint8",
+        "uint16",
+        "uint32",
+        "uint64",
+        "float",
+        "double",
+        "timestamp",
+    ];
+    let name = |code: i32| usize::try_from(code - 1).ok().and_then(|index| SINGLE.get(index));
+    match (name(code), name(code - 19)) {
+        (Some(single), _) => (*single).to_owned(),
+        (None, Some(item)) => format!("{item}[]"),
+        (None, None) => format!("datatype {code}"),
+    }
+}
+
+/// A value of one of the datatypes.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Value {
+    Text(String),
+    Flag(bool),
+    Uint16(u16),
+    Float(f32),
+    Texts(Vec<String>),
+    Flags(Vec<bool>),
+    Floats(Vec<f32>),
+}
+
+impl Value {
+    /// Its datatype.
+    pub(crate) const fn data_type(&self) -> DataType {
+        match self {
+            Self::Text(_) => DataType::Text,
+            Self::Flag(_) => DataType::Flag,
+            Self::Uint16(_) => DataType::Uint16,
+            Self::Float(_) => DataType::Float,
+            Self::Texts(_) => DataType::Texts,
+            Self::Flags(_) => DataType::Flags,
+            Self::Floats(_) => DataType::Floats,
+        }
+    }
+
+    /// Whether every number in it is within the limits.
+    pub(crate) fn is_within(&self, limits: Limits) -> bool {
+        match self {
+            Self::Uint16(number) => limits.contain(f64::from(*number)),
+            Self::Float(number) => limits.contain(f64::from(*number)),
+            Self::Floats(numbers) => numbers.iter().all(|number| limits.contain(f64::from(*number))),
+            Self::Text(_) | Self::Flag(_) | Self::Texts(_) | Self::Flags(_) => true,
+        }
+    }
+
+    /// As the protocol has it: it knows no integers of 16 bits.
+    pub(crate) fn into_message(self) -> TypedValue {
+        match self {
+            Self::Text(text) => TypedValue::Text(text),
+            Self::Flag(flag) => TypedValue::Flag(flag),
+            Self::Uint16(number) => TypedValue::Uint32(number.into()),
+            Self::Float(number) => TypedValue::Float(number),
+            Self::Texts(values) => TypedValue::Texts(Texts { values }),
+            Self::Flags(values) => TypedValue::Flags(Flags { values }),
+            Self::Floats(values) => TypedValue::Floats(Floats { values }),
+        }
+    }
+}
+
+/// A number as VSS's `float`; `None` = unknown, not finite, or beyond its range.
+pub(crate) fn single(number: Option<f64>) -> Option<f32> {
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "rounds; what is beyond the range becomes infinite and is no value"
+    )]
+    number.map(|number| number as f32).filter(|number| number.is_finite())
+}
+
+/// The broker's limits of a signal's numbers, both inclusive; `None` = no limit.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Limits {
+    pub(crate) min: Option<f64>,
+    pub(crate) max: Option<f64>,
+}
+
+impl Limits {
+    fn contain(self, number: f64) -> bool {
+        self.min.is_none_or(|min| number >= min) && self.max.is_none_or(|max| number <= max)
+    }
+}
+
+/// A limit as a number; `None` = none is given.
+pub(crate) fn limit(value: Option<&super::messages::Value>) -> Option<f64> {
+    match value?.typed.as_ref()? {
+        TypedValue::Int32(number) => Some(f64::from(*number)),
+        TypedValue::Uint32(number) => Some(f64::from(*number)),
+        TypedValue::Float(number) => Some(f64::from(*number)),
+        TypedValue::Double(number) => Some(*number),
+        // No signal of this program has a datatype of 64 bits.
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_that_a_float_cannot_hold_is_no_value() {
+        assert_eq!(single(Some(1.5)), Some(1.5));
+        for number in [None, Some(f64::NAN), Some(f64::INFINITY), Some(1e39)] {
+            assert_eq!(single(number), None, "{number:?}");
+        }
+    }
+
+    #[test]
+    fn limits_hold_for_every_number_of_an_array() {
+        let limits = Limits { min: Some(0.0), max: Some(100.0) };
+        assert!(Value::Float(100.0).is_within(limits) && Value::Float(0.0).is_within(limits));
+        assert!(!Value::Float(100.1).is_within(limits) && !Value::Uint16(101).is_within(limits));
+        assert!(!Value::Floats(vec![1.0, -0.1]).is_within(limits));
+        assert!(Value::Floats(vec![1.0, -0.1]).is_within(Limits::default()));
+    }
+
+    #[test]
+    fn datatypes_have_the_names_of_their_numbers() {
+        for data_type in [
+            DataType::Text,
+            DataType::Flag,
+            DataType::Uint16,
+            DataType::Float,
+            DataType::Texts,
+            DataType::Flags,
+            DataType::Floats,
+        ] {
+            assert_eq!(type_name(data_type.code()), data_type.name());
+        }
+        assert_eq!((type_name(12).as_str(), type_name(32).as_str()), ("double", "timestamp[]"));
+        assert_eq!((type_name(0).as_str(), type_name(15).as_str()), ("datatype 0", "datatype 15"));
+    }
+}
