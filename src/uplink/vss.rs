@@ -157,7 +157,7 @@ fn reference() -> String {
             let Signal { name, data_type, fields, description, .. } = signal;
             let _ = writeln!(
                 page,
-                "| `{name}` | {} | {} | `{fields}` | {description} |",
+                "| `{name}` | {} | {} | {fields} | {description} |",
                 data_type.name(),
                 signal.unit.unwrap_or("")
             );
