@@ -13,6 +13,8 @@ use super::{OFFLINE, topic};
 const CONNECT_LIMIT_S: u64 = 15;
 /// Requests that wait in memory for the connection: a window of messages of the queue.
 const REQUESTS: usize = 64;
+/// Messages on their way at once, of the queue and of the current values.
+const IN_FLIGHT: u16 = 64;
 /// Longest packet that the broker may send, bytes: nothing is subscribed.
 const MAX_INCOMING_BYTES: u32 = 64 << 10;
 
@@ -28,6 +30,8 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
     options.set_clean_start(true);
     options.set_last_will(LastWill::new(settings.topic(topic::STATUS), OFFLINE, QoS::AtLeastOnce, true, None));
     options.set_incoming_packet_size_limit(rumqttc::IncomingPacketSizeLimit::Bytes(MAX_INCOMING_BYTES));
+    // Places in memory for messages on their way: by default there are 65,535.
+    options.set_outgoing_inflight_upper_limit(IN_FLIGHT);
     let mut network = options.network_options();
     network.set_connection_timeout(CONNECT_LIMIT_S);
     network.set_tcp_nodelay(true);

@@ -25,6 +25,8 @@ use crate::status_stream::Documents;
 const RETRY: Duration = Duration::from_secs(1);
 /// Messages of the queue that are on their way at once: what most brokers accept.
 const WINDOW: usize = 20;
+/// Longest wait for the acknowledgement of messages: a connection that lives and acknowledges nothing ends then.
+const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
 /// Time to say farewell to the broker.
 const FAREWELL: Duration = Duration::from_secs(2);
 
@@ -43,6 +45,23 @@ impl Message {
     /// A message that the broker keeps.
     pub fn retained(topic: String, text: impl Into<String>) -> Self {
         Self { topic, text: text.into(), is_retained: true }
+    }
+}
+
+/// Why messages were not published.
+#[derive(Debug, PartialEq, Eq)]
+enum Fault {
+    /// The broker does not accept one of them.
+    Refused(String),
+    /// The connection does not carry them.
+    Lost(String),
+}
+
+impl From<Fault> for String {
+    fn from(fault: Fault) -> Self {
+        match fault {
+            Fault::Refused(text) | Fault::Lost(text) => text,
+        }
     }
 }
 
@@ -158,7 +177,8 @@ impl Link<'_> {
             let messages = batch.iter().map(|stored| self.message(stored)).collect();
             match publish(client, messages).await {
                 Ok(()) => self.queue.remove(&batch)?,
-                Err(error) => {
+                Err(Fault::Lost(error)) => return Err(error),
+                Err(Fault::Refused(error)) => {
                     tracing::error!(
                         error,
                         "the broker refuses messages of the queue: they wait for the next connection"
@@ -262,18 +282,24 @@ async fn drive(events: &mut EventLoop) -> String {
 }
 
 /// Publishes messages with QoS 1, in order, and waits until the broker has acknowledged all.
-async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Result<(), String> {
+async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Result<(), Fault> {
+    let acknowledged = timeout(ACKNOWLEDGEMENT, publish_all(client, messages)).await;
+    acknowledged.unwrap_or_else(|_| Err(Fault::Lost(format!("no acknowledgement within {ACKNOWLEDGEMENT:?}"))))
+}
+
+async fn publish_all(client: &AsyncClient, messages: Vec<Message>) -> Result<(), Fault> {
     let mut notices = Vec::with_capacity(messages.len());
     for Message { topic, text, is_retained } in messages {
         let options = PublishOptions::new(QoS::AtLeastOnce).retain(is_retained);
-        let notice =
-            client.publish_tracked(topic.clone(), text, options).await.map_err(|error| format!("{topic}: {error}"))?;
-        notices.push((topic, notice));
+        let notice = client.publish_tracked(topic.clone(), text, options).await;
+        notices.push((notice.map_err(|error| Fault::Lost(format!("{topic}: {error}")))?, topic));
     }
-    for (topic, notice) in notices {
+    for (notice, topic) in notices {
         notice.wait_completion_async().await.map_err(|error| match error {
-            PublishNoticeError::V5PubAck(reason) => format!("{topic}: the broker refuses it: {reason:?}"),
-            other => format!("{topic}: {other}"),
+            PublishNoticeError::V5PubAck(reason) => {
+                Fault::Refused(format!("{topic}: the broker refuses it: {reason:?}"))
+            }
+            other => Fault::Lost(format!("{topic}: {other}")),
         })?;
     }
     Ok(())
