@@ -25,6 +25,7 @@
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, fleets, plots, import, discover (feature `lab`) |
+//! | `src/python` | `python` | the Python module: doors to the rooms above; stubs and Python code in its folder `packwatch` |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -80,6 +81,9 @@
 //! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
 //! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
+//! | what a score is asked for, its tables and document | `lab/score/request.rs`, `lab/score/report.rs`; the cell's configuration: `lab/single_cell.rs` |
+//! | a column of a measured file, the Battery Data Format | `lab/measured.rs` |
+//! | a class or function of the Python module | `python/NAME.rs`, its type in `python/packwatch/_packwatch.pyi` |
 //!
 //! # Invariants
 //! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte

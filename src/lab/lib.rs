@@ -21,6 +21,7 @@ pub mod pack_view;
 pub mod report;
 pub mod rul;
 pub mod score;
+pub mod single_cell;
 
 use std::io::Write as _;
 use std::path::Path;

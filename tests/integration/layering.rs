@@ -37,6 +37,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("replay", MODULES.split_at(19).0, Core::Shell),
     ("diagnosis", MODULES.split_at(19).0, Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
+    ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
@@ -72,8 +73,8 @@ const MODULES: [&str; 25] = [
 const CORE: &[&str] = MODULES.split_at(11).0;
 const BELOW_LAB: &[&str] = MODULES.split_at(24).0;
 /// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
-const CRATES: [(&str, Option<&str>); 4] =
-    [("core", None), ("host", None), ("lab", Some("lab")), ("regress", Some("regress"))];
+const CRATES: [(&str, Option<&str>); 5] =
+    [("core", None), ("host", None), ("lab", Some("lab")), ("python", Some("python")), ("regress", Some("regress"))];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Core {
@@ -362,7 +363,7 @@ fn every_module_imports_only_what_the_map_allows() {
 #[test]
 fn the_table_names_the_modules_that_the_crates_declare() {
     let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut declared = vec!["regress".to_owned(), "ident".to_owned(), "lab".to_owned(), "main".to_owned()];
+    let mut declared = ["regress", "ident", "lab", "python", "main"].map(str::to_owned).to_vec();
     for lib in ["lib.rs", "core/lib.rs", "host/lib.rs"] {
         let source = std::fs::read_to_string(src.join(lib)).expect("a lib.rs");
         let names =
@@ -404,6 +405,7 @@ fn planted_violations_are_found_with_file_and_line() {
         ("core/alarm/mod.rs", "use super::cell::CellModel;", "src/core/alarm/mod.rs:1: alarm may not import"),
         ("regress/kernel.rs", "use packwatch_core::can::Frame;", "regress may not import crate::can::Frame"),
         ("lab/ident/fit.rs", "use packwatch_host::io::log;", "ident may not import crate::io::log"),
+        ("python/fit.rs", "use packwatch::cli::Failure;", "python may not import crate::cli::Failure"),
         ("main.rs", "fn main() { packwatch::service::run(); }", "main may not import crate::service::run"),
         ("novel/mod.rs", "", "src/novel/mod.rs:1: module novel has no row"),
     ];
