@@ -9,7 +9,7 @@ use pyo3_arrow::PyArray;
 use crate::error::data;
 
 /// Numbers, row after row.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
     /// Values; they may be memory of Python's, which is kept until this is dropped.
     pub(crate) values: ScalarBuffer<T::Native>,

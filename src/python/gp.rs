@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use packwatch_lab::gpr::TrainedModel;
-use packwatch_regress::{Basis, GprSettings, Kernel, ProgressCallback, TrainingRows, fit};
+use packwatch_regress::{Basis, FitProgress, GprSettings, Kernel, ProgressCallback, TrainingRows, fit};
 use pyo3::prelude::*;
 
 use crate::arrays::{self, check_rows};
@@ -62,7 +62,7 @@ impl GaussianProcess {
             TrainingRows { inputs: &inputs.values, dimensions: inputs.columns, targets: &targets.values, lines: &lines };
         let shown = Progress { is_shown: progress, total: None, unit: "step" };
         let model = work::run(py, shown, |work| {
-            let mut watcher = |_| {
+            let mut watcher = |_: FitProgress| {
                 work.advance(1);
                 ControlFlow::Continue(())
             };

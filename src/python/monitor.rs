@@ -10,7 +10,7 @@ use packwatch_host::can::decode::{Channel, SensorIndex};
 use packwatch_host::can::{CanId, Frame};
 use packwatch_host::config::Config;
 use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
-use packwatch_host::replay::{MonitorDriver, SLEEP_GAP_S};
+use packwatch_host::replay::MonitorDriver;
 use packwatch_host::sample::VoltageSource;
 use pyo3::prelude::*;
 
@@ -45,7 +45,7 @@ impl Monitor {
     /// A monitor that knows nothing of its pack yet.
     #[new]
     #[pyo3(signature = (config=None, *, text=None, folder=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None,
-                        voltage_max_v=None, sleep_gap_s=SLEEP_GAP_S, estimates_period_s=Some(0.0)))]
+                        voltage_max_v=None, sleep_gap_s=30.0, estimates_period_s=0.0))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
     fn new(
         py: Python<'_>,

@@ -83,11 +83,6 @@ impl Columns {
         self.frames.extend_from_slice(&out.frames);
     }
 
-    /// Whether there are no rows.
-    pub(crate) fn is_empty(&self) -> bool {
-        self.estimates.time_s.is_empty() && self.events.is_empty() && self.frames.is_empty()
-    }
-
     /// The tables; `interfaces` are the names by number. The columns are empty afterwards.
     pub(crate) fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {
         Ok(Outputs {
@@ -194,7 +189,7 @@ fn frames(frames: &[Transmit], interfaces: &[String]) -> PyResult<Table> {
     Table::new(vec![
         ("time_s", times(frames.iter().map(|sent| sent.time))),
         ("interface", Arc::new(frames.iter().map(interface).collect::<StringArray>()) as ArrayRef),
-        ("can_id", Arc::new(UInt32Array::from_iter_values(frames.iter().map(|sent| sent.frame.id().dbc_number())))),
-        ("data", Arc::new(payloads.finish())),
+        ("can_id", Arc::new(UInt32Array::from_iter_values(frames.iter().map(|sent| sent.frame.id().dbc_number()))) as ArrayRef),
+        ("data", Arc::new(payloads.finish()) as ArrayRef),
     ])
 }

@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use packwatch_host::config::{self, Config};
 use packwatch_host::io::log::LogSource;
-use packwatch_host::monitor::Monitor;
-use packwatch_host::replay::{self, LogReading, ReplayError, ReplaySettings, SLEEP_GAP_S, Sinks};
+use packwatch_host::monitor::{Monitor, Outputs as CoreOutputs};
+use packwatch_host::replay::{self, LogReading, ReplayError, ReplaySettings, Sinks};
 use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
@@ -57,8 +57,8 @@ impl Replay {
 
 /// Replays logs, one after another, as one record.
 #[pyfunction]
-#[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=SLEEP_GAP_S,
-                    estimates_period_s=Some(0.0), progress=false))]
+#[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=30.0,
+                    estimates_period_s=0.0, progress=false))]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
 pub(crate) fn replay(
     py: Python<'_>,
@@ -101,7 +101,7 @@ fn run(
 ) -> Result<(Columns, String), ReplayError> {
     let columns = Arc::new(Mutex::new(Columns::default()));
     let sink = Arc::clone(&columns);
-    let take = move |out: &_| sink.lock().unwrap_or_else(PoisonError::into_inner).add(wanted, out);
+    let take = move |out: &CoreOutputs| sink.lock().unwrap_or_else(PoisonError::into_inner).add(wanted, out);
     let sinks = Sinks { outputs: Some(Box::new(take)), ..Sinks::default() };
     let mut source = LogSource::new(logs.to_vec(), reading.options(config));
     let settings = ReplaySettings::plain(sleep_gap_s, config.interface_names());
