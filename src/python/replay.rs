@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use packwatch_host::config::{self, Config};
 use packwatch_host::io::log::LogSource;
 use packwatch_host::monitor::{Monitor, Outputs as CoreOutputs};
-use packwatch_host::replay::{self, LogReading, ReplayError, ReplaySettings, Sinks};
+use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, Sinks};
 use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
@@ -111,7 +111,7 @@ fn run(
         reported = bytes;
     };
     let monitor = Monitor::new(config.monitor.clone());
-    let (summary, _) = replay::run(&mut source, monitor, sinks, settings, &mut |progress| report(progress.bytes))?;
+    let (summary, _) = host_replay::run(&mut source, monitor, sinks, settings, &mut |progress| report(progress.bytes))?;
     report(source.read_bytes().load(Ordering::Relaxed));
     let json = serde_json::to_string_pretty(&summary).map_err(std::io::Error::from)? + "\n";
     let columns = std::mem::take(&mut *columns.lock().unwrap_or_else(PoisonError::into_inner));

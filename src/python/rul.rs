@@ -2,7 +2,7 @@
 
 use packwatch_lab::error::LabError;
 use packwatch_host::io::paths::{check_distinct, short_names};
-use packwatch_lab::rul::{self, History, Threshold};
+use packwatch_lab::rul::{self as lab_rul, History, Threshold};
 use pyo3::prelude::*;
 
 use crate::arguments::Paths;
@@ -50,10 +50,10 @@ pub(crate) fn rul<'py>(
         }
         let all = histories.iter().flat_map(|(history, name)| thresholds.iter().map(move |end| (history, name, *end)));
         if at.is_empty() {
-            return rul::now_json(&all.map(|(history, name, end)| rul::now(history, name, end)).collect::<Vec<_>>());
+            return lab_rul::now_json(&all.map(|(history, name, end)| lab_rul::now(history, name, end)).collect::<Vec<_>>());
         }
-        let scored: Vec<_> = all.map(|(history, name, end)| rul::score(history, name, end, &at, alpha)).collect();
-        rul::scored_json(&scored, alpha)
+        let scored: Vec<_> = all.map(|(history, name, end)| lab_rul::score(history, name, end, &at, alpha)).collect();
+        lab_rul::scored_json(&scored, alpha)
     })?;
     let document = document.map_err(|error| of_files(error, &files))?;
     py.import("json")?.call_method1("loads", (document,))
