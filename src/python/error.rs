@@ -1,8 +1,6 @@
 //! Exceptions: faults of a configuration, of data and arguments, of files. Each has the text of the command line.
 
 use std::fmt::Display;
-use std::fs::File;
-use std::path::{Path, PathBuf};
 
 use packwatch_host::config::ConfigFaults;
 use packwatch_lab::error::RequestError;
@@ -12,6 +10,9 @@ use pyo3::PyErr;
 pyo3::import_exception!(packwatch._errors, ConfigError);
 pyo3::import_exception!(packwatch._errors, DataError);
 pyo3::import_exception!(packwatch._errors, FileError);
+
+/// In the text of every error of the operating system.
+const OF_THE_SYSTEM: &str = "(os error ";
 
 /// A fault of data or arguments.
 pub(crate) fn data(error: impl Display) -> PyErr {
@@ -29,19 +30,16 @@ pub(crate) fn config(faults: ConfigFaults) -> PyErr {
     ConfigError::new_err((text, faults.0))
 }
 
-/// An error of work on these files: a file error where one of them cannot be opened, else one of data.
-pub(crate) fn of_files(error: impl Display, files: &[PathBuf]) -> PyErr {
-    if files.iter().any(|path| is_missing(path)) { file(error) } else { data(error) }
+/// An error of the library, which is a text: of a file where the operating system gave it, else of data.
+pub(crate) fn of_library(error: impl Display) -> PyErr {
+    let text = error.to_string();
+    if text.contains(OF_THE_SYSTEM) { file(text) } else { data(text) }
 }
 
-/// An error of a request on these files.
-pub(crate) fn of_request(error: RequestError, files: &[PathBuf]) -> PyErr {
+/// An error of a request.
+pub(crate) fn of_request(error: RequestError) -> PyErr {
     match error {
         RequestError::Config(faults) => config(faults),
-        RequestError::Lab(error) => of_files(error, files),
+        RequestError::Lab(error) => of_library(error),
     }
-}
-
-fn is_missing(path: &Path) -> bool {
-    path != Path::new("-") && File::open(path).is_err()
 }

@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 
 use crate::arguments::Paths;
 use crate::cell_model::write;
-use crate::error::of_files;
+use crate::error::of_library;
 use crate::work::{self, Progress};
 
 /// A fitted model.
@@ -103,8 +103,7 @@ pub(crate) fn fit(
         first_cycles,
         files: files.list(),
     };
-    let inputs: Vec<PathBuf> = request.files.iter().chain(&request.ocv).cloned().collect();
-    request.check().map_err(|error| of_files(error, &[]))?;
+    request.check().map_err(of_library)?;
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };
     let outcome = work::run(py, shown, |work| {
@@ -113,6 +112,6 @@ pub(crate) fn fit(
             FitProgress::Read(..) | FitProgress::Pass(..) => work.advance(1),
         })
     })?;
-    let outcome = outcome.map_err(|error| of_files(error, &inputs))?;
+    let outcome = outcome.map_err(of_library)?;
     Ok(Fit { request, outcome, seconds: begin.elapsed().as_secs_f64() })
 }

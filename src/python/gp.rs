@@ -8,7 +8,7 @@ use packwatch_regress::{Basis, FitProgress, GprSettings, Kernel, ProgressCallbac
 use pyo3::prelude::*;
 
 use crate::arrays::{self, check_rows};
-use crate::error::{data, file, of_files};
+use crate::error::{data, file, of_library};
 use crate::table::{Table, reals};
 use crate::work::{self, Progress};
 
@@ -76,7 +76,7 @@ impl GaussianProcess {
     #[pyo3(signature = (path, *, threads=None))]
     fn load(py: Python<'_>, path: PathBuf, threads: Option<usize>) -> PyResult<Self> {
         let loaded = py.detach(|| TrainedModel::load(&path, thread_count(threads)));
-        loaded.map(Self).map_err(|error| of_files(error, &[path]))
+        loaded.map(Self).map_err(of_library)
     }
 
     /// Writes the model, completely or not at all; it holds the rows it learned from.

@@ -7,7 +7,7 @@ use arrow_array::{ArrayRef, StringArray};
 use packwatch_lab::measured::{MeasuredFile, MeasuredPart};
 use pyo3::prelude::*;
 
-use crate::error::{data, of_files};
+use crate::error::{data, of_library};
 use crate::table::{Table, reals};
 
 /// Reads a measured file.
@@ -17,7 +17,7 @@ pub(crate) fn read(py: Python<'_>, path: PathBuf, bdf_positive: &str) -> PyResul
     if !["charge", "discharge"].contains(&bdf_positive) {
         return Err(data(format!("bdf_positive {bdf_positive:?}, must be charge or discharge")));
     }
-    let file = py.detach(|| MeasuredFile::read(&path)).map_err(|error| of_files(error, &[path]))?;
+    let file = py.detach(|| MeasuredFile::read(&path)).map_err(of_library)?;
     let sign = if file.is_bdf && bdf_positive == "discharge" { -1.0 } else { 1.0 };
     let column = |of: fn(&MeasuredPart) -> &Vec<f64>, sign: f64| {
         reals(file.parts.iter().flat_map(|part| of(part).iter().map(|value| sign * value + 0.0)).collect())

@@ -87,7 +87,7 @@ pub(crate) fn replay(
     let config = py.detach(|| config::load(&config)).map_err(error::config)?;
     let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
     let result = work::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
-    let (mut outputs, json) = result.map_err(|failure| of_replay(failure, &logs))?;
+    let (mut outputs, json) = result.map_err(of_replay)?;
     let outputs = outputs.finish(py, &config.interface_names())?;
     Ok(Replay { outputs: Py::new(py, outputs)?, json })
 }
@@ -118,12 +118,12 @@ fn run(
     Ok((columns, json))
 }
 
-fn of_replay(failure: ReplayError, logs: &[PathBuf]) -> PyErr {
+fn of_replay(failure: ReplayError) -> PyErr {
     match failure {
         ReplayError::Write(error) if error.kind() == std::io::ErrorKind::BrokenPipe => {
             PyBrokenPipeError::new_err(error.to_string())
         }
         ReplayError::Write(error) => error::file(error),
-        failure => error::of_files(failure, logs),
+        failure => error::of_library(failure),
     }
 }

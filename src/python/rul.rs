@@ -6,7 +6,7 @@ use packwatch_lab::rul::{self as lab_rul, History, Threshold};
 use pyo3::prelude::*;
 
 use crate::arguments::Paths;
-use crate::error::{data, of_files};
+use crate::error::{data, of_library};
 use crate::work::{self, Progress};
 
 /// An end of life: Ah, or a text like "70 %".
@@ -55,7 +55,7 @@ pub(crate) fn rul<'py>(
         let scored: Vec<_> = all.map(|(history, name, end)| lab_rul::score(history, name, end, &at, alpha)).collect();
         lab_rul::scored_json(&scored, alpha)
     })?;
-    let document = document.map_err(|error| of_files(error, &files))?;
+    let document = document.map_err(of_library)?;
     py.import("json")?.call_method1("loads", (document,))
 }
 

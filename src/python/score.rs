@@ -6,7 +6,7 @@ use packwatch_lab::score::{ScoreReport, ScoreRequest, Start};
 use pyo3::prelude::*;
 
 use crate::arguments::{Paths, bytes, cell_source};
-use crate::error::{data, of_files, of_request};
+use crate::error::{data, of_library, of_request};
 use crate::work::{self, Progress};
 
 /// Numbers, or one of them.
@@ -128,15 +128,14 @@ pub(crate) fn score(
 }
 
 fn run(py: Python<'_>, request: &ScoreRequest, is_shown: bool) -> PyResult<Score> {
-    let inputs: Vec<PathBuf> = request.files.iter().chain(&request.learn).chain(&request.cycles).cloned().collect();
     let sizes: Vec<f64> = request.files.iter().map(|path| bytes(std::slice::from_ref(path)) as f64).collect();
     let prepared = work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| request.prepare())?;
-    let prepared = prepared.map_err(|error| of_request(error, &inputs))?;
+    let prepared = prepared.map_err(of_request)?;
     let progress = Progress { is_shown, total: Some(bytes(&request.files)), unit: "B" };
     let report = work::run(py, progress, |work| {
         prepared.run(&|file, part| work.advance((part * sizes.get(file).copied().unwrap_or(0.0)).round() as u64))
     })?;
-    report.map(Score).map_err(|error| of_files(error, &inputs))
+    report.map(Score).map_err(of_library)
 }
 
 impl Numbers {

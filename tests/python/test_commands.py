@@ -17,7 +17,7 @@ def test_score_gives_the_bytes_of_the_command(record):
     score = pw.score(record.csv, cell=CELL, settle_s=60)
     assert score.json() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60", "--json")
     assert score.table() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60")
-    assert score.scores[0]["soc"]["samples"] == 8941
+    assert score.scores[0]["soc"]["samples"] == 8940
 
 
 def test_every_argument_of_score_reaches_it(record, tmp_path):
@@ -131,7 +131,7 @@ CSV_FAULT = "time_s,current_a,voltage_v,discharged_ah\n0,1,3.9,0\n1,x,3.9,0\n"
         (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", cell=CELL), ["score", "bad.csv", "--cell", CELL]),
         (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", config=f / "pack.toml"), ["score", "bad.csv", "-c", "pack.toml"]),
         (pw.ConfigError, ValueError, lambda f: pw.score(f / "bad.csv", cell=f / "bad.toml"), ["score", "bad.csv", "--cell", "bad.toml"]),
-        (pw.ConfigError, ValueError, lambda f: pw.Monitor(f / "bad.toml"), ["check", "-c", "bad.toml"]),
+        (pw.ConfigError, ValueError, lambda f: pw.Monitor(f / "bad.toml"), ["replay", "-c", "bad.toml", "no.log"]),
     ],
 )
 def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases, call, command):
