@@ -98,7 +98,11 @@ mod tests {
         ] {
             assert_eq!(text.parse(), Ok(expected));
         }
-        assert!(["0", "-1", "100 %", "0%", "soon", "", "inf", "nan %"].iter().all(|text| text.parse::<Threshold>().is_err()));
+        assert!(
+            ["0", "-1", "100 %", "0%", "soon", "", "inf", "nan %"]
+                .iter()
+                .all(|text| text.parse::<Threshold>().is_err())
+        );
         assert_eq!(part("40"), Ok(0.4));
         assert!(part("100").is_err() && part("0").is_err() && fraction("0").is_err() && fraction("x").is_err());
     }

@@ -165,7 +165,8 @@ mod tests {
         let part = &file.parts[0];
         assert_eq!((file.parts.len(), &part.current_a), (1, &vec![2.0, -1.5]));
         assert!(part.temperature_c[0] == 21.0 && part.temperature_c[1].is_nan() && part.discharged_ah[0].is_nan());
-        let file = read("test_time_second,voltage_volt,current_ampere,net_capacity_ah\n0,3.5,-2,-0.25\n").expect("reads");
+        let file =
+            read("test_time_second,voltage_volt,current_ampere,net_capacity_ah\n0,3.5,-2,-0.25\n").expect("reads");
         assert_eq!((file.parts[0].current_a[0], file.parts[0].discharged_ah[0]), (2.0, 0.25));
         let found = read("Test Time / s,Voltage / V\n0,3.5\n");
         assert_eq!(found, Err("cell.csv:1: no column Current / A, found Test Time / s,Voltage / V".into()));

@@ -135,7 +135,9 @@ impl FromStr for Threshold {
             "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
         let above_0 = |text: &str| text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
         let found = match text.trim().strip_suffix('%') {
-            Some(percent) => above_0(percent).filter(|percent| *percent < 100.0).map(|percent| Self::OfFirst(percent / 100.0)),
+            Some(percent) => {
+                above_0(percent).filter(|percent| *percent < 100.0).map(|percent| Self::OfFirst(percent / 100.0))
+            }
             None => above_0(text.trim().trim_end_matches("Ah")).map(Self::AmpereHours),
         };
         found.ok_or_else(|| EXPECTED.to_owned())

@@ -50,7 +50,11 @@ pub(crate) fn bytes(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Bytes> {
 
 /// Checks that an array has as many rows as another.
 pub(crate) fn check_rows(name: &str, rows: usize, of: &str, expected: usize) -> PyResult<()> {
-    if rows == expected { Ok(()) } else { Err(data(format!("{name} has {rows} rows, {of} has {expected}: must agree"))) }
+    if rows == expected {
+        Ok(())
+    } else {
+        Err(data(format!("{name} has {rows} rows, {of} has {expected}: must agree")))
+    }
 }
 
 fn matrix<T: ArrowPrimitiveType>(name: &str, dtype: &str, values: &Bound<'_, PyAny>) -> PyResult<Matrix<T>> {

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use packwatch_host::cell::{Chemistry, CellModel as CoreModel, Label};
+use packwatch_host::cell::{CellModel as CoreModel, Chemistry, Label};
 use packwatch_host::config::cell_model::{self, SourcedModel};
 use packwatch_host::config::of_label;
 use pyo3::prelude::*;
@@ -126,7 +126,9 @@ impl CellModel {
     #[pyo3(signature = (voltage_v, temperature_c=25.0))]
     fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> PyResult<f64> {
         if !voltage_v.is_finite() || !temperature_c.is_finite() {
-            return Err(data(format!("voltage_v = {voltage_v}, temperature_c = {temperature_c}, must be finite numbers")));
+            return Err(data(format!(
+                "voltage_v = {voltage_v}, temperature_c = {temperature_c}, must be finite numbers"
+            )));
         }
         Ok(self.model().soc_of_ocv(voltage_v, temperature_c))
     }

@@ -45,7 +45,11 @@ impl GaussianProcess {
         check_known("output", &targets)?;
         let names = names.unwrap_or_else(|| (1..=inputs.columns).map(|number| format!("x{number}")).collect());
         if names.len() != inputs.columns {
-            return Err(data(format!("names has {} names, inputs has {} columns: must agree", names.len(), inputs.columns)));
+            return Err(data(format!(
+                "names has {} names, inputs has {} columns: must agree",
+                names.len(),
+                inputs.columns
+            )));
         }
         let kernel: Kernel = kernel.parse().map_err(data)?;
         let settings = GprSettings {
@@ -58,8 +62,12 @@ impl GaussianProcess {
             ..GprSettings::new(kernel, inputs.rows)
         };
         let lines: Vec<u64> = (0..inputs.rows as u64).collect();
-        let rows =
-            TrainingRows { inputs: &inputs.values, dimensions: inputs.columns, targets: &targets.values, lines: &lines };
+        let rows = TrainingRows {
+            inputs: &inputs.values,
+            dimensions: inputs.columns,
+            targets: &targets.values,
+            lines: &lines,
+        };
         let shown = Progress { is_shown: progress, total: None, unit: "step" };
         let model = work::run(py, shown, |work| {
             let mut watcher = |_: FitProgress| {

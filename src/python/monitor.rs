@@ -301,5 +301,7 @@ fn frame(row: usize, id: u32, payload: &[u8], length: usize) -> PyResult<Frame> 
         data(format!("length[{row}] = {length}, must be at most {} as data has columns", payload.len()))
     })?;
     let frame = if length <= 8 { Frame::classic(can_id, payload) } else { Frame::fd(can_id, false, false, payload) };
-    frame.ok_or_else(|| data(format!("length[{row}] = {length}, must be a length of CAN FD: 12, 16, 20, 24, 32, 48 or 64")))
+    frame.ok_or_else(|| {
+        data(format!("length[{row}] = {length}, must be a length of CAN FD: 12, 16, 20, 24, 32, 48 or 64"))
+    })
 }

@@ -189,7 +189,10 @@ fn frames(frames: &[Transmit], interfaces: &[String]) -> PyResult<Table> {
     Table::new(vec![
         ("time_s", times(frames.iter().map(|sent| sent.time))),
         ("interface", Arc::new(frames.iter().map(interface).collect::<StringArray>()) as ArrayRef),
-        ("can_id", Arc::new(UInt32Array::from_iter_values(frames.iter().map(|sent| sent.frame.id().dbc_number()))) as ArrayRef),
+        (
+            "can_id",
+            Arc::new(UInt32Array::from_iter_values(frames.iter().map(|sent| sent.frame.id().dbc_number()))) as ArrayRef,
+        ),
         ("data", Arc::new(payloads.finish()) as ArrayRef),
     ])
 }

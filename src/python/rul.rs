@@ -1,7 +1,7 @@
 //! `rul`: remaining useful life of measured capacity histories.
 
-use packwatch_lab::error::LabError;
 use packwatch_host::io::paths::{check_distinct, short_names};
+use packwatch_lab::error::LabError;
 use packwatch_lab::rul::{self as lab_rul, History, Threshold};
 use pyo3::prelude::*;
 
@@ -43,18 +43,23 @@ pub(crate) fn rul<'py>(
         return Err(data(format!("at and alpha: found {part}, must be above 0 and below 1")));
     }
     check_distinct(&files).map_err(data)?;
-    let document = work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| -> Result<String, LabError> {
-        let mut histories = Vec::new();
-        for (path, name) in files.iter().zip(short_names(&files)) {
-            histories.push((History::read(path)?, name));
-        }
-        let all = histories.iter().flat_map(|(history, name)| thresholds.iter().map(move |end| (history, name, *end)));
-        if at.is_empty() {
-            return lab_rul::now_json(&all.map(|(history, name, end)| lab_rul::now(history, name, end)).collect::<Vec<_>>());
-        }
-        let scored: Vec<_> = all.map(|(history, name, end)| lab_rul::score(history, name, end, &at, alpha)).collect();
-        lab_rul::scored_json(&scored, alpha)
-    })?;
+    let document =
+        work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| -> Result<String, LabError> {
+            let mut histories = Vec::new();
+            for (path, name) in files.iter().zip(short_names(&files)) {
+                histories.push((History::read(path)?, name));
+            }
+            let all =
+                histories.iter().flat_map(|(history, name)| thresholds.iter().map(move |end| (history, name, *end)));
+            if at.is_empty() {
+                return lab_rul::now_json(
+                    &all.map(|(history, name, end)| lab_rul::now(history, name, end)).collect::<Vec<_>>(),
+                );
+            }
+            let scored: Vec<_> =
+                all.map(|(history, name, end)| lab_rul::score(history, name, end, &at, alpha)).collect();
+            lab_rul::scored_json(&scored, alpha)
+        })?;
     let document = document.map_err(of_library)?;
     py.import("json")?.call_method1("loads", (document,))
 }

@@ -46,7 +46,11 @@ pub(crate) struct Progress<'a> {
 }
 
 /// Runs work.
-pub(crate) fn run<T: Send>(py: Python<'_>, progress: Progress<'_>, work: impl FnOnce(&Work) -> T + Send) -> PyResult<T> {
+pub(crate) fn run<T: Send>(
+    py: Python<'_>,
+    progress: Progress<'_>,
+    work: impl FnOnce(&Work) -> T + Send,
+) -> PyResult<T> {
     let bar = if progress.is_shown { Bar::new(py, progress)? } else { None };
     let (state, bar) = (Work::default(), bar.as_ref());
     let (result, interrupt) = py.detach(|| {

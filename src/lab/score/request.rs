@@ -131,12 +131,12 @@ impl ScoreRequest {
     fn check(&self) -> Result<(), LabError> {
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
-            return Err(LabError(format!(
-                "--cycles given {tables} times for {files} files, must be once per file"
-            )));
+            return Err(LabError(format!("--cycles given {tables} times for {files} files, must be once per file")));
         }
         if self.source.config.is_none() && self.source.cell.is_none() && self.source.label.is_none() {
-            return Err("no cell: a configuration, a cell model or a chemistry with rated capacity must be given".into());
+            return Err(
+                "no cell: a configuration, a cell model or a chemistry with rated capacity must be given".into()
+            );
         }
         check_distinct(&self.files)?;
         self.check_numbers()
@@ -151,14 +151,21 @@ impl ScoreRequest {
         check("soc_error_points", points, |value| value.abs() <= 100.0, "-100 to 100")?;
         check("soc_std_points", self.soc_std_points, to_100, "above 0 and at most 100")?;
         let percent = self.capacity_error_percent.iter().copied();
-        check("capacity_error_percent", percent, |value| value > -100.0 && value <= 100.0, "above -100 and at most 100")?;
+        check(
+            "capacity_error_percent",
+            percent,
+            |value| value > -100.0 && value <= 100.0,
+            "above -100 and at most 100",
+        )?;
         check("capacity_std_percent", self.capacity_std_percent, to_100, "above 0 and at most 100")?;
         check("current_offset_a", self.current_offset_a.iter().copied(), f64::is_finite, "a finite number")?;
         check("settle_s", [self.settle_s], |value| value >= 0.0 && value.is_finite(), "0 or more")?;
         check("truth_capacity_ah", self.truth_capacity_ah, above_0, "a finite number above 0")?;
         check("sleep_gap_s", [self.sleep_gap_s], above_0, "a finite number above 0")?;
         check("threshold_ah", [self.threshold_ah], above_0, "a finite number above 0")?;
-        if let Some((least, most)) = self.window.filter(|(least, most)| !(*least > 0.0 && least <= most && *most <= 1.0)) {
+        if let Some((least, most)) =
+            self.window.filter(|(least, most)| !(*least > 0.0 && least <= most && *most <= 1.0))
+        {
             let allowed = "two parts above 0 and at most 1, the smaller first";
             return Err(LabError(format!("window = {least}, {most}, must be {allowed}")));
         }
