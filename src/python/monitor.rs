@@ -38,6 +38,7 @@ struct State {
     driver: MonitorDriver,
     columns: Columns,
     wanted: Wanted,
+    cells: usize,
 }
 
 #[pymethods]
@@ -149,7 +150,8 @@ impl Monitor {
         let frames = (0..time_s.rows).map(frame).collect::<PyResult<Vec<Frame>>>()?;
         self.work(py, progress, time_s.rows, |state, work| {
             for (row, frame) in frames.iter().enumerate() {
-                state.driver.handle_frame(Timestamp::from_secs(time_s.values[row]), bus, frame);
+                let time = state.begin(time_s.values[row]);
+                state.driver.handle_frame(time, bus, frame);
                 state.columns.take(state.wanted, &mut state.driver.out);
                 report(row, work);
             }
@@ -182,7 +184,7 @@ impl Monitor {
             interfaces: config.interface_names(),
             cells: sample.cells,
             is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            state: Mutex::new(State { driver, columns: Columns::default(), wanted }),
+            state: Mutex::new(State { driver, columns: Columns::default(), wanted, cells: sample.cells.into() }),
         }
     }
 
@@ -217,10 +219,18 @@ impl State {
         let mut values = input.channels();
         for row in 0..time_s.rows {
             input.fill(row, &mut values);
-            self.driver.handle_row(Timestamp::from_secs(time_s.values[row]), &values);
+            let time = self.begin(time_s.values[row]);
+            self.driver.handle_row(time, &values);
             self.columns.take(self.wanted, &mut self.driver.out);
             report(row, work);
         }
+    }
+
+    /// The time of an input. Estimates that would not become rows are not made: that takes time.
+    fn begin(&mut self, time_s: f64) -> Timestamp {
+        let time = Timestamp::from_secs(time_s);
+        self.driver.out.want_estimates = self.columns.wants_estimates(self.wanted, time, self.cells);
+        time
     }
 
     fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {

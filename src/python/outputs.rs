@@ -83,6 +83,15 @@ impl Columns {
         self.frames.extend_from_slice(&out.frames);
     }
 
+    /// Whether an estimate of `time` may become a row; of a pack of `cells`.
+    pub(crate) fn wants_estimates(&self, wanted: Wanted, time: Timestamp, cells: usize) -> bool {
+        match wanted.period_ns {
+            None => false,
+            Some(0) => true,
+            Some(period_ns) => self.estimates.wants(period_ns, time, cells),
+        }
+    }
+
     /// The tables; `interfaces` are the names by number. The columns are empty afterwards.
     pub(crate) fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {
         Ok(Outputs {
@@ -99,9 +108,11 @@ struct EstimateColumns {
     cell: Vec<u16>,
     reals: [Vec<f64>; REALS],
     accepted: Vec<bool>,
-    /// Start of the record, and the period of each cell's last row.
+    /// Time of the record's first estimate, and the period of each cell's last row.
     first: Option<Timestamp>,
     periods: Vec<Option<i64>>,
+    /// The latest period with a row, and how many cells have one in it.
+    latest: Option<(i64, usize)>,
 }
 
 impl EstimateColumns {
@@ -145,8 +156,16 @@ impl EstimateColumns {
         let begins = self.periods[cell].is_none_or(|last| period > last);
         if begins {
             self.periods[cell] = Some(period);
+            let (latest, cells) = self.latest.unwrap_or((period, 0));
+            self.latest = if period > latest { Some((period, 1)) } else { Some((latest, cells + 1)) };
         }
         begins
+    }
+
+    /// Whether an estimate of `time` may become a row.
+    fn wants(&self, period_ns: i64, time: Timestamp, cells: usize) -> bool {
+        let (Some(first), Some((latest, done))) = (self.first, self.latest) else { return true };
+        done < cells || time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns) > latest
     }
 
     fn finish(&mut self) -> PyResult<Table> {

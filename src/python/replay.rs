@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use packwatch_host::config::{self, Config};
 use packwatch_host::io::log::LogSource;
 use packwatch_host::monitor::{Monitor, Outputs as CoreOutputs};
-use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, Sinks};
+use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, SLEEP_GAP_S, Sinks};
 use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
@@ -15,6 +15,9 @@ use crate::arguments::{Paths, bytes};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
 use crate::work::{self, Progress, Work};
+
+// The signatures below and of `Monitor` have it as a literal, which Python shows.
+const _: () = assert!(SLEEP_GAP_S == 30.0);
 
 /// Results of a replay.
 #[pyclass(frozen, module = "packwatch")]

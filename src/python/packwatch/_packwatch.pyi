@@ -12,6 +12,24 @@ _Paths: TypeAlias = _Path | Sequence[_Path]
 _Numbers: TypeAlias = Any
 """Anything that NumPy takes as numbers: arrays, Arrow arrays, columns of a table, lists."""
 
+__all__ = [
+    "BDF_COLUMNS",
+    "CellModel",
+    "Fit",
+    "GaussianProcess",
+    "Monitor",
+    "Outputs",
+    "Replay",
+    "Score",
+    "Table",
+    "__version__",
+    "fit",
+    "read",
+    "replay",
+    "rul",
+    "score",
+]
+
 __version__: str
 BDF_COLUMNS: list[tuple[str, str, str]]
 
