@@ -26,6 +26,7 @@
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
+//! | `src/python` | `python` | the Python module: doors to the rooms above; stubs and Python code in its folder `packwatch` |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
@@ -86,6 +87,9 @@
 //! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
 //! | a package: its files; its program and processor; all of them | `/systemd/tree`; `/systemd/program`, `/systemd/architectures`; `/systemd/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
+//! | what a score is asked for, its tables and document | `lab/score/request.rs`, `lab/score/report.rs`; the cell's configuration: `lab/single_cell.rs` |
+//! | a column of a measured file, the Battery Data Format | `lab/measured.rs` |
+//! | a class or function of the Python module | `python/NAME.rs`, its type in `python/packwatch/_packwatch.pyi` |
 //!
 //! # Invariants
 //! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte

@@ -10,7 +10,7 @@ use std::time::Instant;
 use super::Failure;
 use super::label::{LabelArgs, one_of_chemistries};
 use super::numbers::{above_0, finite, share};
-use super::output::{failure, progress_bar, unless_closed};
+use super::output::{failure, print, progress_bar, unless_closed};
 use super::replay::{InputArgs, log_options};
 use crate::cell::MAX_BRANCHES;
 use crate::config;
@@ -120,16 +120,9 @@ fn soc_nodes(text: &str) -> Result<SocNodes, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    for (key, list) in [("--tau", &args.grid.tau), ("--temperatures", &args.grid.temperatures)] {
-        if let Some([a, b]) = list.as_ref().and_then(|list| list.array_windows().find(|[a, b]| a >= b)) {
-            return Err(Failure::new(format!("{key}: {b} follows {a}, must rise")));
-        }
-    }
-    if args.grid.tau.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
-        return Err(Failure::new(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
-    }
     let begin = Instant::now();
     let mut request = request(args);
+    request.check().map_err(failure)?;
     let bar = progress_bar(None, "{spinner} {elapsed_precise} {msg}");
     let result = if args.log {
         fit_logs(args, &mut request, |progress| report::show(&bar, progress))
@@ -143,8 +136,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         fit::write_plot(path, &outcome).map_err(failure)?;
     }
     let seconds = begin.elapsed().as_secs_f64();
-    let shown = if args.json { report::json(&outcome, seconds) } else { report::table(&outcome, seconds, &args.out) };
-    unless_closed(shown)
+    if args.json {
+        return print(&format!("{}\n", fit::document(&outcome, seconds)));
+    }
+    unless_closed(report::table(&outcome, seconds, &args.out))
 }
 
 /// Fits to logs; completes the request by what the configuration says.
@@ -159,8 +154,8 @@ fn fit_logs(
         voltage_min: args.voltage_min,
         voltage_max: args.voltage_max,
     };
-    let config = match (label.configuration()?, &args.start.config) {
-        (Some(config), _) => config,
+    let config = match (label.keys(), &args.start.config) {
+        (Some(keys), _) => keys.configuration()?,
         (None, path) => config::load(path.as_deref().unwrap_or(Path::new("")))?,
     };
     let model = &config.monitor.model;

@@ -181,7 +181,17 @@ impl Failure {
 
 impl From<crate::config::ConfigFaults> for Failure {
     fn from(faults: crate::config::ConfigFaults) -> Self {
-        Self { message: faults.0.join("\n"), code: EXIT_CONFIG }
+        Self { message: faults.to_string(), code: EXIT_CONFIG }
+    }
+}
+
+#[cfg(feature = "lab")]
+impl From<crate::lab::error::RequestError> for Failure {
+    fn from(error: crate::lab::error::RequestError) -> Self {
+        match error {
+            crate::lab::error::RequestError::Config(faults) => faults.into(),
+            crate::lab::error::RequestError::Lab(error) => Self::new(error.0),
+        }
     }
 }
 

@@ -11,6 +11,9 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use super::Failure;
+use crate::io::paths;
+
+pub(crate) use crate::io::text_table::text_table as table;
 
 /// A failure of the work with this error's text.
 pub(crate) fn failure(error: impl Display) -> Failure {
@@ -47,24 +50,6 @@ pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     writeln!(out)
 }
 
-/// Columns as wide as their widest entry: the first `left` are aligned to the left, the others to the right.
-pub(crate) fn table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec<String>>, left: usize) -> String {
-    let heads: Vec<String> = heads.iter().map(|head| head.as_ref().to_owned()).collect();
-    let rows: Vec<Vec<String>> = Some(heads).filter(|heads| !heads.is_empty()).into_iter().chain(rows).collect();
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
-    let widths: Vec<usize> =
-        (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
-    let line = |row: &Vec<String>| {
-        let cells = widths.iter().enumerate().map(|(column, &width)| {
-            let text = entry(row, column);
-            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
-        });
-        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned() + "\n"
-    };
-    rows.iter().map(line).collect()
-}
-
 /// Writes such a [`table`].
 pub(crate) fn write_table<H: AsRef<str>>(
     out: &mut impl Write,
@@ -89,34 +74,5 @@ pub(crate) fn create_folder(folder: &Path) -> Result<(), Failure> {
 
 /// Rejects a file that is named twice.
 pub(crate) fn check_distinct(files: &[PathBuf]) -> Result<(), Failure> {
-    match files.iter().enumerate().find(|(index, file)| files[..*index].contains(file)) {
-        Some((_, file)) => Err(Failure::new(format!("{}: named twice", file.display()))),
-        None => Ok(()),
-    }
-}
-
-/// Short names that distinguish the files: folder and name without endings, the whole path where two are the same.
-pub(crate) fn short_names(files: &[PathBuf]) -> Vec<String> {
-    let short = |path: &PathBuf| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let name = name.split('.').next().unwrap_or_default().to_owned();
-        let folder = path.parent().and_then(Path::file_name).map(|folder| folder.to_string_lossy().into_owned());
-        folder.map_or(name.clone(), |folder| format!("{folder}/{name}"))
-    };
-    let all: Vec<String> = files.iter().map(short).collect();
-    let is_twice = |name: &String| all.iter().filter(|other| *other == name).count() > 1;
-    let full =
-        |(name, path): (&String, &PathBuf)| if is_twice(name) { path.display().to_string() } else { name.clone() };
-    all.iter().zip(files).map(full).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_distinguish_files() {
-        let files = ["a/25C/x.csv.gz", "a/10C/x.csv.gz", "b/10C/x.csv", "y.csv"].map(PathBuf::from);
-        assert_eq!(short_names(&files), ["25C/x", "a/10C/x.csv.gz", "b/10C/x.csv", "y"]);
-    }
+    paths::check_distinct(files).map_err(Failure::new)
 }

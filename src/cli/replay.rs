@@ -9,17 +9,14 @@ use std::path::Path;
 
 use super::Failure;
 use super::output::print_json;
-use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::io::csv_log::CsvOptions;
 use crate::io::event_log;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
 use crate::io::snapshot_file;
 use crate::io::socket::CanSender;
 use crate::monitor::Monitor;
-use crate::replay::{self, ReplayError, ReplaySettings, ReplaySummary, Sinks};
-use crate::sample::VoltageSource;
+use crate::replay::{self, LogReading, ReplayError, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::Recorder;
 
 pub(crate) use args::{Args, CsvSign, InputArgs, column};
@@ -55,7 +52,7 @@ fn replay_all(
         estimates: create(args.estimates.as_deref())?,
         events: events_file(args.events.as_deref(), &config)?,
         frames: create(args.frames.as_deref())?,
-        watch: None,
+        ..Sinks::default()
     };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor);
@@ -80,26 +77,13 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
 }
 
 pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
-    let sample = &config.monitor.sample;
-    let encoder = InputEncoder::new(&config.monitor.input).with_answers(&config.monitor.answers);
-    let mut protector = InputProtector::new(&config.monitor.guards);
-    LogOptions {
-        interfaces: config.interface_names(),
+    let reading = LogReading {
         strict: args.strict,
-        csv: CsvOptions {
-            columns: args.columns.clone(),
-            charge_positive: args.csv_sign == args::CsvSign::Charge,
-            start_times: args.start_times.clone(),
-            cells: sample.cells,
-            pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-        },
-        // A row has no frames: they are encoded as their senders encode them, with protection.
-        encode_row: Box::new(move |values, frames| {
-            let uncarried = encoder.encode(values, frames);
-            protector.protect(frames);
-            uncarried
-        }),
-    }
+        columns: args.columns.clone(),
+        charge_positive: args.csv_sign == args::CsvSign::Charge,
+        start_times: args.start_times.clone(),
+    };
+    reading.options(config)
 }
 
 fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {

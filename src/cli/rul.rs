@@ -3,10 +3,12 @@
 mod report;
 
 use std::path::PathBuf;
+use std::str::FromStr as _;
 
 use super::Failure;
-use super::numbers::{above_0, finite, fraction};
-use super::output::{check_distinct, failure, short_names, unless_closed};
+use super::numbers::{finite, fraction};
+use super::output::{check_distinct, failure, print, unless_closed};
+use crate::io::paths::short_names;
 use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
 
 /// Most parts of the life: one per per cent.
@@ -26,7 +28,7 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Capacity at the end of life, Ah, or per cent of the file's first: 1.4 or "70 %"; several make a forecast each
-    #[arg(long, value_name = "AH|PERCENT", required = true, value_delimiter = ',', value_parser = threshold)]
+    #[arg(long, value_name = "AH|PERCENT", required = true, value_delimiter = ',', value_parser = Threshold::from_str)]
     end_of_life: Vec<Threshold>,
     /// Parts of the life, per cent, at which forecasts are made and judged: 40,50,60,70,80 [default: one forecast, now]
     #[arg(long, value_name = "PERCENT,..", value_delimiter = ',', value_parser = part)]
@@ -47,11 +49,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     check_distinct(&args.files)?;
     let shown = if args.at.is_empty() {
         let forecasts: Vec<CurrentForecast> = each(args, rul::now)?;
-        if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
+        if args.json {
+            return print(&rul::now_json(&forecasts).map_err(failure)?);
+        }
+        report::now_table(&forecasts)
     } else {
         let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);
         let scored: Vec<HistoryScore> = each(args, score)?;
-        if args.json { report::scored_json(&scored, args.alpha) } else { report::scored_table(&scored, args.alpha) }
+        if args.json {
+            return print(&rul::scored_json(&scored, args.alpha).map_err(failure)?);
+        }
+        report::scored_table(&scored, args.alpha)
     };
     unless_closed(shown)
 }
@@ -64,17 +72,6 @@ fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> R
         all.extend(args.end_of_life.iter().map(|&threshold| work(&history, &name, threshold)));
     }
     Ok(all)
-}
-
-/// `1.4`, `1.4 Ah`, `70 %`.
-fn threshold(text: &str) -> Result<Threshold, String> {
-    const EXPECTED: &str =
-        "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
-    let found = match text.trim().strip_suffix('%') {
-        Some(percent) => below_100(percent).map(Threshold::OfFirst),
-        None => above_0(text.trim().trim_end_matches("Ah")).ok().map(Threshold::AmpereHours),
-    };
-    found.ok_or_else(|| EXPECTED.to_owned())
 }
 
 /// Per cent above 0 and below 100, as a fraction.
@@ -99,9 +96,13 @@ mod tests {
             ("70 %", Threshold::OfFirst(0.7)),
             ("70%", Threshold::OfFirst(0.7)),
         ] {
-            assert_eq!(threshold(text), Ok(expected));
+            assert_eq!(text.parse(), Ok(expected));
         }
-        assert!(["0", "-1", "100 %", "0%", "soon", "", "inf", "nan %"].iter().all(|text| threshold(text).is_err()));
+        assert!(
+            ["0", "-1", "100 %", "0%", "soon", "", "inf", "nan %"]
+                .iter()
+                .all(|text| text.parse::<Threshold>().is_err())
+        );
         assert_eq!(part("40"), Ok(0.4));
         assert!(part("100").is_err() && part("0").is_err() && fraction("0").is_err() && fraction("x").is_err());
     }

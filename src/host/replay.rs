@@ -10,8 +10,10 @@ use std::sync::atomic::Ordering;
 
 mod cells;
 mod clock;
+mod driver;
 mod in_order;
 mod intake;
+mod reading;
 mod rows;
 mod summary;
 
@@ -27,8 +29,11 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 pub use cells::CellSummary;
 pub use clock::LogTime;
 use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};
+pub use driver::MonitorDriver;
 pub use in_order::in_order;
 pub use intake::ProtectedSummary;
+pub use reading::{LogReading, RowFrames, SLEEP_GAP_S};
+pub use rows::ESTIMATE_COLUMNS;
 use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};
@@ -89,6 +94,9 @@ impl ReplaySettings {
 /// Called with each input and its outputs.
 pub type OutputWatch = Box<dyn FnMut(&Input<'_>, &Outputs)>;
 
+/// Called with outputs before they are emptied.
+pub type OutputSink = Box<dyn FnMut(&Outputs)>;
+
 /// Files of the results.
 #[derive(Default)]
 pub struct Sinks {
@@ -100,6 +108,8 @@ pub struct Sinks {
     pub frames: Option<ResultFile>,
     /// Called with each input and its outputs.
     pub watch: Option<OutputWatch>,
+    /// Called with all outputs, in their order, those after the last input too.
+    pub outputs: Option<OutputSink>,
 }
 
 /// Reason why a replay ended early.
@@ -230,7 +240,7 @@ impl Replay {
         if let Some(file) = &mut sinks.estimates {
             write_estimates_header(file)?;
         }
-        let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some();
+        let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some() || sinks.outputs.is_some();
         let out = Outputs { want_estimates, ..Outputs::default() };
         Ok(Self {
             monitor,
@@ -368,6 +378,9 @@ impl Replay {
         let out = &mut self.out;
         if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
             return Ok(());
+        }
+        if let Some(take) = &mut self.sinks.outputs {
+            take(out);
         }
         if let Some(file) = &mut self.sinks.estimates {
             self.summary.estimates += out.estimates.len() as u64;

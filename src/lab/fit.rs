@@ -6,6 +6,7 @@
 
 mod cells;
 mod chemistry;
+mod document;
 mod evidence;
 mod limits;
 pub mod logs;
@@ -21,13 +22,14 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 
 pub use cells::CellDeviation;
+pub use document::document;
 pub use picture::write as write_plot;
 pub use range::MeasuredRange;
 pub use toml::text;
 pub(crate) use toml::{quoted, table as toml_table};
 
 use super::measured::MeasuredFile;
-use crate::cell::{AgedOcv, Thermal};
+use crate::cell::{AgedOcv, MAX_BRANCHES, Thermal};
 use crate::error::LabError;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
@@ -94,6 +96,24 @@ pub struct FitRequest {
     pub first_cycles: Option<usize>,
     /// Files to fit.
     pub files: Vec<PathBuf>,
+}
+
+impl FitRequest {
+    /// Checks the lists.
+    ///
+    /// # Errors
+    /// A list that does not rise, or more time constants than a model has branches.
+    pub fn check(&self) -> Result<(), LabError> {
+        for (key, list) in [("--tau", &self.tau_s), ("--temperatures", &self.temperature_c)] {
+            if let Some([a, b]) = list.as_ref().and_then(|list| list.array_windows().find(|[a, b]| a >= b)) {
+                return Err(LabError(format!("{key}: {b} follows {a}, must rise")));
+            }
+        }
+        if self.tau_s.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
+            return Err(LabError(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
+        }
+        Ok(())
+    }
 }
 
 /// Progress of the fit, for a progress bar.

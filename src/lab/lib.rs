@@ -22,6 +22,7 @@ pub mod passport;
 pub mod report;
 pub mod rul;
 pub mod score;
+pub mod single_cell;
 
 use std::io::Write as _;
 use std::path::Path;

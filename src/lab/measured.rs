@@ -3,11 +3,25 @@
 //! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and where they exist `temperature_c`,
 //! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`) at each
 //! of whose values the time starts again. An empty field is NaN. A field that is no number is an error with its line.
+//!
+//! Files of the Battery Data Format, by their columns ([`BDF_COLUMNS`]), are read too. There, positive current is charge: the format
+//! does not state it, but counts its net capacity as charged minus discharged, and cyclers write it so. Time does not start again.
 
 use std::path::{Path, PathBuf};
 
 pub use crate::ident::MeasuredPart;
 use crate::io::table::{Header, PART_COLUMNS, Row, Table, TableError};
+
+/// Columns of the Battery Data Format: ours, the format's label, its name for machines; the first of several that is there counts.
+pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
+    ("time_s", "Test Time / s", "test_time_second"),
+    ("current_a", "Current / A", "current_ampere"),
+    ("voltage_v", "Voltage / V", "voltage_volt"),
+    ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
+    ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
+    // With the other sign, as the current.
+    ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
+];
 
 /// One measured file.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,6 +30,8 @@ pub struct MeasuredFile {
     pub path: PathBuf,
     /// Its parts in the file's order; one where there is no part column.
     pub parts: Vec<MeasuredPart>,
+    /// Whether it is of the Battery Data Format.
+    pub is_bdf: bool,
 }
 
 /// Numbers of the columns.
@@ -27,6 +43,8 @@ struct Columns {
     discharged: Option<usize>,
     part: Option<usize>,
     kind: Option<usize>,
+    /// Of current and charge: 1, or -1 where positive is charge.
+    sign: f64,
 }
 
 impl MeasuredFile {
@@ -44,7 +62,7 @@ impl MeasuredFile {
         if parts.is_empty() {
             return Err(table.header().file_fault("no rows after the header"));
         }
-        Ok(Self { path: path.to_owned(), parts })
+        Ok(Self { path: path.to_owned(), parts, is_bdf: columns.sign < 0.0 })
     }
 
     /// Rows of all parts.
@@ -55,6 +73,28 @@ impl MeasuredFile {
 
 impl Columns {
     fn find(header: &Header) -> Result<Self, TableError> {
+        let is_bdf = header.find("time_s").is_none() && bdf_column(header, "time_s").is_some();
+        if is_bdf { Self::find_bdf(header) } else { Self::find_ours(header) }
+    }
+
+    fn find_bdf(header: &Header) -> Result<Self, TableError> {
+        let required = |ours: &str| {
+            let names: Vec<&str> = BDF_COLUMNS.iter().filter(|of| of.0 == ours).map(|of| of.1).collect();
+            bdf_column(header, ours).map_or_else(|| header.required(&names), Ok)
+        };
+        Ok(Self {
+            time: required("time_s")?,
+            current: required("current_a")?,
+            voltage: required("voltage_v")?,
+            temperature: bdf_column(header, "temperature_c"),
+            discharged: bdf_column(header, "discharged_ah"),
+            part: None,
+            kind: None,
+            sign: -1.0,
+        })
+    }
+
+    fn find_ours(header: &Header) -> Result<Self, TableError> {
         Ok(Self {
             time: header.required(&["time_s"])?,
             current: header.required(&["current_a"])?,
@@ -63,7 +103,13 @@ impl Columns {
             discharged: header.find("discharged_ah"),
             part: header.find_any(&PART_COLUMNS),
             kind: header.find("type"),
+            sign: 1.0,
         })
+    }
+
+    /// With our sign; 0 stays a positive 0.
+    fn signed(&self, value: f64) -> f64 {
+        self.sign * value + 0.0
     }
 
     /// Adds a row to the last part, or to a new one where the key differs.
@@ -72,8 +118,8 @@ impl Columns {
         let number = |column: usize| Ok(row.number(column)?.unwrap_or(f64::NAN));
         let optional = |column: Option<usize>| column.map_or(Ok(f64::NAN), number);
         let time_s = row.number(self.time)?.ok_or_else(|| row.fault(self.time, "seconds"))?;
-        let (current_a, voltage_v) = (number(self.current)?, number(self.voltage)?);
-        let (temperature_c, discharged_ah) = (optional(self.temperature)?, optional(self.discharged)?);
+        let (current_a, voltage_v) = (self.signed(number(self.current)?), number(self.voltage)?);
+        let (temperature_c, discharged_ah) = (optional(self.temperature)?, self.signed(optional(self.discharged)?));
         let key = text(self.part);
         if parts.last().is_none_or(|part| part.key != key) {
             let kind = text(self.kind).into_owned();
@@ -83,6 +129,12 @@ impl Columns {
         part.push(time_s, current_a, voltage_v, temperature_c, discharged_ah);
         Ok(())
     }
+}
+
+/// The column of the Battery Data Format that stands for one of ours.
+fn bdf_column(header: &Header, ours: &str) -> Option<usize> {
+    let names = BDF_COLUMNS.iter().filter(|of| of.0 == ours);
+    names.into_iter().find_map(|(_, label, name)| header.find_any(&[label, name]))
 }
 
 #[cfg(test)]
@@ -104,6 +156,20 @@ mod tests {
         assert_eq!((file.parts.len(), file.rows()), (2, 3));
         assert_eq!((file.parts[1].key.as_str(), file.parts[1].kind.as_str()), ("4", "discharge"));
         assert!(file.parts[0].voltage_v[1].is_nan() && file.parts[0].temperature_c[0].is_nan());
+    }
+
+    #[test]
+    fn of_the_battery_data_format_positive_current_is_charge_and_the_surface_counts_before_the_ambient() {
+        let head = "Test Time / s,Voltage / V,Current / A,Ambient Temperature / degC,Surface Temperature T1 / degC,Cycle Count / 1";
+        let file = read(&format!("{head},Net Capacity / Ah\n0,3.5,-2,20,21,1\n1,3.4,1.5,20,,2\n")).expect("reads");
+        let part = &file.parts[0];
+        assert_eq!((file.parts.len(), &part.current_a), (1, &vec![2.0, -1.5]));
+        assert!(part.temperature_c[0] == 21.0 && part.temperature_c[1].is_nan() && part.discharged_ah[0].is_nan());
+        let file =
+            read("test_time_second,voltage_volt,current_ampere,net_capacity_ah\n0,3.5,-2,-0.25\n").expect("reads");
+        assert_eq!((file.parts[0].current_a[0], file.parts[0].discharged_ah[0]), (2.0, 0.25));
+        let found = read("Test Time / s,Voltage / V\n0,3.5\n");
+        assert_eq!(found, Err("cell.csv:1: no column Current / A, found Test Time / s,Voltage / V".into()));
     }
 
     #[test]

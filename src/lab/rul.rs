@@ -10,13 +10,17 @@
 //! nor hastens it.
 
 mod baseline;
+mod document;
 mod history;
 mod truth;
+
+use std::str::FromStr;
 
 use serde::Serialize;
 
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, RemainingLife, Usage};
 
+pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
@@ -120,6 +124,24 @@ pub struct CurrentForecast {
     /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
+}
+
+impl FromStr for Threshold {
+    type Err = String;
+
+    /// `1.4`, `1.4 Ah`, `70 %`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        const EXPECTED: &str =
+            "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
+        let above_0 = |text: &str| text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
+        let found = match text.trim().strip_suffix('%') {
+            Some(percent) => {
+                above_0(percent).filter(|percent| *percent < 100.0).map(|percent| Self::OfFirst(percent / 100.0))
+            }
+            None => above_0(text.trim().trim_end_matches("Ah")).map(Self::AmpereHours),
+        };
+        found.ok_or_else(|| EXPECTED.to_owned())
+    }
 }
 
 impl Threshold {

@@ -15,6 +15,8 @@ mod feed;
 mod learn;
 mod life;
 mod picture;
+mod report;
+mod request;
 mod soc;
 mod window;
 
@@ -26,6 +28,8 @@ pub use case::{Case, CaseScore, Start};
 pub use cycles::CycleTable;
 pub use learn::{Learned, learn};
 pub use life::{DischargeScore, LifeScore};
+pub use report::ScoreReport;
+pub use request::{ScoreRequest, ScoreRun};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
 use super::measured::MeasuredFile;

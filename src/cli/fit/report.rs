@@ -1,4 +1,4 @@
-//! Output of `fit`: progress on the terminal, the table of residuals, JSON.
+//! Output of `fit`: progress on the terminal, the table of residuals.
 
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -42,36 +42,4 @@ pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Resu
     let fit = &outcome.fit;
     let ended = if fit.converged { "converged" } else { "stopped" };
     writeln!(out, "{ended} after {} passes, {seconds:.1} s; written to {}", fit.passes, path.display())
-}
-
-/// Prints the outcome as JSON.
-pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
-    let of_file = |file: &crate::lab::fit::FileResidual| {
-        let r = &file.residual;
-        serde_json::json!({
-            "path": file.path, "rows": file.rows, "seconds": file.seconds, "outliers": file.outliers,
-            "rmse_v": r.rmse_v, "mean_v": r.mean_v, "worst_v": r.worst_v,
-        })
-    };
-    let cells = outcome.logs.iter().flat_map(|logs| &logs.cells).zip(1..).map(|(cell, number)| {
-        serde_json::json!({
-            "cell": number, "capacity_ah": outcome.capacity_ah * cell.capacity_ratio.0,
-            "capacity_std_ah": outcome.capacity_ah * cell.capacity_ratio.1,
-            "resistance_ratio": cell.resistance_ratio.0, "resistance_ratio_std": cell.resistance_ratio.1,
-            "leakage_per_h": cell.leakage_per_h.0, "residual_v": cell.residual_v,
-        })
-    });
-    let value = serde_json::json!({
-        "files": outcome.files.iter().map(of_file).collect::<Vec<_>>(),
-        "rmse_v": outcome.fit.total.rmse_v,
-        "capacity_ah": outcome.capacity_ah,
-        "capacity_std_ah": outcome.logs.as_ref().map(|logs| logs.capacity_std_ah),
-        "cells": cells.collect::<Vec<_>>(),
-        "passes": outcome.fit.passes,
-        "converged": outcome.fit.converged,
-        "notes": outcome.notes,
-        "verdict": outcome.verdict,
-        "seconds": seconds,
-    });
-    writeln!(io::stdout().lock(), "{value}")
 }

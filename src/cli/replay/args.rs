@@ -6,7 +6,7 @@ use crate::cli::Failure;
 use crate::cli::run::away;
 use crate::io::stamp;
 use crate::monitor::Downtime;
-use crate::replay::LogTime;
+use crate::replay::{LogTime, SLEEP_GAP_S};
 
 /// Which way a CSV's positive current flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -84,7 +84,7 @@ pub(crate) struct InputArgs {
     #[arg(long)]
     pub(crate) strict: bool,
     /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
-    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
+    #[arg(long, value_name = "S", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
     /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
     /// the letter n in braces in the names stands for the number of the cell or sensor, from 1

@@ -100,7 +100,7 @@ fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result
         estimates: create(&estimates)?,
         events: super::events_file(events.as_deref(), config)?,
         frames: create(&frames)?,
-        watch: None,
+        ..Sinks::default()
     };
     let mut source = LogSource::new([log.to_owned()], super::log_options(&args.input, config));
     let settings = super::plain_settings(args, config);

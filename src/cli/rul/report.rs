@@ -1,44 +1,10 @@
-//! Output of `rul`: tables and JSON.
+//! Output of `rul`: tables.
 
 use std::io::{self, Write};
 
-use serde::Serialize;
-
-use crate::cli::output::{print_json, write_table};
+use crate::cli::output::write_table;
 use crate::health::{Axis, Remaining};
 use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
-
-/// Version of the JSON documents.
-const VERSION: u32 = 1;
-
-#[derive(Serialize)]
-struct NowDocument<'a> {
-    version: u32,
-    interval: [f64; 2],
-    forecasts: &'a [CurrentForecast],
-}
-
-#[derive(Serialize)]
-struct ScoredDocument<'a> {
-    version: u32,
-    interval: [f64; 2],
-    alpha: f64,
-    files: &'a [HistoryScore],
-    total: Option<ScoreTotal>,
-}
-
-/// Quantiles of the interval.
-const INTERVAL: [f64; 2] = [0.05, 0.95];
-
-/// Prints forecasts at the end of the histories as JSON.
-pub(super) fn now_json(forecasts: &[CurrentForecast]) -> io::Result<()> {
-    print_json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
-}
-
-/// Prints scored forecasts as JSON.
-pub(super) fn scored_json(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
-    print_json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
-}
 
 /// Prints forecasts at the end of the histories as a table.
 pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {

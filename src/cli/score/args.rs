@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use crate::cli::Failure;
 use crate::cli::label::LabelArgs;
 use crate::cli::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
-use crate::cli::output::check_distinct;
-use crate::lab::score::Start;
+use crate::lab::score::{ScoreRequest, Start};
+use crate::lab::single_cell::CellSource;
 
 /// Where in a file the estimator starts.
 const STARTS: [NamedValue<Start>; 2] = [
@@ -134,15 +133,31 @@ pub(crate) struct OutputArgs {
 }
 
 impl Args {
-    /// Checks the arguments that depend on each other.
-    pub(super) fn check(&self) -> Result<(), Failure> {
-        let (files, tables) = (self.files.len(), self.life.cycles.len());
-        if tables != 0 && tables != files {
-            return Err(Failure::new(format!(
-                "--cycles given {tables} times for {files} files, must be once per file"
-            )));
+    /// What is asked for.
+    pub(super) fn request(&self) -> ScoreRequest {
+        let Self { files, config, cell, label, learn, starts, statistics, life, output } = self;
+        ScoreRequest {
+            files: files.clone(),
+            source: CellSource { config: config.clone(), cell: cell.clone(), label: label.keys() },
+            learn: learn.clone(),
+            start: starts.start.clone(),
+            remove: starts.remove,
+            soc_error_points: starts.soc_error.iter().map(|error| error.0).collect(),
+            soc_std_points: starts.soc_std,
+            capacity_error_percent: starts.capacity_error.clone(),
+            capacity_std_percent: starts.capacity_std,
+            current_offset_a: starts.current_offset.clone(),
+            settle_s: statistics.settle,
+            truth_capacity_ah: statistics.truth_capacity,
+            sleep_gap_s: statistics.sleep_gap,
+            cycles: life.cycles.clone(),
+            load: life.load,
+            threshold_ah: life.threshold,
+            skip_cycles: life.skip_cycles,
+            window: life.window,
+            seeds: life.seed.clone(),
+            plots: output.plot.clone(),
         }
-        check_distinct(&self.files)
     }
 }
 
@@ -191,6 +206,19 @@ mod tests {
         assert_eq!(duration("10min"), Ok(600.0));
         assert_eq!((duration("90"), duration("90 s"), duration("0.5h")), (Ok(90.0), Ok(90.0), Ok(1800.0)));
         assert!(duration("-1s").is_err() && duration("soon").is_err() && duration("min").is_err());
+    }
+
+    #[test]
+    fn nothing_but_files_and_a_cell_is_the_default_request() {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            args: Args,
+        }
+        let line = <Line as clap::Parser>::try_parse_from(["score", "a.csv", "--cell", "m.toml"]);
+        let source = CellSource { cell: Some("m.toml".into()), ..CellSource::default() };
+        let expected = ScoreRequest { files: vec!["a.csv".into()], source, ..ScoreRequest::default() };
+        assert_eq!(line.map(|line| line.args.request()).map_err(|error| error.to_string()), Ok(expected));
     }
 
     #[test]

@@ -160,7 +160,8 @@ pub struct InterfaceConfig {
 }
 
 /// All faults of a configuration, one line each: `pack.toml:14: pack.cells = 0, must be 1 to 1024`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", .0.join("\n"))]
 pub struct ConfigFaults(pub Vec<String>);
 
 /// Reads the bytes of a file: from the disk, or (demo, tests) from memory.

@@ -2,19 +2,33 @@
 
 use std::io::{self, Write};
 
-use crate::cell::MAX_BRANCHES;
 use crate::io::candump::{self, StampDigits};
 use crate::monitor::{Estimate, Transmit};
 
+/// Columns of the estimates, in their order.
+pub const ESTIMATE_COLUMNS: [&str; 17] = [
+    "time_s",
+    "cell",
+    "soc",
+    "soc_std",
+    "u1_v",
+    "u2_v",
+    "u3_v",
+    "capacity_ah",
+    "capacity_std_ah",
+    "resistance_ratio",
+    "resistance_ratio_std",
+    "innovation_v",
+    "innovation_std_v",
+    "accepted",
+    "voltage_v",
+    "current_a",
+    "temperature_c",
+];
+
 /// The column names.
 pub(super) fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
-    write!(out, "time_s,cell,soc,soc_std")?;
-    (1..=MAX_BRANCHES).try_for_each(|n| write!(out, ",u{n}_v"))?;
-    writeln!(
-        out,
-        ",capacity_ah,capacity_std_ah,resistance_ratio,resistance_ratio_std,innovation_v,innovation_std_v,accepted,\
-         voltage_v,current_a,temperature_c"
-    )
+    writeln!(out, "{}", ESTIMATE_COLUMNS.join(","))
 }
 
 /// One row; floats in the shortest form that reads back the same, nothing for NaN.

@@ -276,8 +276,8 @@ impl<'a> CaseRun<'a> {
         );
         self.take_events();
         let truth = truth(part, row, self.settings);
-        let estimate = self.feeder.out.estimates.pop();
-        self.feeder.out.clear();
+        let estimate = self.feeder.out().estimates.pop();
+        self.feeder.out().clear();
         self.last = estimate.or(self.last);
         match estimate {
             Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => {
@@ -294,7 +294,7 @@ impl<'a> CaseRun<'a> {
     }
 
     fn take_events(&mut self) {
-        for event in self.feeder.out.events.drain(..) {
+        for event in self.feeder.out().events.drain(..) {
             self.resets += usize::from(matches!(event.kind, EventKind::FilterReset { .. }));
             if let Some(table) = &self.cycles {
                 self.life.observe(&event, table);
@@ -320,7 +320,7 @@ impl<'a> CaseRun<'a> {
             name: job.name.clone(),
             case: *case,
             rows: self.rows,
-            uncarried_values: self.feeder.uncarried,
+            uncarried_values: self.feeder.uncarried(),
             resets: self.resets,
             final_capacity_ah: last.map(|e| e.capacity_ah),
             final_capacity_std_ah: last.map(|e| e.capacity_std_ah),

@@ -27,7 +27,7 @@ pub struct Learned {
 /// A file that cannot be read.
 pub fn learn(files: &[PathBuf], config: &MonitorConfig, sleep_gap_s: f64) -> Result<Learned, LabError> {
     let mut feeder = Feeder::new(config.clone(), sleep_gap_s, None);
-    feeder.out.want_estimates = false;
+    feeder.out().want_estimates = false;
     let mut latest = Timestamp::ZERO;
     for path in files {
         for part in &MeasuredFile::read(path)?.parts {
@@ -37,7 +37,7 @@ pub fn learn(files: &[PathBuf], config: &MonitorConfig, sleep_gap_s: f64) -> Res
             for row in 0..part.len() {
                 let time = base.plus_secs(part.time_s[row]);
                 feeder.row(time, part.current_a[row], part.voltage_v[row], part.temperature_c[row]);
-                feeder.out.clear();
+                feeder.out().clear();
                 latest = latest.max(time);
             }
         }

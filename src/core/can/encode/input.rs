@@ -6,7 +6,11 @@
 //! if one of its signals has a "not available" code. Values beyond the bits saturate; values outside the DBC's range stay
 //! outside, so that their receiver detects the fault. A diagnostic answer is made with its request and flow control, as on a
 //! bus with a tester.
+//!
+//! Rows of one log have the same channels in the same order: where the value of each signal is in a row is looked up once and
+//! kept until the channels change.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use crate::can::decode::{Binding, Channel, InputMap};
@@ -24,6 +28,33 @@ const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 pub struct InputEncoder {
     pages: Vec<InputPage>,
     answers: Vec<AnswerPage>,
+    /// Of the last row; kept, because the next one most often has the same channels.
+    places: RefCell<RowPlaces>,
+}
+
+/// Where the values of the fields are in a row of values.
+#[derive(Debug, Clone, Default)]
+struct RowPlaces {
+    channels: Vec<RowChannel>,
+    /// Place of each field's value, by the field's number; `None` = the row has no such channel.
+    of_fields: Vec<Option<usize>>,
+}
+
+/// A row of values, and where they are.
+#[derive(Clone, Copy)]
+struct PlacedRow<'a> {
+    values: &'a [(Channel, Option<f64>)],
+    of_fields: &'a [Option<usize>],
+}
+
+/// A place in a row of values.
+#[derive(Debug, Clone, Copy)]
+struct RowChannel {
+    channel: Channel,
+    /// A later place has the same channel, and its value counts.
+    is_overridden: bool,
+    /// Whether a frame carries the value of the current row.
+    is_carried: bool,
 }
 
 /// One diagnostic answer.
@@ -50,6 +81,8 @@ struct InputPage {
 #[derive(Debug, Clone)]
 struct InputField {
     channel: Channel,
+    /// Number among all fields of the encoder, for [`RowPlaces`].
+    number: usize,
     plan: SignalPlan,
     scale: f64,
     offset: f64,
@@ -76,6 +109,7 @@ impl InputField {
         };
         Self {
             channel: binding.channel,
+            number: 0,
             plan: binding.plan,
             scale: binding.scale,
             offset: binding.offset,
@@ -84,13 +118,18 @@ impl InputField {
         }
     }
 
+    fn place(&self, of_fields: &[Option<usize>]) -> Option<usize> {
+        of_fields.get(self.number).copied().flatten()
+    }
+
+    /// Its value in a row; NaN is no value.
+    fn value(&self, row: PlacedRow<'_>) -> Option<f64> {
+        row.values.get(self.place(row.of_fields)?)?.1.filter(|value| !value.is_nan())
+    }
+
     /// Whether a frame is needed for it.
-    fn is_sent(&self, given: &BTreeMap<Channel, Option<f64>>) -> bool {
-        match given.get(&self.channel) {
-            Some(Some(_)) => true,
-            Some(None) => self.has_not_available,
-            None => false,
-        }
+    fn is_sent(&self, row: PlacedRow<'_>) -> bool {
+        self.place(row.of_fields).is_some() && (self.has_not_available || self.value(row).is_some())
     }
 
     fn code(&self, value: Option<f64>) -> Option<u64> {
@@ -112,35 +151,78 @@ impl InputEncoder {
             templates.dedup();
             templates.into_iter().map(|template| InputPage::new(message, template))
         });
-        Self { pages: pages.collect(), answers: Vec::new() }
+        Self { pages: pages.collect(), answers: Vec::new(), places: RefCell::default() }.numbered()
     }
 
     /// The same with diagnostic answers, made after the frames.
     #[must_use]
     pub fn with_answers(self, answers: &[Answer]) -> Self {
-        Self { answers: answers.iter().map(AnswerPage::new).collect(), ..self }
+        Self { answers: answers.iter().map(AnswerPage::new).collect(), ..self }.numbered()
     }
 
     /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value now". Returns how many
     /// values no frame could carry.
     pub fn encode(&self, values: &[(Channel, Option<f64>)], out: &mut Vec<(BusIndex, Frame)>) -> usize {
-        let given: BTreeMap<Channel, Option<f64>> =
-            values.iter().map(|(channel, value)| (*channel, value.filter(|value| !value.is_nan()))).collect();
-        let mut open: Vec<Channel> =
-            given.iter().filter(|(_, value)| value.is_some()).map(|(channel, _)| *channel).collect();
+        let mut places = self.places.borrow_mut();
+        if !places.are_of(values) {
+            *places = self.find_places(values);
+        }
+        let RowPlaces { channels, of_fields } = &mut *places;
+        channels.iter_mut().for_each(|of| of.is_carried = false);
+        let row = PlacedRow { values, of_fields };
+        let mut carry = |field: &InputField| {
+            let of = field.place(row.of_fields).and_then(|place| channels.get_mut(place));
+            of.into_iter().for_each(|of| of.is_carried = true);
+        };
         for page in &self.pages {
-            if let Some(frame) = page.frame(&given) {
-                open.retain(|channel| !page.fields.iter().any(|field| field.channel == *channel));
+            if let Some(frame) = page.frame(row) {
+                page.fields.iter().for_each(&mut carry);
                 out.push((page.bus, frame));
             }
         }
         for answer in &self.answers {
-            if let Some(message) = answer.message(&given) {
-                open.retain(|channel| !answer.fields.iter().any(|(_, field)| field.channel == *channel));
+            if let Some(message) = answer.message(row) {
+                answer.fields.iter().for_each(|(_, field)| carry(field));
                 answer.exchange(&message, out);
             }
         }
-        open.len()
+        let is_open = |of: &RowChannel| !of.is_carried && !of.is_overridden;
+        let is_known = |value: Option<f64>| value.is_some_and(|value| !value.is_nan());
+        channels.iter().zip(values).filter(|(of, (_, value))| is_open(of) && is_known(*value)).count()
+    }
+
+    /// Numbers the fields.
+    fn numbered(mut self) -> Self {
+        let of_pages = self.pages.iter_mut().flat_map(|page| &mut page.fields);
+        let of_answers = self.answers.iter_mut().flat_map(|answer| &mut answer.fields).map(|(_, field)| field);
+        of_pages.chain(of_answers).enumerate().for_each(|(number, field)| field.number = number);
+        self.places = RefCell::default();
+        self
+    }
+
+    /// Finds where the values of the fields are in rows of these channels.
+    fn find_places(&self, values: &[(Channel, Option<f64>)]) -> RowPlaces {
+        let last: BTreeMap<Channel, usize> = values.iter().enumerate().map(|(place, value)| (value.0, place)).collect();
+        let of_pages = self.pages.iter().flat_map(|page| &page.fields);
+        let of_answers = self.answers.iter().flat_map(|answer| &answer.fields).map(|(_, field)| field);
+        let channel = |(place, &(channel, _)): (usize, &(Channel, _))| RowChannel {
+            channel,
+            is_overridden: last.get(&channel) != Some(&place),
+            is_carried: false,
+        };
+        RowPlaces {
+            channels: values.iter().enumerate().map(channel).collect(),
+            of_fields: of_pages.chain(of_answers).map(|field| last.get(&field.channel).copied()).collect(),
+        }
+    }
+}
+
+impl RowPlaces {
+    /// Whether they are those of a row of the same channels.
+    fn are_of(&self, values: &[(Channel, Option<f64>)]) -> bool {
+        // An encoder that has seen no row has no places yet.
+        let is_found = !self.of_fields.is_empty() && self.channels.len() == values.len();
+        is_found && self.channels.iter().zip(values).all(|(of, (channel, _))| of.channel == *channel)
     }
 }
 
@@ -155,13 +237,13 @@ impl AnswerPage {
     }
 
     /// The answer with these values; `None` when none of them is in it, or one that is missing has no code.
-    fn message(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Vec<u8>> {
-        if !self.fields.iter().any(|(_, field)| field.is_sent(given)) {
+    fn message(&self, row: PlacedRow<'_>) -> Option<Vec<u8>> {
+        if !self.fields.iter().any(|(_, field)| field.is_sent(row)) {
             return None;
         }
         let mut message = self.template.clone();
         for (first_byte, field) in &self.fields {
-            let code = field.code(given.get(&field.channel).copied().flatten())?;
+            let code = field.code(field.value(row))?;
             field.plan.encode_raw(message.get_mut(*first_byte..)?, code).ok()?;
         }
         Some(message)
@@ -196,13 +278,13 @@ impl InputPage {
         Self { bus, id, len, template, fields: present.into_iter().map(InputField::new).collect() }
     }
 
-    fn frame(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Frame> {
-        if !self.fields.iter().any(|field| field.is_sent(given)) {
+    fn frame(&self, row: PlacedRow<'_>) -> Option<Frame> {
+        if !self.fields.iter().any(|field| field.is_sent(row)) {
             return None;
         }
         let mut payload = self.template;
         for field in &self.fields {
-            let code = field.code(given.get(&field.channel).copied().flatten())?;
+            let code = field.code(field.value(row))?;
             field.plan.encode_raw(&mut payload, code).ok()?;
         }
         Frame::padded(self.id, self.len, &payload)

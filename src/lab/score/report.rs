@@ -1,48 +1,26 @@
-//! Output of `score`: a progress bar, tables, JSON.
+//! The scores as text: tables for people, one JSON document for programs.
 
-use std::io::{self, Write};
+use std::fmt::Write as _;
+use std::path::PathBuf;
 
-use indicatif::ProgressBar;
 use serde::Serialize;
 
-use crate::cli::output::{print_json, progress_bar, write_table};
-use crate::config::Config;
-use crate::lab::score::{
-    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore,
-};
+use super::{CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreSettings, SocScore};
+use crate::error::LabError;
+use crate::io::text_table::text_table;
 use crate::monitor::ModelState;
 
-/// Progress on standard error, when that is a terminal; by the files' sizes.
-pub(super) struct Bar {
-    bar: ProgressBar,
-    bytes: Vec<f64>,
-}
-
-impl Bar {
-    pub(super) fn new(jobs: &[ScoreJob]) -> Self {
-        let bytes: Vec<f64> =
-            jobs.iter().map(|job| std::fs::metadata(&job.path).map_or(0.0, |found| found.len() as f64)).collect();
-        let bar = progress_bar(bytes.iter().sum::<f64>() as u64, "{bar:32} {percent} % of {msg}, eta {eta}");
-        bar.set_message(if jobs.len() == 1 { "1 file".to_owned() } else { format!("{} files", jobs.len()) });
-        Self { bar, bytes }
-    }
-
-    /// Adds a share of the work on file `index`.
-    pub(super) fn advance(&self, index: usize, part: f64) {
-        self.bar.inc((part * self.bytes.get(index).copied().unwrap_or(0.0)).round() as u64);
-    }
-
-    pub(super) fn clear(&self) {
-        self.bar.finish_and_clear();
-    }
-}
-
 /// Scores with their settings.
-pub(super) struct ScoreReport<'a> {
-    pub(super) config: &'a Config,
-    pub(super) settings: &'a ScoreSettings,
-    pub(super) cases: &'a [Case],
-    pub(super) scores: &'a [CaseScore],
+#[derive(Debug)]
+pub struct ScoreReport {
+    /// The configuration's path.
+    pub config: PathBuf,
+    /// Settings of all files and cases.
+    pub settings: ScoreSettings,
+    /// The cases.
+    pub cases: Vec<Case>,
+    /// Every file in every case.
+    pub scores: Vec<CaseScore>,
 }
 
 /// Columns of the table of SOC errors.
@@ -108,11 +86,14 @@ struct LifeTotal<'a> {
     least_coverage: f64,
 }
 
-impl ScoreReport<'_> {
-    /// Prints one JSON document on standard output.
-    pub(super) fn json(&self) -> io::Result<()> {
-        print_json(&Document {
-            config: self.config.path.display().to_string(),
+impl ScoreReport {
+    /// One JSON document, with a line feed at its end.
+    ///
+    /// # Errors
+    /// Never: every value has a form in JSON.
+    pub fn json(&self) -> Result<String, LabError> {
+        let document = Document {
+            config: self.config.display().to_string(),
             cell_model: &self.settings.monitor.model.name,
             truth_capacity_ah: self.settings.truth_capacity_ah,
             settle_s: self.settings.settle_s,
@@ -123,31 +104,31 @@ impl ScoreReport<'_> {
                 capacity_ah: learned.capacity.mean,
                 capacity_std_ah: learned.capacity.std(),
             }),
-            scores: self.scores,
+            scores: &self.scores,
             totals: self.totals(),
-        })
+        };
+        Ok(serde_json::to_string_pretty(&document)? + "\n")
     }
 
-    /// Prints tables on standard output.
-    pub(super) fn table(&self) -> io::Result<()> {
-        let mut out = io::stdout().lock();
-        let settings = self.settings;
-        writeln!(out, "cell model {}", settings.monitor.model.name)?;
+    /// Tables for people.
+    pub fn table(&self) -> String {
+        let settings = &self.settings;
+        let mut out = format!("cell model {}\n", settings.monitor.model.name);
         if self.scores.iter().any(|score| score.soc.is_some()) {
             let (truth_ah, settle_s, hold_min) =
                 (settings.truth_capacity_ah, settings.settle_s, CONVERGED_HOLD_S / 60.0);
-            writeln!(
-                out,
-                "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min"
-            )?;
-            write_table(&mut out, &SOC_HEADS, self.soc_rows(), 2)?;
+            out += &format!(
+                "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min\n"
+            );
+            out += &text_table(&SOC_HEADS, self.soc_rows(), 2);
         }
         if self.scores.iter().any(|score| score.life.is_some()) {
-            writeln!(out, "\nusable capacity after {} discharges", settings.skip_cycles)?;
+            out += &format!("\nusable capacity after {} discharges\n", settings.skip_cycles);
             let below = format!("below {} Ah", settings.threshold_ah);
-            write_table(&mut out, &life_heads(&below), self.life_rows(), 2)?;
+            out += &text_table(&life_heads(&below), self.life_rows(), 2);
         }
-        self.notes(&mut out)
+        self.add_notes(&mut out);
+        out
     }
 
     fn totals(&self) -> Vec<Total<'_>> {
@@ -180,31 +161,34 @@ impl ScoreReport<'_> {
         scored.map(|(score, life)| life_row(score, life)).collect()
     }
 
-    /// Prints which values were not fed or not scored.
-    fn notes(&self, out: &mut impl Write) -> io::Result<()> {
-        for score in self.scores {
+    /// Adds which values were not fed or not scored.
+    fn add_notes(&self, out: &mut String) {
+        let mut note = |text: std::fmt::Arguments<'_>| {
+            // Writing to a text cannot fail.
+            let _ = writeln!(out, "{text}");
+        };
+        for score in &self.scores {
             let (name, case) = (&score.name, describe(&score.case));
             let left_out = score.soc.as_ref().map_or(0, |soc| soc.left_out_rows);
             if left_out > 0 {
-                writeln!(out, "{name}, {case}: {left_out} of {} rows left out (no truth or no estimate)", score.rows)?;
+                let rows = score.rows;
+                note(format_args!("{name}, {case}: {left_out} of {rows} rows left out (no truth or no estimate)"));
             }
             if score.uncarried_values > 0 {
-                writeln!(out, "{name}, {case}: {} values that no frame can carry", score.uncarried_values)?;
+                note(format_args!("{name}, {case}: {} values that no frame can carry", score.uncarried_values));
             }
             if let Some(life) = score.life.as_ref().filter(|life| life.left_out > 0) {
                 let (left_out, all) = (life.left_out, life.discharges);
-                writeln!(
-                    out,
+                note(format_args!(
                     "{name}, {case}: {left_out} of {all} discharges left out (no estimate or no published capacity)"
-                )?;
+                ));
             }
         }
         let plots = self.scores.iter().filter(|score| score.plot.is_some()).count();
         if let (1.., Some(folder)) = (plots, &self.settings.plots) {
             let noun = if plots == 1 { "plot" } else { "plots" };
-            writeln!(out, "{plots} {noun} in {}", folder.display())?;
+            note(format_args!("{plots} {noun} in {}", folder.display()));
         }
-        Ok(())
     }
 }
 

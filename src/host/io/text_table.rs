@@ -1,0 +1,19 @@
+//! Tables of text for people.
+
+/// Columns as wide as their widest entry: the first `left` are aligned to the left, the others to the right.
+pub fn text_table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec<String>>, left: usize) -> String {
+    let heads: Vec<String> = heads.iter().map(|head| head.as_ref().to_owned()).collect();
+    let rows: Vec<Vec<String>> = Some(heads).filter(|heads| !heads.is_empty()).into_iter().chain(rows).collect();
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
+    let widths: Vec<usize> =
+        (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| {
+        let cells = widths.iter().enumerate().map(|(column, &width)| {
+            let text = entry(row, column);
+            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
+        });
+        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned() + "\n"
+    };
+    rows.iter().map(line).collect()
+}

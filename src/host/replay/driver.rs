@@ -1,0 +1,83 @@
+//! A monitor that its caller drives with rows of values or frames, and the ticks of a replay between them.
+//!
+//! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the caller
+//! empties. Promise: the same inputs give the same outputs as `packwatch replay` of a log with them.
+
+use super::RowFrames;
+use crate::can::Frame;
+use crate::can::decode::Channel;
+use crate::io::ticks::Ticks;
+use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use crate::quantity::{BusIndex, Timestamp};
+
+/// A monitor, its ticks, and the encoder of rows.
+#[derive(Debug)]
+pub struct MonitorDriver {
+    /// The monitor.
+    pub monitor: Monitor,
+    row_frames: RowFrames,
+    ticks: Ticks,
+    frames: Vec<(BusIndex, Frame)>,
+    /// Outputs since the caller last emptied them.
+    pub out: Outputs,
+    /// Values that no frame can carry.
+    pub uncarried_values: usize,
+}
+
+impl MonitorDriver {
+    /// A monitor before its first input; a gap of inputs longer than `sleep_gap_s` means that the recorder was asleep, s.
+    pub fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
+        Self {
+            row_frames: RowFrames::new(&config),
+            monitor: Monitor::new(config),
+            ticks: Ticks::new(TICK_PERIOD_MS, sleep_gap_s),
+            frames: Vec::new(),
+            out: Outputs { want_estimates: true, ..Outputs::default() },
+            uncarried_values: 0,
+        }
+    }
+
+    /// Takes one row: `None` and NaN mean "no value now".
+    pub fn handle_row(&mut self, time: Timestamp, values: &[(Channel, Option<f64>)]) {
+        self.advance(time);
+        let mut frames = std::mem::take(&mut self.frames);
+        self.uncarried_values += self.row_frames.encode(values, &mut frames);
+        for (bus, frame) in frames.drain(..) {
+            self.monitor.handle(Input::Frame { time, bus, frame: &frame }, &mut self.out);
+        }
+        self.frames = frames;
+    }
+
+    /// Takes one frame.
+    pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        self.advance(time);
+        self.monitor.handle(Input::Frame { time, bus, frame }, &mut self.out);
+    }
+
+    /// The record continues at `time` after a gap of unknown length.
+    pub fn handle_unknown_gap(&mut self, time: Timestamp) {
+        self.ticks.sleep();
+        self.send_ticks();
+        self.monitor.handle(Input::UnknownGap { time }, &mut self.out);
+    }
+
+    /// Ends the record: its last samples become estimates.
+    pub fn finish(&mut self) {
+        self.ticks.sleep();
+        self.send_ticks();
+        self.monitor.settle(&mut self.out);
+    }
+
+    fn advance(&mut self, time: Timestamp) {
+        if !self.ticks.advance_within(time, self.monitor.next_due()) {
+            self.ticks.advance(time);
+            self.send_ticks();
+        }
+    }
+
+    fn send_ticks(&mut self) {
+        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+            self.monitor.handle(Input::Tick { time }, &mut self.out);
+        }
+    }
+}

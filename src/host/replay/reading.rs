@@ -1,0 +1,75 @@
+//! How logs are read with a configuration: the settings of a reader, completed by what the configuration says.
+
+use std::path::PathBuf;
+
+use crate::can::Frame;
+use crate::can::decode::Channel;
+use crate::can::encode::{InputEncoder, InputProtector};
+use crate::config::Config;
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::LogOptions;
+use crate::monitor::MonitorConfig;
+use crate::quantity::BusIndex;
+use crate::sample::VoltageSource;
+
+/// A hole in a log longer than this means that the recorder was asleep, s, unless another is given.
+pub const SLEEP_GAP_S: f64 = 30.0;
+
+/// How logs are read.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LogReading {
+    /// A malformed line ends the reading.
+    pub strict: bool,
+    /// CSV: role to column, see [`CsvOptions::columns`].
+    pub columns: Vec<(String, String)>,
+    /// CSV: positive current is charge.
+    pub charge_positive: bool,
+    /// CSV: table with the section's column and `start`.
+    pub start_times: Option<PathBuf>,
+}
+
+impl LogReading {
+    /// The options of a log with this configuration.
+    pub fn options(&self, config: &Config) -> LogOptions {
+        let sample = &config.monitor.sample;
+        LogOptions {
+            interfaces: config.interface_names(),
+            strict: self.strict,
+            csv: CsvOptions {
+                columns: self.columns.clone(),
+                charge_positive: self.charge_positive,
+                start_times: self.start_times.clone(),
+                cells: sample.cells,
+                pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+            },
+            encode_row: {
+                let mut row_frames = RowFrames::new(&config.monitor);
+                Box::new(move |values, frames| row_frames.encode(values, frames))
+            },
+        }
+    }
+}
+
+/// Encodes rows of values, which have no frames, as their senders encode them: with protection.
+#[derive(Debug)]
+pub struct RowFrames {
+    encoder: InputEncoder,
+    protector: InputProtector,
+}
+
+impl RowFrames {
+    /// Of the input signals of this configuration.
+    pub fn new(config: &MonitorConfig) -> Self {
+        Self {
+            encoder: InputEncoder::new(&config.input).with_answers(&config.answers),
+            protector: InputProtector::new(&config.guards),
+        }
+    }
+
+    /// Appends the frames that carry `values` (`None` and NaN: no value now); returns how many values no frame can carry.
+    pub fn encode(&mut self, values: &[(Channel, Option<f64>)], frames: &mut Vec<(BusIndex, Frame)>) -> usize {
+        let uncarried = self.encoder.encode(values, frames);
+        self.protector.protect(frames);
+        uncarried
+    }
+}

@@ -1,0 +1,262 @@
+//! A request for scores, as the command line and the Python module take it, and the run that it stands for.
+//!
+//! In: files, the cell's configuration, starts of the estimator, settings of the statistics. Out: [`ScoreRun`], with everything read
+//! and checked. Errors name the file or the argument.
+
+use std::path::PathBuf;
+
+use super::{Case, CaseScore, CycleTable, ScoreJob, ScoreReport, ScoreSettings, Start, learn};
+use crate::config::Config;
+use crate::error::{LabError, RequestError};
+use crate::health::UsableConfig;
+use crate::io::paths::{check_distinct, short_names};
+use crate::single_cell::CellSource;
+
+/// What to score. Every list makes more cases: each file runs in every combination.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScoreRequest {
+    /// Measured files.
+    pub files: Vec<PathBuf>,
+    /// Configuration of the cell.
+    pub source: CellSource,
+    /// Files that the monitor has seen before, in this order.
+    pub learn: Vec<PathBuf>,
+    /// Where in each file the estimator starts.
+    pub start: Vec<Start>,
+    /// Part of the full charge already taken out where a start in the middle begins.
+    pub remove: f64,
+    /// Errors of the initial SOC, points; `None` = no initial SOC is given.
+    pub soc_error_points: Vec<Option<f64>>,
+    /// Standard deviation of the initial SOC, points.
+    pub soc_std_points: Option<f64>,
+    /// Errors of the capacity that the estimator starts with, percent of the model's.
+    pub capacity_error_percent: Vec<f64>,
+    /// Standard deviation that goes with them, percent.
+    pub capacity_std_percent: Option<f64>,
+    /// Offsets of the current sensor, A.
+    pub current_offset_a: Vec<f64>,
+    /// Time after the start without statistics, s.
+    pub settle_s: f64,
+    /// Charge from full to empty that the truth is stated in, Ah; `None` = the model's capacity.
+    pub truth_capacity_ah: Option<f64>,
+    /// A gap longer than this means that the recorder was asleep, s.
+    pub sleep_gap_s: f64,
+    /// Tables of published capacities, one per file; none where there are none.
+    pub cycles: Vec<PathBuf>,
+    /// Load of those capacities: A, degrees C, V; `None` = the configuration's `[usable]`.
+    pub load: Option<[f64; 3]>,
+    /// The first discharge below this capacity is reported, Ah.
+    pub threshold_ah: f64,
+    /// Discharges before the statistics of the capacity begin.
+    pub skip_cycles: usize,
+    /// Least and largest part of each half-cycle's charge that is seen.
+    pub window: Option<(f64, f64)>,
+    /// Seeds of the windows.
+    pub seeds: Vec<u64>,
+    /// Folder for a plot per file and case.
+    pub plots: Option<PathBuf>,
+}
+
+impl Default for ScoreRequest {
+    /// The defaults of the command line.
+    fn default() -> Self {
+        Self {
+            files: vec![],
+            source: CellSource::default(),
+            learn: vec![],
+            start: vec![Start::Full],
+            remove: 0.3,
+            soc_error_points: vec![None],
+            soc_std_points: None,
+            capacity_error_percent: vec![0.0],
+            capacity_std_percent: None,
+            current_offset_a: vec![0.0],
+            settle_s: 600.0,
+            truth_capacity_ah: None,
+            sleep_gap_s: 90.0,
+            cycles: vec![],
+            load: None,
+            threshold_ah: 1.4,
+            skip_cycles: 10,
+            window: None,
+            seeds: vec![1],
+            plots: None,
+        }
+    }
+}
+
+/// What a request stands for.
+#[derive(Debug)]
+pub struct ScoreRun {
+    config: Config,
+    settings: ScoreSettings,
+    jobs: Vec<ScoreJob>,
+    cases: Vec<Case>,
+}
+
+impl ScoreRun {
+    /// The files.
+    pub fn jobs(&self) -> &[ScoreJob] {
+        &self.jobs
+    }
+
+    /// Scores every file in every case; `progress` as in [`super::run`].
+    ///
+    /// # Errors
+    /// Error of the first file (in order) that cannot be scored, or the folder of the plots cannot be created.
+    pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
+        if let Some(folder) = &self.settings.plots {
+            let created = std::fs::create_dir_all(folder);
+            created.map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
+        }
+        let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;
+        let Self { config, settings, cases, .. } = self;
+        Ok(ScoreReport { config: config.path, settings, cases, scores })
+    }
+}
+
+impl ScoreRequest {
+    /// Reads the configuration, the tables and the files to learn from.
+    ///
+    /// # Errors
+    /// Faults of the configuration; a number out of its range, arguments that do not fit together, a table or a file to learn from that cannot be read.
+    pub fn prepare(&self) -> Result<ScoreRun, RequestError> {
+        self.check()?;
+        let config = self.source.load()?;
+        let settings = self.settings(&config)?;
+        let jobs = self.jobs()?;
+        Ok(ScoreRun { config, settings, jobs, cases: self.cases() })
+    }
+
+    fn check(&self) -> Result<(), LabError> {
+        let (files, tables) = (self.files.len(), self.cycles.len());
+        if tables != 0 && tables != files {
+            return Err(LabError(format!("--cycles given {tables} times for {files} files, must be once per file")));
+        }
+        if self.source.config.is_none() && self.source.cell.is_none() && self.source.label.is_none() {
+            return Err(
+                "no cell: a configuration, a cell model or a chemistry with rated capacity must be given".into()
+            );
+        }
+        check_distinct(&self.files)?;
+        self.check_numbers()
+    }
+
+    /// The ranges of the command line's arguments.
+    fn check_numbers(&self) -> Result<(), LabError> {
+        let above_0 = |value: f64| value > 0.0 && value.is_finite();
+        let to_100 = |value: f64| value > 0.0 && value <= 100.0;
+        check("remove", [self.remove], |value| value > 0.0 && value < 1.0, "above 0 and below 1")?;
+        let points = self.soc_error_points.iter().copied().flatten();
+        check("soc_error_points", points, |value| value.abs() <= 100.0, "-100 to 100")?;
+        check("soc_std_points", self.soc_std_points, to_100, "above 0 and at most 100")?;
+        let percent = self.capacity_error_percent.iter().copied();
+        check(
+            "capacity_error_percent",
+            percent,
+            |value| value > -100.0 && value <= 100.0,
+            "above -100 and at most 100",
+        )?;
+        check("capacity_std_percent", self.capacity_std_percent, to_100, "above 0 and at most 100")?;
+        check("current_offset_a", self.current_offset_a.iter().copied(), f64::is_finite, "a finite number")?;
+        check("settle_s", [self.settle_s], |value| value >= 0.0 && value.is_finite(), "0 or more")?;
+        check("truth_capacity_ah", self.truth_capacity_ah, above_0, "a finite number above 0")?;
+        check("sleep_gap_s", [self.sleep_gap_s], above_0, "a finite number above 0")?;
+        check("threshold_ah", [self.threshold_ah], above_0, "a finite number above 0")?;
+        if let Some((least, most)) =
+            self.window.filter(|(least, most)| !(*least > 0.0 && least <= most && *most <= 1.0))
+        {
+            let allowed = "two parts above 0 and at most 1, the smaller first";
+            return Err(LabError(format!("window = {least}, {most}, must be {allowed}")));
+        }
+        let unfit = |[current_a, temperature_c, cutoff_v]: &[f64; 3]| {
+            !(above_0(*current_a) && temperature_c.is_finite() && above_0(*cutoff_v))
+        };
+        if let Some([current_a, temperature_c, cutoff_v]) = self.load.filter(unfit) {
+            let allowed = "amperes above 0, degrees C and volts above 0";
+            return Err(LabError(format!("load = {current_a}, {temperature_c}, {cutoff_v}, must be {allowed}")));
+        }
+        Ok(())
+    }
+
+    fn settings(&self, config: &Config) -> Result<ScoreSettings, LabError> {
+        let mut monitor = config.monitor.clone();
+        if monitor.sample.cells != 1 {
+            let found = monitor.sample.cells;
+            return Err(LabError(format!(
+                "{}: pack.cells = {found}, must be 1 to score files of one cell",
+                config.path.display()
+            )));
+        }
+        if let Some([current_a, temperature_c, cutoff_v]) = self.load {
+            let taper_current_a =
+                monitor.health.usable.map_or(monitor.model.rated_capacity_ah / 20.0, |u| u.taper_current_a);
+            monitor.health.usable = Some(UsableConfig { current_a, temperature_c, cutoff_v, taper_current_a });
+        }
+        if !self.cycles.is_empty() && monitor.health.usable.is_none() {
+            return Err(LabError::from(
+                "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
+            ));
+        }
+        let learned = (!self.learn.is_empty()).then(|| learn(&self.learn, &monitor, self.sleep_gap_s)).transpose()?;
+        Ok(ScoreSettings {
+            learned,
+            truth_capacity_ah: self.truth_capacity_ah.unwrap_or(monitor.model.capacity_ah),
+            monitor,
+            remove: self.remove,
+            settle_s: self.settle_s,
+            soc_std: self.soc_std_points.map(|points| points / 100.0),
+            capacity_std: self.capacity_std_percent.map(|percent| percent / 100.0),
+            sleep_gap_s: self.sleep_gap_s,
+            threshold_ah: self.threshold_ah,
+            skip_cycles: self.skip_cycles,
+            window: self.window,
+            plots: self.plots.clone(),
+        })
+    }
+
+    fn jobs(&self) -> Result<Vec<ScoreJob>, LabError> {
+        let names = short_names(&self.files);
+        let tables: Result<Vec<_>, _> = self.cycles.iter().map(|path| CycleTable::read(path).map(Some)).collect();
+        let mut tables = tables?;
+        tables.resize(self.files.len(), None);
+        let jobs = self.files.iter().zip(names).zip(tables);
+        Ok(jobs.map(|((path, name), cycles)| ScoreJob { path: path.clone(), cycles, name }).collect())
+    }
+
+    /// Every combination, in the order of the lists.
+    fn cases(&self) -> Vec<Case> {
+        let seeds = match self.window {
+            Some(_) => self.seeds.iter().map(|&seed| Some(seed)).collect(),
+            None => vec![None],
+        };
+        let mut cases = Vec::new();
+        for start in &self.start {
+            for &soc_error_points in &self.soc_error_points {
+                for &capacity_error_percent in &self.capacity_error_percent {
+                    for &current_offset_a in &self.current_offset_a {
+                        cases.extend(seeds.iter().map(|&seed| Case {
+                            start: *start,
+                            soc_error_points,
+                            capacity_error_percent,
+                            current_offset_a,
+                            seed,
+                        }));
+                    }
+                }
+            }
+        }
+        cases
+    }
+}
+
+/// Rejects the first value that is not allowed.
+fn check(
+    name: &str,
+    values: impl IntoIterator<Item = f64>,
+    is_allowed: impl Fn(f64) -> bool,
+    allowed: &str,
+) -> Result<(), LabError> {
+    let found = values.into_iter().find(|value| !is_allowed(*value));
+    found.map_or(Ok(()), |value| Err(LabError(format!("{name} = {value}, must be {allowed}"))))
+}

@@ -1,0 +1,109 @@
+//! The configuration of one measured cell: a given one, or the built-in one with a cell model or a label in its place.
+//!
+//! In: paths, or what is on the label. Out: a checked configuration whose input signals are those of `measured.dbc`, in which
+//! every estimator key has its default unless the given configuration states it. Faults name the file they are in.
+
+use std::path::{Path, PathBuf};
+
+use crate::config::{self, Config, ConfigFaults, ConfigFiles};
+
+/// The configuration used when none is given, and what it names.
+const BUILT_IN: [(&str, &[u8]); 2] = [
+    ("score.toml", include_bytes!("../../config/score.toml")),
+    ("measured.dbc", include_bytes!("../../config/measured.dbc")),
+];
+
+/// What is on the label of a cell without a model, as in the keys of `[pack]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelKeys {
+    /// Chemistry, by its name.
+    pub chemistry: String,
+    /// Capacity, Ah; required by the configuration.
+    pub rated_ah: Option<f64>,
+    /// Lowest voltage, V; `None` = usual of the chemistry.
+    pub voltage_min_v: Option<f64>,
+    /// Highest voltage, V; `None` = usual of the chemistry.
+    pub voltage_max_v: Option<f64>,
+}
+
+/// Where the configuration of a cell comes from. A label comes first, then the model in place of the configuration's own.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct CellSource {
+    /// Configuration; `None` = the built-in one.
+    pub config: Option<PathBuf>,
+    /// Cell model file.
+    pub cell: Option<PathBuf>,
+    /// Label.
+    pub label: Option<LabelKeys>,
+}
+
+impl CellSource {
+    /// Loads the configuration.
+    ///
+    /// # Errors
+    /// All faults of the files; no cell of this chemistry has these voltages.
+    pub fn load(&self) -> Result<Config, ConfigFaults> {
+        if let Some(label) = &self.label {
+            return label.configuration();
+        }
+        let built_in = self.config.is_none();
+        let path = self.config.clone().unwrap_or_else(|| PathBuf::from(BUILT_IN[0].0));
+        let Some(cell) = &self.cell else { return config::load(&path) };
+        // Faults of the model are reported with its own file name.
+        config::cell_model::load(cell)?;
+        let read = |file: &Path| {
+            let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
+            known.map_or_else(|| std::fs::read(file), |(_, bytes)| Ok(bytes.to_vec()))
+        };
+        let files = if built_in { ConfigFiles::alone(&path) } else { ConfigFiles::find(&path)? };
+        let named = named_cell(&files, &read)?;
+        let read = |file: &Path| if file == named { std::fs::read(cell) } else { read(file) };
+        config::load_with(&files, &read)
+    }
+}
+
+impl LabelKeys {
+    /// The built-in configuration with this label in place of the cell model.
+    ///
+    /// # Errors
+    /// No cell of this chemistry has these voltages, or the capacity is missing.
+    pub fn configuration(&self) -> Result<Config, ConfigFaults> {
+        let keys = self.text();
+        let read = |file: &Path| {
+            let known = BUILT_IN.iter().find(|(name, _)| Path::new(name) == file);
+            let (name, bytes) = known.ok_or(std::io::ErrorKind::NotFound)?;
+            if *name != BUILT_IN[0].0 {
+                return Ok(bytes.to_vec());
+            }
+            let with_label =
+                |line: &str| if line.starts_with("cell_model") { keys.clone() } else { format!("{line}\n") };
+            Ok(String::from_utf8_lossy(bytes).lines().map(with_label).collect::<String>().into_bytes())
+        };
+        config::load_with(&ConfigFiles::alone(Path::new(BUILT_IN[0].0)), &read)
+    }
+
+    /// The keys of `[pack]`.
+    fn text(&self) -> String {
+        let mut text = format!("chemistry = {}\n", toml::Value::from(self.chemistry.as_str()));
+        let numbers = [
+            ("rated_capacity_ah", self.rated_ah),
+            ("voltage_min_v", self.voltage_min_v),
+            ("voltage_max_v", self.voltage_max_v),
+        ];
+        for (key, value) in numbers {
+            value.iter().for_each(|value| text.push_str(&format!("{key} = {value:?}\n")));
+        }
+        text
+    }
+}
+
+/// The path of the cell model that a configuration names.
+fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
+    let text = config::merged_with(files, read)?;
+    let named = text.parse::<toml::Table>().ok().and_then(|table| {
+        let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
+        Some(files.main.parent().unwrap_or(Path::new("")).join(model))
+    });
+    // Without one, reading the configuration reports the fault.
+    Ok(named.unwrap_or_default())
+}

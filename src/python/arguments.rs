@@ -1,0 +1,52 @@
+//! Arguments that several doors take: paths, and where a configuration comes from.
+
+use std::path::{Path, PathBuf};
+
+use packwatch_host::config::{self, Config, ConfigFiles};
+use packwatch_lab::single_cell::{CellSource, LabelKeys};
+use pyo3::prelude::*;
+
+use crate::error;
+
+/// One path, or several.
+#[derive(FromPyObject)]
+pub(crate) enum Paths {
+    One(PathBuf),
+    Several(Vec<PathBuf>),
+}
+
+impl Paths {
+    /// As a list.
+    pub(crate) fn list(self) -> Vec<PathBuf> {
+        match self {
+            Self::One(path) => vec![path],
+            Self::Several(paths) => paths,
+        }
+    }
+}
+
+/// Loads a configuration from its text; the files it names are in `folder`.
+pub(crate) fn of_text(text: &str, folder: &Path) -> PyResult<Config> {
+    let main = folder.join("configuration.toml");
+    let read = |file: &Path| if file == main { Ok(text.as_bytes().to_vec()) } else { std::fs::read(file) };
+    config::load_with(&ConfigFiles::alone(&main), &read).map_err(error::config)
+}
+
+/// Where the configuration of a single cell comes from.
+pub(crate) fn cell_source(
+    config: Option<PathBuf>,
+    cell: Option<PathBuf>,
+    label: (Option<String>, Option<f64>, Option<f64>, Option<f64>),
+) -> PyResult<CellSource> {
+    let (chemistry, rated_ah, voltage_min_v, voltage_max_v) = label;
+    if chemistry.is_some() && (config.is_some() || cell.is_some()) {
+        return Err(error::data("chemistry must not be given together with config or cell, which state it"));
+    }
+    let label = chemistry.map(|chemistry| LabelKeys { chemistry, rated_ah, voltage_min_v, voltage_max_v });
+    Ok(CellSource { config, cell, label })
+}
+
+/// Total size of files, bytes; those that cannot be read count nothing.
+pub(crate) fn bytes(files: &[PathBuf]) -> u64 {
+    files.iter().filter_map(|path| std::fs::metadata(path).ok()).map(|found| found.len()).sum()
+}

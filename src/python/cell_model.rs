@@ -1,0 +1,154 @@
+//! `CellModel`: open-circuit voltage and resistances of a cell, from a file, a text or a label.
+
+use std::path::{Path, PathBuf};
+
+use packwatch_host::cell::{CellModel as CoreModel, Chemistry, Label};
+use packwatch_host::config::cell_model::{self, SourcedModel};
+use packwatch_host::config::of_label;
+use pyo3::prelude::*;
+
+use crate::arrays;
+use crate::error::{config, data, file};
+use crate::table::{Table, reals};
+
+/// A cell model.
+#[pyclass(frozen, module = "packwatch")]
+pub(crate) struct CellModel(SourcedModel);
+
+impl CellModel {
+    fn model(&self) -> &CoreModel {
+        &self.0.model
+    }
+}
+
+#[pymethods]
+impl CellModel {
+    /// Reads a cell model file.
+    #[new]
+    fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
+        py.detach(|| cell_model::load_sourced(&path)).map(Self).map_err(|faults| match path.exists() {
+            true => config(faults),
+            false => file(faults),
+        })
+    }
+
+    /// The model of a cell of which only the label is known.
+    #[staticmethod]
+    #[pyo3(signature = (chemistry, rated_ah, *, voltage_min_v=None, voltage_max_v=None))]
+    fn of_label(
+        chemistry: &str,
+        rated_ah: f64,
+        voltage_min_v: Option<f64>,
+        voltage_max_v: Option<f64>,
+    ) -> PyResult<Self> {
+        let names = Chemistry::ALL.map(|(_, name)| name).join(", ");
+        let known = Chemistry::ALL.into_iter().find(|(_, name)| *name == chemistry);
+        let (chemistry, _) = known.ok_or_else(|| data(format!("chemistry {chemistry:?}, must be one of {names}")))?;
+        if !rated_ah.is_finite() || rated_ah <= 0.0 {
+            return Err(data(format!("rated_ah = {rated_ah}, must be a finite number above 0")));
+        }
+        let usual = Label::usual(chemistry, rated_ah);
+        let label = Label {
+            voltage_min_v: voltage_min_v.unwrap_or(usual.voltage_min_v),
+            voltage_max_v: voltage_max_v.unwrap_or(usual.voltage_max_v),
+            ..usual
+        };
+        of_label(&label).map(Self).ok_or_else(|| {
+            let (low, high) = chemistry.usual_voltages_v();
+            let Label { voltage_min_v, voltage_max_v, .. } = label;
+            let name = chemistry.name();
+            data(format!("no cell of {name} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {low} and {high} V"))
+        })
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.model().name
+    }
+
+    #[getter]
+    fn capacity_ah(&self) -> f64 {
+        self.model().capacity_ah
+    }
+
+    #[getter]
+    fn rated_capacity_ah(&self) -> f64 {
+        self.model().rated_capacity_ah
+    }
+
+    #[getter]
+    fn voltage_min_v(&self) -> f64 {
+        self.model().voltage_min_v
+    }
+
+    #[getter]
+    fn voltage_max_v(&self) -> f64 {
+        self.model().voltage_max_v
+    }
+
+    /// SOC breakpoints, fractions.
+    #[getter]
+    fn soc(&self) -> Vec<f64> {
+        self.model().soc.clone()
+    }
+
+    /// Temperature breakpoints, degrees C.
+    #[getter]
+    fn temperature_c(&self) -> Vec<f64> {
+        self.model().temperature_c.clone()
+    }
+
+    /// The model at these SOC and this temperature: open-circuit voltage, series and branch resistances, time constants.
+    #[pyo3(signature = (soc, temperature_c=25.0))]
+    fn table(&self, soc: &Bound<'_, PyAny>, temperature_c: f64) -> PyResult<Table> {
+        let (soc, model) = (arrays::reals("soc", soc)?, self.model());
+        if let Some(found) = soc.values.iter().find(|soc| !(0.0..=1.0).contains(*soc)) {
+            return Err(data(format!("soc: found {found}, must be fractions from 0 to 1")));
+        }
+        if !temperature_c.is_finite() {
+            return Err(data(format!("temperature_c = {temperature_c}, must be a finite number")));
+        }
+        let positions: Vec<_> = soc.values.iter().map(|soc| model.grid_position(*soc, temperature_c)).collect();
+        let names: [[&str; 2]; 3] = [["r1_ohm", "tau1_s"], ["r2_ohm", "tau2_s"], ["r3_ohm", "tau3_s"]];
+        let mut columns = vec![
+            ("soc", reals(soc.values.to_vec())),
+            ("ocv_v", reals(positions.iter().map(|at| model.ocv_v(at)).collect())),
+            ("r0_ohm", reals(positions.iter().map(|at| model.r0_ohm(at)).collect())),
+        ];
+        for (branch, [r_ohm, tau_s]) in names.into_iter().enumerate().take(model.branches.len()) {
+            columns.push((r_ohm, reals(positions.iter().map(|at| model.branch_r_ohm(branch, at)).collect())));
+            columns.push((tau_s, reals(positions.iter().map(|at| model.branch_tau_s(branch, at)).collect())));
+        }
+        Table::new(columns)
+    }
+
+    /// The SOC of an open-circuit voltage, a fraction.
+    #[pyo3(signature = (voltage_v, temperature_c=25.0))]
+    fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> PyResult<f64> {
+        if !voltage_v.is_finite() || !temperature_c.is_finite() {
+            return Err(data(format!(
+                "voltage_v = {voltage_v}, temperature_c = {temperature_c}, must be finite numbers"
+            )));
+        }
+        Ok(self.model().soc_of_ocv(voltage_v, temperature_c))
+    }
+
+    /// The file's text, as `model export` writes it.
+    fn text(&self) -> String {
+        cell_model::text(&self.0, "Written by packwatch.")
+    }
+
+    /// Writes the file, completely or not at all.
+    fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        py.detach(|| write(&path, &self.text()))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<packwatch.CellModel {:?}, {} Ah>", self.model().name, self.model().capacity_ah)
+    }
+}
+
+/// Writes a text, completely or not at all.
+pub(crate) fn write(path: &Path, text: &str) -> PyResult<()> {
+    packwatch_lab::write_file(path, text.as_bytes()).map_err(file)
+}

@@ -1,0 +1,117 @@
+//! `fit`: a cell model from measured files.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use packwatch_lab::fit::{self as lab_fit, FitOutcome, FitProgress, FitRequest};
+use pyo3::prelude::*;
+
+use crate::arguments::Paths;
+use crate::cell_model::write;
+use crate::error::of_library;
+use crate::work::{self, Progress};
+
+/// A fitted model.
+#[pyclass(frozen, module = "packwatch")]
+pub(crate) struct Fit {
+    request: FitRequest,
+    outcome: FitOutcome,
+    seconds: f64,
+}
+
+#[pymethods]
+impl Fit {
+    /// The cell model file, as `fit --out` writes it.
+    fn text(&self) -> String {
+        lab_fit::text(&self.request, &self.outcome)
+    }
+
+    /// Writes the cell model file, completely or not at all.
+    fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        py.detach(|| write(&path, &self.text()))
+    }
+
+    /// The document that `fit --json` prints, as a dictionary.
+    #[getter]
+    fn document<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let document = lab_fit::document(&self.outcome, self.seconds).to_string();
+        py.import("json")?.call_method1("loads", (document,))
+    }
+
+    #[getter]
+    fn capacity_ah(&self) -> f64 {
+        self.outcome.capacity_ah
+    }
+
+    /// Root of the mean squared residual, V.
+    #[getter]
+    fn rmse_v(&self) -> f64 {
+        self.outcome.fit.total.rmse_v
+    }
+
+    #[getter]
+    fn notes(&self) -> Vec<String> {
+        self.outcome.notes.clone()
+    }
+
+    /// What the model is good for.
+    #[getter]
+    fn verdict(&self) -> Vec<String> {
+        self.outcome.verdict.clone()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<packwatch.Fit {:?}, {:.1} mV>", self.request.name, 1e3 * self.rmse_v())
+    }
+}
+
+/// Fits a cell model to measured files.
+#[pyfunction]
+#[pyo3(signature = (files, name, *, ocv=None, capacity_ah=None, rated_ah=None, voltage_min_v=None, voltage_max_v=None,
+                    ageing_shift=None, branches=None, tau_s=None, temperatures_c=None, soc_nodes=None, first_cycles=None,
+                    progress=false))]
+#[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
+pub(crate) fn fit(
+    py: Python<'_>,
+    files: Paths,
+    name: String,
+    ocv: Option<Paths>,
+    capacity_ah: Option<f64>,
+    rated_ah: Option<f64>,
+    voltage_min_v: Option<f64>,
+    voltage_max_v: Option<f64>,
+    ageing_shift: Option<f64>,
+    branches: Option<usize>,
+    tau_s: Option<Vec<f64>>,
+    temperatures_c: Option<Vec<f64>>,
+    soc_nodes: Option<Vec<f64>>,
+    first_cycles: Option<usize>,
+    progress: bool,
+) -> PyResult<Fit> {
+    let request = FitRequest {
+        name,
+        capacity_ah,
+        rated_ah,
+        voltage_min_v,
+        voltage_max_v,
+        ageing_shift,
+        ocv: ocv.map_or_else(Vec::new, Paths::list),
+        branches,
+        tau_s,
+        temperature_c: temperatures_c,
+        soc: soc_nodes,
+        first_cycles,
+        files: files.list(),
+    };
+    request.check().map_err(of_library)?;
+    let begin = Instant::now();
+    let shown = Progress { is_shown: progress, total: None, unit: "step" };
+    let outcome = work::run(py, shown, |work| {
+        // A step is a file read or a pass of the fit.
+        lab_fit::run(&request, |progress: FitProgress| match progress {
+            FitProgress::Read(..) | FitProgress::Pass(..) => work.advance(1),
+        })
+    })?;
+    let outcome = outcome.map_err(of_library)?;
+    Ok(Fit { request, outcome, seconds: begin.elapsed().as_secs_f64() })
+}

@@ -1,0 +1,50 @@
+//! The Python module `packwatch._packwatch`: doors to the library that the command line uses too.
+//!
+//! In: paths, NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Out: Arrow tables, texts and dictionaries, the
+//! same as the command line writes. A value that is not known is null or NaN, never a default number. Bad input is a Python exception
+//! (`packwatch._errors`) with the text that the command line prints. Long work runs without the interpreter's lock, and Ctrl-C ends it.
+//!
+//! | file | what is in it |
+//! | --- | --- |
+//! | `monitor.rs`, `replay.rs` | rows, frames and logs through the monitor |
+//! | `outputs.rs`, `table.rs` | what comes out: estimates, events, frames as Arrow tables |
+//! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
+//! | `cell_model.rs`, `measured.rs` | cell models, measured files |
+//! | `arrays.rs`, `work.rs`, `error.rs`, `arguments.rs` | arrays in, progress and Ctrl-C, exceptions, arguments shared |
+
+mod arguments;
+mod arrays;
+mod cell_model;
+mod error;
+mod fit;
+mod gp;
+mod measured;
+mod monitor;
+mod outputs;
+mod replay;
+mod rul;
+mod score;
+mod table;
+mod work;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+fn _packwatch(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("BDF_COLUMNS", packwatch_lab::measured::BDF_COLUMNS.to_vec())?;
+    module.add_class::<cell_model::CellModel>()?;
+    module.add_class::<fit::Fit>()?;
+    module.add_class::<gp::GaussianProcess>()?;
+    module.add_class::<monitor::Monitor>()?;
+    module.add_class::<outputs::Outputs>()?;
+    module.add_class::<replay::Replay>()?;
+    module.add_class::<score::Score>()?;
+    module.add_class::<table::Table>()?;
+    module.add_function(wrap_pyfunction!(fit::fit, module)?)?;
+    module.add_function(wrap_pyfunction!(measured::read, module)?)?;
+    module.add_function(wrap_pyfunction!(replay::replay, module)?)?;
+    module.add_function(wrap_pyfunction!(rul::rul, module)?)?;
+    module.add_function(wrap_pyfunction!(score::score, module)?)?;
+    Ok(())
+}

@@ -1,0 +1,317 @@
+//! `Monitor`: rows or frames in, tables out.
+//!
+//! A row becomes the frames that would have carried it, with the resolution of the configured signals, as in a replay of a CSV file:
+//! the same rows give the same estimates as `packwatch replay`.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use packwatch_host::can::decode::{Channel, SensorIndex};
+use packwatch_host::can::{CanId, Frame};
+use packwatch_host::config::Config;
+use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
+use packwatch_host::replay::MonitorDriver;
+use packwatch_host::sample::VoltageSource;
+use pyo3::prelude::*;
+
+use crate::arguments::{cell_source, of_text};
+use crate::arrays::{self, Reals, check_rows};
+use crate::error::{config as config_error, data};
+use crate::outputs::{Columns, Outputs, Wanted};
+use crate::work::{self, Progress, Work};
+
+/// Rows between two reports of progress.
+const REPORT_EVERY: usize = 16_384;
+/// Bit 31 of an identifier marks an extended one, as in a DBC and in SocketCAN.
+const EXTENDED: u32 = 0x8000_0000;
+
+/// The monitor of a pack.
+#[pyclass(frozen, module = "packwatch")]
+pub(crate) struct Monitor {
+    state: Mutex<State>,
+    interfaces: Vec<String>,
+    cells: u16,
+    is_pack_total: bool,
+}
+
+struct State {
+    driver: MonitorDriver,
+    columns: Columns,
+    wanted: Wanted,
+    cells: usize,
+}
+
+#[pymethods]
+impl Monitor {
+    /// A monitor that knows nothing of its pack yet.
+    #[new]
+    #[pyo3(signature = (config=None, *, text=None, folder=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None,
+                        voltage_max_v=None, sleep_gap_s=30.0, estimates_period_s=0.0))]
+    #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
+    fn new(
+        py: Python<'_>,
+        config: Option<PathBuf>,
+        text: Option<String>,
+        folder: Option<PathBuf>,
+        cell: Option<PathBuf>,
+        chemistry: Option<String>,
+        rated_ah: Option<f64>,
+        voltage_min_v: Option<f64>,
+        voltage_max_v: Option<f64>,
+        sleep_gap_s: f64,
+        estimates_period_s: Option<f64>,
+    ) -> PyResult<Self> {
+        if sleep_gap_s.is_nan() || sleep_gap_s <= 0.0 {
+            return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));
+        }
+        let wanted = Wanted::new(estimates_period_s)?;
+        let config = match &text {
+            Some(_) if config.is_some() || cell.is_some() || chemistry.is_some() => {
+                return Err(data("text must not be given together with config, cell or chemistry"));
+            }
+            Some(text) => of_text(text, folder.as_deref().unwrap_or(Path::new("")))?,
+            None if config.is_none() && cell.is_none() && chemistry.is_none() => {
+                return Err(data("no configuration: config, text, cell or chemistry must be given"));
+            }
+            None => {
+                let source = cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?;
+                py.detach(|| source.load()).map_err(config_error)?
+            }
+        };
+        Ok(Self::of(&config, sleep_gap_s, wanted))
+    }
+
+    /// Cells in series.
+    #[getter]
+    fn cells(&self) -> u16 {
+        self.cells
+    }
+
+    /// Names of the interfaces, by their numbers.
+    #[getter]
+    fn interfaces(&self) -> Vec<String> {
+        self.interfaces.clone()
+    }
+
+    /// Values of rows that no frame of the configuration can carry, so far.
+    #[getter]
+    fn uncarried_values(&self) -> usize {
+        self.state().driver.uncarried_values
+    }
+
+    /// Takes rows.
+    #[pyo3(signature = (time_s, current_a, voltage_v, temperature_c=None, *, progress=false))]
+    fn rows(
+        &self,
+        py: Python<'_>,
+        time_s: &Bound<'_, PyAny>,
+        current_a: &Bound<'_, PyAny>,
+        voltage_v: &Bound<'_, PyAny>,
+        temperature_c: Option<&Bound<'_, PyAny>>,
+        progress: bool,
+    ) -> PyResult<Outputs> {
+        let time_s = times(time_s)?;
+        let input = RowInput {
+            current_a: arrays::reals("current_a", current_a)?,
+            voltage_v: arrays::reals("voltage_v", voltage_v)?,
+            temperature_c: temperature_c.map(|values| arrays::reals("temperature_c", values)).transpose()?,
+            is_pack_total: self.is_pack_total,
+        };
+        input.check(time_s.rows, if self.is_pack_total { 1 } else { usize::from(self.cells) })?;
+        self.work(py, progress, time_s.rows, |state, work| state.take_rows(&time_s, &input, work))
+    }
+
+    /// Takes frames.
+    #[pyo3(signature = (time_s, can_id, data, *, length=None, interface=None, progress=false))]
+    #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
+    fn frames(
+        &self,
+        py: Python<'_>,
+        time_s: &Bound<'_, PyAny>,
+        can_id: &Bound<'_, PyAny>,
+        data: &Bound<'_, PyAny>,
+        length: Option<&Bound<'_, PyAny>>,
+        interface: Option<&str>,
+        progress: bool,
+    ) -> PyResult<Outputs> {
+        let time_s = times(time_s)?;
+        let can_id = arrays::words("can_id", can_id)?;
+        let payloads = arrays::bytes("data", data)?;
+        let length = length.map(|values| arrays::words("length", values)).transpose()?;
+        check_rows("can_id", can_id.rows, "time_s", time_s.rows)?;
+        check_rows("data", payloads.rows, "time_s", time_s.rows)?;
+        length.iter().try_for_each(|length| check_rows("length", length.rows, "time_s", time_s.rows))?;
+        let bus = self.bus(interface)?;
+        let frame = |row: usize| {
+            let length = length.as_ref().map_or(payloads.columns, |length| length.values[row] as usize);
+            frame(row, can_id.values[row], payloads.row(row), length)
+        };
+        // Before the first is taken: a fault in a row must not leave half of them behind.
+        let frames = (0..time_s.rows).map(frame).collect::<PyResult<Vec<Frame>>>()?;
+        self.work(py, progress, time_s.rows, |state, work| {
+            for (row, frame) in frames.iter().enumerate() {
+                let time = state.begin(time_s.values[row]);
+                state.driver.handle_frame(time, bus, frame);
+                state.columns.take(state.wanted, &mut state.driver.out);
+                report(row, work);
+            }
+        })
+    }
+
+    /// The record continues at `time_s` after a gap of unknown length.
+    fn gap(&self, py: Python<'_>, time_s: f64) -> PyResult<Outputs> {
+        if !time_s.is_finite() {
+            return Err(data(format!("time_s = {time_s}, must be a finite number")));
+        }
+        let mut state = self.state();
+        state.driver.handle_unknown_gap(Timestamp::from_secs(time_s));
+        state.finish(py, &self.interfaces)
+    }
+
+    /// Ends the record: its last samples become estimates.
+    fn finish(&self, py: Python<'_>) -> PyResult<Outputs> {
+        let mut state = self.state();
+        state.driver.finish();
+        state.finish(py, &self.interfaces)
+    }
+}
+
+impl Monitor {
+    fn of(config: &Config, sleep_gap_s: f64, wanted: Wanted) -> Self {
+        let sample = &config.monitor.sample;
+        let driver = MonitorDriver::new(config.monitor.clone(), sleep_gap_s);
+        Self {
+            interfaces: config.interface_names(),
+            cells: sample.cells,
+            is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+            state: Mutex::new(State { driver, columns: Columns::default(), wanted, cells: sample.cells.into() }),
+        }
+    }
+
+    /// The state; a panic in an earlier call has left it whole enough to be read.
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn bus(&self, interface: Option<&str>) -> PyResult<BusIndex> {
+        let name = interface.or(self.interfaces.first().map(String::as_str)).unwrap_or_default();
+        let found = self.interfaces.iter().position(|known| known == name).and_then(|index| u8::try_from(index).ok());
+        let allowed = self.interfaces.join(", ");
+        found.map(BusIndex).ok_or_else(|| data(format!("interface {name:?}, must be one of {allowed}")))
+    }
+
+    /// Work on rows, and its tables.
+    fn work(
+        &self,
+        py: Python<'_>,
+        is_shown: bool,
+        rows: usize,
+        take: impl FnOnce(&mut State, &Work) + Send,
+    ) -> PyResult<Outputs> {
+        let progress = Progress { is_shown, total: Some(rows as u64), unit: "row" };
+        work::run(py, progress, |work| take(&mut self.state(), work))?;
+        self.state().finish(py, &self.interfaces)
+    }
+}
+
+impl State {
+    fn take_rows(&mut self, time_s: &Reals, input: &RowInput, work: &Work) {
+        let mut values = input.channels();
+        for row in 0..time_s.rows {
+            input.fill(row, &mut values);
+            let time = self.begin(time_s.values[row]);
+            self.driver.handle_row(time, &values);
+            self.columns.take(self.wanted, &mut self.driver.out);
+            report(row, work);
+        }
+    }
+
+    /// The time of an input. Estimates that would not become rows are not made: that takes time.
+    fn begin(&mut self, time_s: f64) -> Timestamp {
+        let time = Timestamp::from_secs(time_s);
+        self.driver.out.want_estimates = self.columns.wants_estimates(self.wanted, time, self.cells);
+        time
+    }
+
+    fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {
+        self.columns.take(self.wanted, &mut self.driver.out);
+        self.columns.finish(py, interfaces)
+    }
+}
+
+/// Rows of readings.
+struct RowInput {
+    current_a: Reals,
+    voltage_v: Reals,
+    temperature_c: Option<Reals>,
+    is_pack_total: bool,
+}
+
+impl RowInput {
+    fn check(&self, rows: usize, voltages: usize) -> PyResult<()> {
+        check_rows("current_a", self.current_a.rows, "time_s", rows)?;
+        check_rows("voltage_v", self.voltage_v.rows, "time_s", rows)?;
+        self.temperature_c.iter().try_for_each(|of| check_rows("temperature_c", of.rows, "time_s", rows))?;
+        let found = self.voltage_v.columns;
+        if found != voltages {
+            return Err(data(format!("voltage_v has {found} columns, must have {voltages} as the configuration has")));
+        }
+        let most = usize::from(u16::MAX);
+        let sensors = self.temperature_c.as_ref().map_or(0, |of| of.columns);
+        if self.current_a.columns != 1 || sensors > most {
+            return Err(data(format!("current_a must have 1 column, temperature_c at most {most}")));
+        }
+        Ok(())
+    }
+
+    /// The channels of a row, without values.
+    fn channels(&self) -> Vec<(Channel, Option<f64>)> {
+        let numbers = |count: usize| 0..u16::try_from(count).unwrap_or(u16::MAX);
+        let cells = numbers(self.voltage_v.columns).map(|cell| Channel::CellVoltage(CellIndex(cell)));
+        let sensors = numbers(self.temperature_c.as_ref().map_or(0, |of| of.columns));
+        let mut channels = vec![Channel::Current];
+        if self.is_pack_total {
+            channels.push(Channel::PackVoltage);
+        } else {
+            channels.extend(cells);
+        }
+        channels.extend(sensors.map(|sensor| Channel::Temperature(SensorIndex(sensor))));
+        channels.into_iter().map(|channel| (channel, None)).collect()
+    }
+
+    /// Writes the values of a row.
+    fn fill(&self, row: usize, values: &mut [(Channel, Option<f64>)]) {
+        let temperatures = self.temperature_c.as_ref().map_or(&[][..], |of| of.row(row));
+        let all = self.current_a.row(row).iter().chain(self.voltage_v.row(row)).chain(temperatures);
+        values.iter_mut().zip(all).for_each(|(value, found)| value.1 = Some(*found));
+    }
+}
+
+fn report(row: usize, work: &Work) {
+    if (row + 1).is_multiple_of(REPORT_EVERY) {
+        work.advance(REPORT_EVERY as u64);
+    }
+}
+
+/// Times, which must be known.
+fn times(time_s: &Bound<'_, PyAny>) -> PyResult<Reals> {
+    let time_s = arrays::reals("time_s", time_s)?;
+    match time_s.values.iter().position(|time_s| !time_s.is_finite()) {
+        Some(row) => Err(data(format!("time_s[{row}] = {}, must be a finite number", time_s.values[row]))),
+        None if time_s.columns != 1 => Err(data(format!("time_s has {} columns, must have 1", time_s.columns))),
+        None => Ok(time_s),
+    }
+}
+
+fn frame(row: usize, id: u32, payload: &[u8], length: usize) -> PyResult<Frame> {
+    let can_id = if id & EXTENDED == 0 { CanId::standard(id) } else { CanId::extended(id & !EXTENDED) };
+    let allowed = "must be at most 0x7FF, or at most 0x1FFFFFFF with bit 31 set for an extended one";
+    let can_id = can_id.ok_or_else(|| data(format!("can_id[{row}] = {id:#X}, {allowed}")))?;
+    let payload = payload.get(..length).ok_or_else(|| {
+        data(format!("length[{row}] = {length}, must be at most {} as data has columns", payload.len()))
+    })?;
+    let frame = if length <= 8 { Frame::classic(can_id, payload) } else { Frame::fd(can_id, false, false, payload) };
+    frame.ok_or_else(|| {
+        data(format!("length[{row}] = {length}, must be a length of CAN FD: 12, 16, 20, 24, 32, 48 or 64"))
+    })
+}

@@ -1,0 +1,49 @@
+"""Battery health monitoring: the library of packwatch.
+
+Units are last in names (``time_s``, ``current_a``), SOC is a fraction, positive current is discharge. A value that is not known is null
+in a table and NaN in an array, never a default number. Errors are exceptions with the text that the command line prints.
+"""
+
+from ._errors import ConfigError, DataError, FileError, PackwatchError
+from ._packwatch import (
+    CellModel,
+    Fit,
+    GaussianProcess,
+    Monitor,
+    Outputs,
+    Replay,
+    Score,
+    Table,
+    __version__,
+    fit,
+    read,
+    replay,
+    rul,
+    score,
+)
+from .bdf import from_bdf
+
+gp = GaussianProcess
+
+__all__ = [
+    "CellModel",
+    "ConfigError",
+    "DataError",
+    "FileError",
+    "Fit",
+    "GaussianProcess",
+    "Monitor",
+    "Outputs",
+    "PackwatchError",
+    "Replay",
+    "Score",
+    "Table",
+    "__version__",
+    "fit",
+    "from_bdf",
+    "gp",
+    "read",
+    "replay",
+    "rul",
+    "score",
+]

@@ -1,0 +1,132 @@
+//! `replay`: logs through the monitor, as the command does, with the results in tables.
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use packwatch_host::config::{self, Config};
+use packwatch_host::io::log::LogSource;
+use packwatch_host::monitor::{Monitor, Outputs as CoreOutputs};
+use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, SLEEP_GAP_S, Sinks};
+use pyo3::exceptions::PyBrokenPipeError;
+use pyo3::prelude::*;
+
+use crate::arguments::{Paths, bytes};
+use crate::error::{self, data};
+use crate::outputs::{Columns, Outputs, Wanted};
+use crate::work::{self, Progress, Work};
+
+// The signatures below and of `Monitor` have it as a literal, which Python shows.
+const _: () = assert!(SLEEP_GAP_S == 30.0);
+
+/// Results of a replay.
+#[pyclass(frozen, module = "packwatch")]
+pub(crate) struct Replay {
+    /// Estimates, events, frames.
+    #[pyo3(get)]
+    outputs: Py<Outputs>,
+    /// The summary that `replay --json` prints.
+    json: String,
+}
+
+#[pymethods]
+impl Replay {
+    /// The summary as the text that `replay --json` prints.
+    fn json(&self) -> &str {
+        &self.json
+    }
+
+    /// The summary as a dictionary.
+    #[getter]
+    fn summary<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        py.import("json")?.call_method1("loads", (&self.json,))
+    }
+
+    #[getter]
+    fn estimates(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        self.outputs.getattr(py, "estimates")
+    }
+
+    #[getter]
+    fn events(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        self.outputs.getattr(py, "events")
+    }
+
+    #[getter]
+    fn frames(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        self.outputs.getattr(py, "frames")
+    }
+}
+
+/// Replays logs, one after another, as one record.
+#[pyfunction]
+#[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=30.0,
+                    estimates_period_s=0.0, progress=false))]
+#[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
+pub(crate) fn replay(
+    py: Python<'_>,
+    config: PathBuf,
+    logs: Paths,
+    columns: Option<std::collections::BTreeMap<String, String>>,
+    csv_sign: &str,
+    start_times: Option<PathBuf>,
+    strict: bool,
+    sleep_gap_s: f64,
+    estimates_period_s: Option<f64>,
+    progress: bool,
+) -> PyResult<Replay> {
+    let charge_positive = match csv_sign {
+        "discharge" => false,
+        "charge" => true,
+        other => return Err(data(format!("csv_sign {other:?}, must be discharge or charge"))),
+    };
+    if sleep_gap_s.is_nan() || sleep_gap_s <= 0.0 {
+        return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));
+    }
+    let wanted = Wanted::new(estimates_period_s)?;
+    let columns = columns.unwrap_or_default().into_iter().collect();
+    let reading = LogReading { strict, columns, charge_positive, start_times };
+    let logs = logs.list();
+    let config = py.detach(|| config::load(&config)).map_err(error::config)?;
+    let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
+    let result = work::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
+    let (mut outputs, json) = result.map_err(of_replay)?;
+    let outputs = outputs.finish(py, &config.interface_names())?;
+    Ok(Replay { outputs: Py::new(py, outputs)?, json })
+}
+
+fn run(
+    config: &Config,
+    logs: &[PathBuf],
+    reading: &LogReading,
+    (sleep_gap_s, wanted): (f64, Wanted),
+    work: &Work,
+) -> Result<(Columns, String), ReplayError> {
+    let columns = Arc::new(Mutex::new(Columns::default()));
+    let sink = Arc::clone(&columns);
+    let take = move |out: &CoreOutputs| sink.lock().unwrap_or_else(PoisonError::into_inner).add(wanted, out);
+    let sinks = Sinks { outputs: Some(Box::new(take)), ..Sinks::default() };
+    let mut source = LogSource::new(logs.to_vec(), reading.options(config));
+    let settings = ReplaySettings::plain(sleep_gap_s, config.interface_names());
+    let mut reported = 0;
+    let mut report = |bytes: u64| {
+        work.advance(bytes.saturating_sub(reported));
+        reported = bytes;
+    };
+    let monitor = Monitor::new(config.monitor.clone());
+    let (summary, _) = host_replay::run(&mut source, monitor, sinks, settings, &mut |progress| report(progress.bytes))?;
+    report(source.read_bytes().load(Ordering::Relaxed));
+    let json = serde_json::to_string_pretty(&summary).map_err(std::io::Error::from)? + "\n";
+    let columns = std::mem::take(&mut *columns.lock().unwrap_or_else(PoisonError::into_inner));
+    Ok((columns, json))
+}
+
+fn of_replay(failure: ReplayError) -> PyErr {
+    match failure {
+        ReplayError::Write(error) if error.kind() == std::io::ErrorKind::BrokenPipe => {
+            PyBrokenPipeError::new_err(error.to_string())
+        }
+        ReplayError::Write(error) => error::file(error),
+        failure => error::of_library(failure),
+    }
+}

@@ -1,0 +1,172 @@
+//! `score`: measured files against truth.
+
+use std::path::PathBuf;
+
+use packwatch_lab::score::{ScoreReport, ScoreRequest, Start};
+use pyo3::prelude::*;
+
+use crate::arguments::{Paths, bytes, cell_source};
+use crate::error::{data, of_library, of_request};
+use crate::work::{self, Progress};
+
+/// Numbers, or one of them.
+#[derive(FromPyObject)]
+pub(crate) enum Numbers {
+    One(f64),
+    Several(Vec<f64>),
+}
+
+/// Errors of the initial SOC, points; None: no SOC is given.
+#[derive(FromPyObject)]
+pub(crate) enum SocErrors {
+    One(Option<f64>),
+    Several(Vec<Option<f64>>),
+}
+
+/// One start or several.
+#[derive(FromPyObject)]
+pub(crate) enum Starts {
+    One(String),
+    Several(Vec<String>),
+}
+
+/// Scores of files in cases.
+#[pyclass(frozen, module = "packwatch")]
+pub(crate) struct Score(ScoreReport);
+
+#[pymethods]
+impl Score {
+    /// The document that `score --json` prints, with the line feed at its end.
+    fn json(&self) -> PyResult<String> {
+        self.0.json().map_err(data)
+    }
+
+    /// The tables that `score` prints.
+    fn table(&self) -> String {
+        self.0.table()
+    }
+
+    /// The document as a dictionary.
+    #[getter]
+    fn document<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        py.import("json")?.call_method1("loads", (self.json()?,))
+    }
+
+    /// One dictionary per file and case.
+    #[getter]
+    fn scores<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        self.document(py)?.get_item("scores")
+    }
+
+    fn __str__(&self) -> String {
+        self.table()
+    }
+}
+
+/// Runs measured files through the core and compares the estimates with the truth.
+#[pyfunction]
+#[pyo3(signature = (files, *, config=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None, voltage_max_v=None,
+                    learn=None, start=None, remove=None, soc_error_points=None, soc_std_points=None,
+                    capacity_error_percent=None, capacity_std_percent=None, current_offset_a=None, settle_s=None,
+                    truth_capacity_ah=None, sleep_gap_s=None, cycles=None, load=None, threshold_ah=None, skip_cycles=None,
+                    window=None, seeds=None, plots=None, progress=false))]
+#[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
+pub(crate) fn score(
+    py: Python<'_>,
+    files: Paths,
+    config: Option<PathBuf>,
+    cell: Option<PathBuf>,
+    chemistry: Option<String>,
+    rated_ah: Option<f64>,
+    voltage_min_v: Option<f64>,
+    voltage_max_v: Option<f64>,
+    learn: Option<Paths>,
+    start: Option<Starts>,
+    remove: Option<f64>,
+    soc_error_points: Option<SocErrors>,
+    soc_std_points: Option<f64>,
+    capacity_error_percent: Option<Numbers>,
+    capacity_std_percent: Option<f64>,
+    current_offset_a: Option<Numbers>,
+    settle_s: Option<f64>,
+    truth_capacity_ah: Option<f64>,
+    sleep_gap_s: Option<f64>,
+    cycles: Option<Paths>,
+    load: Option<[f64; 3]>,
+    threshold_ah: Option<f64>,
+    skip_cycles: Option<usize>,
+    window: Option<(f64, f64)>,
+    seeds: Option<Vec<u64>>,
+    plots: Option<PathBuf>,
+    progress: bool,
+) -> PyResult<Score> {
+    let usual = ScoreRequest::default();
+    let numbers = |given: Option<Numbers>, usual: Vec<f64>| given.map_or(usual, Numbers::list);
+    let request = ScoreRequest {
+        files: files.list(),
+        source: cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?,
+        learn: learn.map_or_else(Vec::new, Paths::list),
+        start: start.map_or(Ok(usual.start), Starts::list)?,
+        remove: remove.unwrap_or(usual.remove),
+        soc_error_points: soc_error_points.map_or(usual.soc_error_points, SocErrors::list),
+        soc_std_points,
+        capacity_error_percent: numbers(capacity_error_percent, usual.capacity_error_percent),
+        capacity_std_percent,
+        current_offset_a: numbers(current_offset_a, usual.current_offset_a),
+        settle_s: settle_s.unwrap_or(usual.settle_s),
+        truth_capacity_ah,
+        sleep_gap_s: sleep_gap_s.unwrap_or(usual.sleep_gap_s),
+        cycles: cycles.map_or_else(Vec::new, Paths::list),
+        load,
+        threshold_ah: threshold_ah.unwrap_or(usual.threshold_ah),
+        skip_cycles: skip_cycles.unwrap_or(usual.skip_cycles),
+        window,
+        seeds: seeds.unwrap_or(usual.seeds),
+        plots,
+    };
+    run(py, &request, progress)
+}
+
+fn run(py: Python<'_>, request: &ScoreRequest, is_shown: bool) -> PyResult<Score> {
+    let sizes: Vec<f64> = request.files.iter().map(|path| bytes(std::slice::from_ref(path)) as f64).collect();
+    let prepared = work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| request.prepare())?;
+    let prepared = prepared.map_err(of_request)?;
+    let progress = Progress { is_shown, total: Some(bytes(&request.files)), unit: "B" };
+    let report = work::run(py, progress, |work| {
+        prepared.run(&|file, part| work.advance((part * sizes.get(file).copied().unwrap_or(0.0)).round() as u64))
+    })?;
+    report.map(Score).map_err(of_library)
+}
+
+impl Numbers {
+    pub(crate) fn list(self) -> Vec<f64> {
+        match self {
+            Self::One(number) => vec![number],
+            Self::Several(numbers) => numbers,
+        }
+    }
+}
+
+impl SocErrors {
+    fn list(self) -> Vec<Option<f64>> {
+        match self {
+            Self::One(points) => vec![points],
+            Self::Several(points) => points,
+        }
+    }
+}
+
+impl Starts {
+    fn list(self) -> PyResult<Vec<Start>> {
+        let names = match self {
+            Self::One(name) => vec![name],
+            Self::Several(names) => names,
+        };
+        let start = |name: &String| match name.as_str() {
+            "full" => Ok(Start::Full),
+            "middle" => Ok(Start::Middle),
+            other => Err(data(format!("start {other:?}, must be full or middle"))),
+        };
+        names.iter().map(start).collect()
+    }
+}

@@ -1,0 +1,175 @@
+"""The doors of the commands: the same bytes, the same files, and exceptions with the same text."""
+
+import json
+import subprocess
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from conftest import BINARY, CELL, CONFIG, assert_same_estimates, packwatch
+
+import packwatch as pw
+
+PAPER = CONFIG / "paper.toml"
+
+
+def test_score_gives_the_bytes_of_the_command(record):
+    score = pw.score(record.csv, cell=CELL, settle_s=60)
+    assert score.json() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60", "--json")
+    assert score.table() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60")
+    assert score.scores[0]["soc"]["samples"] == 8940
+
+
+def test_every_argument_of_score_reaches_it(record, tmp_path):
+    score = pw.score(
+        record.csv, cell=CELL, start=["full", "middle"], remove=0.15, soc_error_points=[None, -5.0], soc_std_points=6.0,
+        capacity_error_percent=[0.0, 5.0], capacity_std_percent=4.0, current_offset_a=0.05, settle_s=120.0, truth_capacity_ah=2.6,
+        sleep_gap_s=30.0, plots=tmp_path / "plots", learn=[record.csv],
+    )  # fmt: skip
+    arguments = "--start full,middle --remove 0.15 --told none,-5 --soc-std 6 --capacity-error 0,5 --capacity-std 4 --current-offset 0.05"
+    arguments += f" --settle 120 --truth-capacity 2.6 --sleep-gap 30 --plot {tmp_path}/plots --learn {record.csv} --json"
+    assert score.json() == packwatch("score", record.csv, "--cell", CELL, *arguments.split())
+    assert len(score.scores) == 8 and len(list((tmp_path / "plots").glob("*.svg"))) == 8
+
+
+def test_score_of_a_panasonic_drive_gives_the_bytes_of_the_command(data):
+    drive = sorted((data / "panasonic_18650pf/25C").glob("HWFTa*"))[0]
+    model = CONFIG / "cells/panasonic_18650pf.toml"
+    score = pw.score([drive], cell=model)
+    assert score.json() == packwatch("score", drive, "--cell", model, "--json")
+    assert score.scores[0]["soc"]["rmse_points"] < 2.0
+
+
+def test_replay_gives_the_files_of_the_command(record, tmp_path):
+    csv, events, frames = (tmp_path / name for name in ("estimates.csv", "events.jsonl", "frames.log"))
+    told = packwatch("replay", "-c", PAPER, record.log, "--estimates", csv, "--events", events, "--frames", frames, "--json")
+    replay = pw.replay(PAPER, [record.log])
+    assert_same_estimates(replay.estimates, csv)
+    assert list(replay.events["document"]) == events.read_text().splitlines()
+    assert [json.loads(document)["event"] for document in replay.events["document"]] == list(replay.events["event"])
+    lines = [f"{interface} {can_id:03X}#{data.hex().upper()}" for interface, can_id, data in
+             zip(*(replay.frames[name] for name in ("interface", "can_id", "data")))]  # fmt: skip
+    assert lines == [line.split(maxsplit=1)[1] for line in frames.read_text().splitlines()]
+    timed = ("wall_s", "times_real_time", "frames_per_s", "cell_steps_per_s", "peak_memory_kib", "estimates")
+    without = lambda summary: {key: value for key, value in summary.items() if key not in timed}  # noqa: E731
+    assert without(replay.summary) == without(json.loads(told))
+
+
+def test_replay_reads_columns_of_other_names(record, tmp_path):
+    csv = tmp_path / "other.csv"
+    np.savetxt(csv, np.column_stack([record.time_s, -record.current_a, record.voltage_v]), fmt="%.6f", delimiter=",",
+               header="t,I,U", comments="")  # fmt: skip
+    replay = pw.replay(PAPER, csv, columns={"time": "t", "current": "I", "voltage": "U"}, csv_sign="charge")
+    assert abs(replay.estimates["soc"][-1] - record.soc[-1]) < 0.03
+
+
+def test_fit_writes_the_model_of_the_command(tmp_path, data):
+    drives = sorted((data / "panasonic_18650pf/25C").glob("HWFT*"))
+    packwatch("fit", *drives, "--name", "cell", "--capacity", "2.9", "--out", tmp_path / "command.toml")
+    fit = pw.fit(drives, "cell", capacity_ah=2.9)
+    fit.write(tmp_path / "python.toml")
+    assert (tmp_path / "python.toml").read_bytes() == (tmp_path / "command.toml").read_bytes()
+    assert fit.capacity_ah == 2.9 and 0.0 < fit.rmse_v < 0.1 and fit.document["converged"] in (True, False)
+    assert pw.CellModel(tmp_path / "python.toml").name == "cell"
+
+
+def histories(folder):
+    path = folder / "life.csv"
+    rows = "".join(f"{86400 * n},{2.0 - 0.003 * n - 0.00001 * n * n:.6f}\n" for n in range(120))
+    path.write_text(f"date,capacity_ah\n{rows}")
+    return path
+
+
+def test_rul_gives_the_document_of_the_command(tmp_path):
+    life = histories(tmp_path)
+    assert pw.rul(life, "70 %") == json.loads(packwatch("rul", life, "--end-of-life", "70 %", "--json"))
+    judged = pw.rul([life], [1.6, "85%"], at=[0.5, 0.7], alpha=0.1)
+    assert judged == json.loads(packwatch("rul", life, "--end-of-life", "1.6,85%", "--at", "50,70", "--alpha", "0.1", "--json"))
+    assert len(judged["files"]) == 2
+
+
+def test_gp_gives_the_model_of_the_command(tmp_path):
+    rows = np.random.default_rng(1).uniform(0.0, 6.0, (80, 1))
+    output = np.sin(rows[:, 0]) + 0.5
+    np.savetxt(tmp_path / "rows.csv", np.column_stack([rows, output]), delimiter=",", header="x,y", comments="", fmt="%.17g")
+    packwatch("gpr", "train", tmp_path / "rows.csv", "--output", "y", "--inputs", "x", "--kernel", "matern52", "--out", tmp_path / "model.json")
+    process = pw.gp.fit(rows, output, kernel="matern52")
+    loaded = pw.gp.load(tmp_path / "model.json")
+    assert (loaded.inputs, loaded.output) == (["x"], "y")
+    assert process.hyperparameters == loaded.hyperparameters
+    at = np.linspace(0.5, 5.5, 11)
+    for name in ("mean", "std", "low_95", "high_95"):
+        np.testing.assert_array_equal(process.predict(at)[name], loaded.predict(at)[name])
+    assert np.abs(process.predict(at)["mean"] - np.sin(at) - 0.5).max() < 0.01
+    process.save(tmp_path / "again.json")
+    np.testing.assert_array_equal(pw.gp.load(tmp_path / "again.json").predict(at)["mean"], process.predict(at)["mean"])
+
+
+def test_cell_models_are_read_asked_and_written(tmp_path):
+    model = pw.CellModel(CELL)
+    table = model.table(np.linspace(0.0, 1.0, 11))
+    assert (np.diff(table["ocv_v"]) > 0).all() and (table["r0_ohm"] > 0).all() and "tau1_s" in table
+    assert abs(model.soc_of_ocv(table["ocv_v"][3]) - 0.3) < 1e-9
+    model.write(tmp_path / "model.toml")
+    again = pw.CellModel(tmp_path / "model.toml")
+    assert again.capacity_ah == model.capacity_ah == 2.6
+    np.testing.assert_allclose(again.table([0.5])["ocv_v"], model.table([0.5])["ocv_v"], rtol=1e-6)
+    label = pw.CellModel.of_label("nca-graphite", 2.9)
+    assert label.rated_capacity_ah == 2.9 and pa.table(label.table([0.1, 0.9])).num_rows == 2
+
+
+CSV_FAULT = "time_s,current_a,voltage_v,discharged_ah\n0,1,3.9,0\n1,x,3.9,0\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "bases", "call", "command"),
+    [
+        (pw.FileError, OSError, lambda f: pw.score(f / "no.csv", cell=CELL), ["score", "no.csv", "--cell", CELL]),
+        (pw.FileError, OSError, lambda f: pw.replay(PAPER, f / "no.log"), ["replay", "-c", PAPER, "no.log"]),
+        (pw.FileError, OSError, lambda f: pw.rul(f / "no.csv", 1.4), ["rul", "no.csv", "--end-of-life", "1.4"]),
+        (pw.FileError, OSError, lambda f: pw.fit(f / "no.csv", "x"), ["fit", "no.csv", "--name", "x", "--out", "m.toml"]),
+        (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", cell=CELL), ["score", "bad.csv", "--cell", CELL]),
+        (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", config=f / "pack.toml"), ["score", "bad.csv", "-c", "pack.toml"]),
+        (pw.ConfigError, ValueError, lambda f: pw.score(f / "bad.csv", cell=f / "bad.toml"), ["score", "bad.csv", "--cell", "bad.toml"]),
+        (pw.ConfigError, ValueError, lambda f: pw.Monitor(f / "bad.toml"), ["replay", "-c", "bad.toml", "no.log"]),
+    ],
+)
+def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases, call, command):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.csv").write_text(CSV_FAULT)
+    (tmp_path / "bad.toml").write_text("[pack]\ncells = 0\n")
+    pack = (CONFIG / "example.toml").read_text().replace('"pack96.dbc"', f'"{CONFIG}/pack96.dbc"')
+    (tmp_path / "pack.toml").write_text(pack.replace('"cells/', f'"{CONFIG}/cells/'))
+    done = subprocess.run([BINARY, *map(str, command)], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    with pytest.raises(kind) as caught:
+        call(type(tmp_path)())
+    assert str(caught.value) == (done.stderr or done.stdout).removesuffix("\n")
+    assert isinstance(caught.value, (bases, pw.PackwatchError)) and issubclass(kind, bases)
+    if kind is pw.ConfigError:
+        assert caught.value.faults == str(caught.value).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda: pw.score("a.csv"), "no cell: a configuration, a cell model or a chemistry with rated capacity must be given"),
+        (lambda: pw.score(["a.csv", "a.csv"], cell=CELL), "a.csv: named twice"),
+        (lambda: pw.score("a.csv", cell=CELL, start="end"), 'start "end", must be full or middle'),
+        (lambda: pw.score("a.csv", cell=CELL, remove=1.5), "remove = 1.5, must be above 0 and below 1"),
+        (lambda: pw.score("a.csv", cell=CELL, settle_s=float("nan")), "settle_s = NaN, must be 0 or more"),
+        (lambda: pw.score("a.csv", cell=CELL, capacity_error_percent=-100.0), "capacity_error_percent = -100, must be above -100 and at most 100"),
+        (lambda: pw.score("a.csv", cell=CELL, window=(0.7, 0.4)), "window = 0.7, 0.4, must be two parts above 0 and at most 1, the smaller first"),
+        (lambda: pw.rul("a.csv", "soon"), 'end_of_life "soon": must be Ah above 0 like 1.4, or per cent'),
+        (lambda: pw.rul("a.csv", 1.4, at=[1.0]), "at and alpha: found 1, must be above 0 and below 1"),
+        (lambda: pw.fit("a.csv", "x", tau_s=[10.0, 5.0]), "--tau: 5 follows 10, must rise"),
+        (lambda: pw.gp.fit([[1.0]], [1.0, 2.0]), "output has 2 rows, inputs has 1: must agree"),
+        (lambda: pw.gp.fit([[1.0]], [1.0], basis="cubic"), 'basis "cubic", must be zero, constant or linear'),
+        (lambda: pw.CellModel.of_label("lead", 60.0), 'chemistry "lead", must be one of'),
+        (lambda: pw.CellModel(CELL).table([1.5]), "soc: found 1.5, must be fractions from 0 to 1"),
+    ],
+)
+def test_bad_arguments_are_named(call, text):
+    with pytest.raises(pw.DataError) as caught:
+        call()
+    assert text in str(caught.value)

@@ -1,0 +1,227 @@
+"""Rows and frames through the monitor: as a replay of the same, in any portions; bad input is an exception that says what is wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from conftest import CELL, CONFIG, assert_same_estimates, packwatch
+
+import packwatch as pw
+
+PAPER = CONFIG / "paper.toml"
+PACK = """
+[pack]
+cells = 3
+cell_model = "cells/example_nmc_2600.toml"
+
+[[interface]]
+name = "can0"
+
+[input]
+dbc = ["pack.dbc"]
+
+[input.current]
+signal = "Pack.Current"
+positive = "discharge"
+
+[input.cell_voltage]
+signal = "Cells.Cell{n}"
+first = 1
+
+[[input.temperature]]
+signal = "Pack.Temperature"
+"""
+PACK_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: BMS
+BO_ 256 Pack: 4 BMS
+ SG_ Current : 0|16@1- (0.01,0) [-300|300] "A" Vector__XXX
+ SG_ Temperature : 16|16@1- (0.1,0) [-40|100] "degC" Vector__XXX
+BO_ 257 Cells: 6 BMS
+ SG_ Cell1 : 0|16@1+ (0.001,0) [0|6] "V" Vector__XXX
+ SG_ Cell2 : 16|16@1+ (0.001,0) [0|6] "V" Vector__XXX
+ SG_ Cell3 : 32|16@1+ (0.001,0) [0|6] "V" Vector__XXX
+"""
+
+
+def columns(record):
+    return record.time_s, record.current_a, record.voltage_v, record.temperature_c
+
+
+def together(tables, name):
+    return np.concatenate([np.asarray(table[name], dtype="float64") for table in tables])
+
+
+def test_rows_give_every_bit_that_a_replay_of_the_same_file_gives(record, tmp_path):
+    csv = tmp_path / "estimates.csv"
+    packwatch("replay", "-c", PAPER, record.csv, "--estimates", csv)
+    monitor = pw.Monitor(PAPER)
+    tables = [pa.table(monitor.rows(*columns(record)).estimates), pa.table(monitor.finish().estimates)]
+    expected_rows = sum(map(len, tables))
+    assert expected_rows == len(csv.read_text().splitlines()) - 1
+    whole = pw.replay(PAPER, record.csv).estimates
+    assert_same_estimates(whole, csv)
+    for name in whole.column_names:
+        np.testing.assert_array_equal(together(tables, name), np.asarray(whole[name], dtype="float64"), err_msg=name)
+
+
+def test_rows_in_portions_give_what_they_give_at_once(record):
+    at_once, portions = pw.Monitor(PAPER), pw.Monitor(PAPER)
+    whole = at_once.rows(*columns(record)).estimates
+    parts = [portions.rows(*(column[start : start + 700] for column in columns(record))).estimates for start in range(0, 9000, 700)]
+    np.testing.assert_array_equal(together(parts, "soc"), whole["soc"])
+
+
+def test_frames_give_what_a_replay_of_their_log_gives(record, tmp_path):
+    csv = tmp_path / "estimates.csv"
+    packwatch("replay", "-c", PAPER, record.log, "--estimates", csv)
+    frames = [line.split() for line in record.log.read_text().splitlines()]
+    time_s = [float(stamp.strip("()")) for stamp, _, _ in frames]
+    can_id = [int(frame.split("#")[0], 16) for _, _, frame in frames]
+    payload = np.array([list(bytes.fromhex(frame.split("#")[1])) for _, _, frame in frames], dtype="uint8")
+    monitor = pw.Monitor(PAPER)
+    out = monitor.frames(time_s, can_id, payload)
+    assert len(out.frames) > 0 and set(out.frames["interface"]) == {"vcan0"}
+    soc = together([out.estimates, monitor.finish().estimates], "soc")
+    expected = pw.replay(PAPER, record.log)
+    assert_same_estimates(expected.estimates, csv)
+    np.testing.assert_array_equal(soc, expected.estimates["soc"])
+
+
+def test_a_configuration_is_a_text_and_cells_are_columns(tmp_path):
+    (tmp_path / "pack.dbc").write_text(PACK_DBC)
+    monitor = pw.Monitor(text=PACK.replace("cells/", f"{CONFIG}/cells/"), folder=tmp_path)
+    assert (monitor.cells, monitor.interfaces) == (3, ["can0"])
+    time_s = np.arange(600.0)
+    voltage_v = np.full((600, 3), [3.9, 3.8, 3.7])
+    voltage_v[:, 1] = np.nan
+    out = monitor.rows(time_s, np.full(600, 1.0), voltage_v, np.full(600, 25.0)).estimates
+    assert set(out["cell"]) == {0, 2}, "no estimate without a voltage"
+    last = {cell: out["soc"][out["cell"] == cell][-1] for cell in (0, 2)}
+    assert last[0] > last[2] > 0.0
+    with pytest.raises(pw.DataError, match=r"voltage_v has 1 columns, must have 3 as the configuration has"):
+        monitor.rows(time_s, time_s, time_s)
+
+
+def test_unknown_is_null_and_never_a_number(record):
+    out = pw.Monitor(PAPER).rows(record.time_s[:600], np.full(600, np.nan), record.voltage_v[:600]).estimates
+    table = pa.table(out)
+    assert table["current_a"].null_count == len(table), "no current was read"
+    assert np.isnan(out["current_a"]).all() and out["soc_std"][-1] > 0.01
+    assert pa.table(out)["u3_v"].null_count == len(table), "the model has fewer branches"
+
+
+def test_at_most_one_estimate_per_period(record):
+    every = pw.Monitor(PAPER).rows(*columns(record)).estimates
+    thin = pw.Monitor(PAPER, estimates_period_s=60.0).rows(*columns(record)).estimates
+    none = pw.Monitor(PAPER, estimates_period_s=None).rows(*columns(record)).estimates
+    assert (len(none), len(thin)) == (0, -(-len(every) // 60))
+    np.testing.assert_array_equal(thin["soc"], every["soc"][::60])
+
+
+def test_tables_are_arrow_without_a_copy(record):
+    out = pw.Monitor(cell=CELL).rows(*columns(record)).estimates
+    table = pa.table(out)
+    assert table.schema.field("soc").type == pa.float64()
+    assert np.shares_memory(table["soc"].chunk(0).to_numpy(), out["soc"]) and np.shares_memory(out["soc"], out["soc"])
+    assert list(out.to_pandas().columns) == out.column_names and "soc" in out
+    with pytest.raises(KeyError, match="no column charge, found time_s,cell,soc"):
+        out["charge"]
+
+
+def test_arrays_lists_and_arrow_columns_are_the_same(record):
+    few = [column[:300] for column in columns(record)]
+    expected = pw.Monitor(PAPER).rows(*few).estimates["soc"]
+    for form in (list, pa.array, lambda column: column[::-1][::-1], lambda column: np.asarray(column, dtype=object)):
+        np.testing.assert_array_equal(pw.Monitor(PAPER).rows(*map(form, few)).estimates["soc"], expected)
+
+
+def test_a_label_is_enough(record):
+    out = pw.Monitor(chemistry="nmc-graphite", rated_ah=2.6).rows(*columns(record)).estimates
+    assert abs(out["soc"][-1] - record.soc[-1]) < 0.15 < 4.0 * max(out["soc_std"][-1], 0.0376)
+
+
+@pytest.mark.parametrize(
+    ("call", "text"),
+    [
+        (lambda m: m.rows([0.0, np.nan], [1, 1], [4, 4]), "time_s[1] = NaN, must be a finite number"),
+        (lambda m: m.rows([0.0, 1.0], [1], [4, 4]), "current_a has 1 rows, time_s has 2: must agree"),
+        (lambda m: m.rows([0.0], [1], [4], [25, 26]), "temperature_c has 2 rows, time_s has 1: must agree"),
+        (lambda m: m.rows([[[0.0]]], [1], [4]), "time_s has 3 dimensions, must have 1 or 2"),
+        (lambda m: m.rows(["x"], [1], [4]), "time_s: no array of numbers: ValueError: could not convert string to float: 'x'"),
+        (lambda m: m.frames([0.0], [0x800], [[1, 2]]), "can_id[0] = 0x800, must be at most 0x7FF, or"),
+        (lambda m: m.frames([0.0], [1], [[1, 2]], length=[3]), "length[0] = 3, must be at most 2 as data has columns"),
+        (lambda m: m.frames([0.0], [1], [[1]], interface="can7"), 'interface "can7", must be one of vcan0'),
+        (lambda m: m.gap(float("inf")), "time_s = inf, must be a finite number"),
+        (lambda m: pw.Monitor(), "no configuration: config, text, cell or chemistry must be given"),
+        (lambda m: pw.Monitor(PAPER, sleep_gap_s=0), "sleep_gap_s = 0, must be above 0"),
+        (lambda m: pw.Monitor(PAPER, estimates_period_s=-1), "estimates_period_s = -1, must be 0 to 1e9, or None"),
+    ],
+)
+def test_bad_input_is_named(call, text):
+    with pytest.raises(pw.DataError) as caught:
+        call(pw.Monitor(PAPER))
+    assert text in str(caught.value) and isinstance(caught.value, ValueError)
+
+
+def test_after_a_fault_the_monitor_goes_on_as_if_it_had_not_been(record):
+    monitor = pw.Monitor(PAPER)
+    with pytest.raises(pw.DataError):
+        monitor.rows(record.time_s, record.current_a[1:], record.voltage_v)
+    soc = monitor.rows(*columns(record)).estimates["soc"]
+    np.testing.assert_array_equal(soc, pw.Monitor(PAPER).rows(*columns(record)).estimates["soc"])
+
+
+def test_no_rows_give_empty_tables():
+    out = pw.Monitor(PAPER).rows([], [], [])
+    assert len(out.estimates) == len(out.estimates["soc"]) == len(out.events["event"]) == 0
+    assert pa.table(out.frames).num_rows == 0
+
+
+def long(rows):
+    return np.arange(rows, dtype=float), np.full(rows, 0.1), np.full(rows, 3.7)
+
+
+def test_other_threads_run_during_the_work():
+    monitor, times = pw.Monitor(PAPER, estimates_period_s=None), []
+    work = threading.Thread(target=lambda: monitor.rows(*long(400_000)))
+    work.start()
+    while work.is_alive():
+        times.append(time.perf_counter())
+        time.sleep(0.001)
+    assert len(times) > 20 and max(np.diff(times)) < 0.5 * (times[-1] - times[0]), "the interpreter was not blocked"
+
+
+def test_progress_is_shown_with_tqdm(capsys):
+    pw.Monitor(PAPER, estimates_period_s=None).rows(*long(50_000), progress=True)
+    assert "50.0k" in capsys.readouterr().err.split("\r")[-1]
+
+
+def test_control_c_ends_the_work(tmp_path):
+    script = textwrap.dedent(f"""
+        import numpy as np, packwatch as pw
+        monitor = pw.Monitor({str(PAPER)!r}, estimates_period_s=None)
+        rows = 50_000_000
+        columns = np.arange(rows, dtype=float), np.full(rows, 0.1), np.full(rows, 3.7)
+        print("begins", flush=True)
+        try:
+            monitor.rows(*columns)
+        except KeyboardInterrupt:
+            monitor.rows([1e9], [0.1], [3.7])
+            print("interrupted", flush=True)
+    """)
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "begins\n"
+    time.sleep(0.5)
+    begin = time.monotonic()
+    os.kill(process.pid, signal.SIGINT)
+    assert process.communicate(timeout=60)[0] == "interrupted\n"
+    assert process.returncode == 0 and time.monotonic() - begin < 10.0
