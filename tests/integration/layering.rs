@@ -38,7 +38,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("diagnosis", MODULES.split_at(19).0, Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     // A program of its own: it reads the daemon's status and has nothing of its loop.
-    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "status"], Core::Shell),
+    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status"], Core::Shell),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
@@ -277,8 +277,9 @@ fn place(file: &str) -> (&str, usize) {
     let member = CRATES.iter().find(|(name, _)| parts.len() > 1 && parts[0] == *name);
     let Some((_, whole)) = member else { return (parts[0], parts.len()) };
     parts.remove(0);
-    // The uplink has a main.rs of its own.
-    let is_known = parts[0] != "main" && TABLE.iter().any(|(name, ..)| *name == parts[0]);
+    // Programs and doors of their own may name their files as they like.
+    let is_apart = matches!(*whole, Some("python" | "uplink"));
+    let is_known = !is_apart && TABLE.iter().any(|(name, ..)| *name == parts[0]);
     let module = if is_known { parts[0] } else { whole.unwrap_or(parts[0]) };
     (module, parts.len())
 }
