@@ -1,3 +1,5 @@
+//! The overlay as vspec and JSON, and the manual's page.
+
 use super::*;
 
 /// Paths of the leaves below a node of the JSON, with their datatypes.

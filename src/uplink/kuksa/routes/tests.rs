@@ -1,3 +1,5 @@
+//! Ids and datatypes of a broker against those of the signals: what is skipped, what is withheld.
+
 use packwatch_host::status::client::parse;
 
 use super::super::messages::{Texts, TypedValue};

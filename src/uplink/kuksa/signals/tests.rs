@@ -1,3 +1,5 @@
+//! Values of the signals from documents: signs, unknown values, the table's own consistency.
+
 use std::collections::BTreeSet;
 
 use packwatch_host::status::client::parse;

@@ -1,3 +1,5 @@
+//! Discovery messages against the entities and a table of what Home Assistant accepts.
+
 use std::collections::BTreeSet;
 
 use super::*;

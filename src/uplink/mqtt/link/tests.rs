@@ -1,3 +1,5 @@
+//! What a connection publishes and when it takes messages from the queue, without a broker.
+
 use super::*;
 
 fn document() -> StatusDocument {

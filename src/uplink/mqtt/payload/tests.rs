@@ -1,3 +1,5 @@
+//! Published documents: signs, units, and null for what is not known.
+
 use super::*;
 
 fn document() -> StatusDocument {

@@ -1,3 +1,5 @@
+//! The queue on disk: order, bounds, what is dropped first, restarts.
+
 use super::*;
 
 fn settings(folder: &Path, max_messages: u64, max_bytes: u64) -> HistorySettings {

@@ -1,3 +1,5 @@
+//! Which samples and events become messages, each once, also over restarts of the daemon.
+
 use super::super::settings::HistorySettings;
 use super::*;
 use serde_json::json;
