@@ -24,6 +24,7 @@
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
+//! | | `failure` | why a command ended: text and exit code of every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
 //! | `src/python` | `python` | the Python module: doors to the rooms above; stubs and Python code in its folder `packwatch` |

@@ -56,9 +56,7 @@ mod whatif;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-
-/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart on it).
-pub const EXIT_CONFIG: u8 = 78;
+pub use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 /// Streaming battery health monitoring over SocketCAN.
 #[derive(Debug, Parser)]
@@ -156,43 +154,6 @@ enum Command {
     /// Write the measured part of a battery passport, merged with the manufacturer's part and checked
     #[cfg(feature = "lab")]
     Passport(Box<passport::Args>),
-}
-
-/// Why a command ended without success: what to print and the exit code.
-#[derive(Debug)]
-pub struct Failure {
-    /// For the terminal, without the program's name; empty = the output reports it.
-    pub message: String,
-    /// Exit code.
-    pub code: u8,
-}
-
-impl Failure {
-    /// A failure of the work itself: exit code 1.
-    pub fn new(message: impl Into<String>) -> Self {
-        Self { message: message.into(), code: 1 }
-    }
-
-    /// A failure that another start does not repair: exit code 78.
-    pub fn config(message: impl Into<String>) -> Self {
-        Self { message: message.into(), code: EXIT_CONFIG }
-    }
-}
-
-impl From<crate::config::ConfigFaults> for Failure {
-    fn from(faults: crate::config::ConfigFaults) -> Self {
-        Self { message: faults.to_string(), code: EXIT_CONFIG }
-    }
-}
-
-#[cfg(feature = "lab")]
-impl From<crate::lab::error::RequestError> for Failure {
-    fn from(error: crate::lab::error::RequestError) -> Self {
-        match error {
-            crate::lab::error::RequestError::Config(faults) => faults.into(),
-            crate::lab::error::RequestError::Lab(error) => Self::new(error.0),
-        }
-    }
 }
 
 /// Parses the command line and runs the command.

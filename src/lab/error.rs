@@ -1,5 +1,7 @@
 //! The one error of offline work: a text with the place, what was found and what is allowed.
 
+use packwatch_host::failure::Failure;
+
 use crate::chart::PlotError;
 use crate::config::ConfigFaults;
 use crate::io::table::TableError;
@@ -42,3 +44,12 @@ convert!(
     PlotError,
     TableError,
 );
+
+impl From<RequestError> for Failure {
+    fn from(error: RequestError) -> Self {
+        match error {
+            RequestError::Config(faults) => faults.into(),
+            RequestError::Lab(error) => Self::new(error.0),
+        }
+    }
+}

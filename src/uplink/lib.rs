@@ -6,7 +6,6 @@
 //!
 //! | module | what lives there |
 //! | --- | --- |
-//! | `failure` | why a command ended, and its exit code |
 //! | `kuksa` | provider of a KUKSA databroker |
 //! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
 //! | `options` | options of the commands that run for ever |
@@ -14,7 +13,6 @@
 //! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
 //! | `vss` | the overlay of the vehicle signal specification |
 
-mod failure;
 pub mod kuksa;
 pub mod mqtt;
 mod options;
@@ -22,5 +20,5 @@ pub mod settings;
 pub mod status_stream;
 pub mod vss;
 
-pub use failure::Failure;
 pub use options::Options;
+pub use packwatch_host::failure::Failure;

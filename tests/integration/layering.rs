@@ -36,16 +36,17 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("exporter", MODULES.split_at(19).0, Core::Shell),
     ("replay", MODULES.split_at(19).0, Core::Shell),
     ("diagnosis", MODULES.split_at(19).0, Core::Shell),
+    ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     // A program of its own: it reads the daemon's status and has nothing of its loop.
-    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status"], Core::Shell),
+    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status", "failure"], Core::Shell),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// The modules of `src/core` and `src/host`, lowest first, then those of the lab.
-const MODULES: [&str; 25] = [
+const MODULES: [&str; 26] = [
     "quantity",
     "filter",
     "can",
@@ -68,12 +69,13 @@ const MODULES: [&str; 25] = [
     "exporter",
     "replay",
     "diagnosis",
+    "failure",
     "regress",
     "ident",
     "lab",
 ];
 const CORE: &[&str] = MODULES.split_at(11).0;
-const BELOW_LAB: &[&str] = MODULES.split_at(24).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(25).0;
 /// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
 const CRATES: [(&str, Option<&str>); 6] = [
     ("core", None),

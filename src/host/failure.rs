@@ -1,12 +1,14 @@
-//! Why a command ended without success: what to print and the exit code, as of `packwatch`.
+//! Why a command ended without success: the text for the terminal and the exit code, of every program of packwatch.
 
-/// Exit code of bad settings (EX_CONFIG; systemd does not restart on it).
-const EXIT_CONFIG: u8 = 78;
+use crate::config::ConfigFaults;
+
+/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart on it).
+pub const EXIT_CONFIG: u8 = 78;
 
 /// Why a command ended without success.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
-    /// For the terminal.
+    /// For the terminal, without the program's name; empty = the output reports it.
     pub message: String,
     /// Exit code.
     pub code: u8,
@@ -21,5 +23,11 @@ impl Failure {
     /// A failure that another start does not repair: exit code 78.
     pub fn config(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: EXIT_CONFIG }
+    }
+}
+
+impl From<ConfigFaults> for Failure {
+    fn from(faults: ConfigFaults) -> Self {
+        Self::config(faults.to_string())
     }
 }
