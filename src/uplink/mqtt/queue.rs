@@ -3,13 +3,13 @@
 //! In: messages of the recorder. Out: the oldest messages in order, until they are removed. A message that was accepted survives a
 //! power cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. When it is
 //! full, the oldest samples are dropped, and the oldest events only when no sample is left. Drops are counted for ever. A
-//! file that is damaged is put aside and a new one begun.
+//! file that is damaged is put aside and a new one begun; where the disk fails or a newer program wrote the file, it stays as it is.
 
 use std::cell::{Cell, RefCell};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use rusqlite::{Connection, OptionalExtension as _, Transaction, params};
+use rusqlite::{Connection, ErrorCode, OptionalExtension as _, Transaction, params};
 use tokio::sync::Notify;
 
 use super::settings::HistorySettings;
@@ -79,11 +79,12 @@ impl Queue {
         let path = folder.join(FILE);
         let database = match prepare(&path) {
             Ok(database) => database,
-            Err(error) => {
+            Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
-                tracing::error!(%error, aside = %aside.display(), "the queue is damaged: put aside, a new one begins");
-                prepare(&path).map_err(|error| at(&error))?
+                tracing::error!(error, aside = %aside.display(), "the queue is damaged: put aside, a new one begins");
+                prepare(&path).map_err(|fault| at(&fault.text()))?
             }
+            Err(OpenFault::Failed(error)) => return Err(at(&error)),
         };
         let fill = read_fill(&database).map_err(|error| at(&error))?;
         let (max_messages, max_bytes) = (settings.max_messages, settings.max_bytes);
@@ -200,24 +201,58 @@ fn length(body: &str) -> u64 {
     body.len() as u64
 }
 
-/// Opens the file, checks it and creates its tables.
-fn prepare(path: &Path) -> rusqlite::Result<Connection> {
+/// Why the file cannot be opened.
+enum OpenFault {
+    /// It holds no queue.
+    Damaged(String),
+    /// It may hold one: the disk is full or fails, or the file is a newer program's.
+    Failed(String),
+}
+
+impl OpenFault {
+    fn text(self) -> String {
+        match self {
+            Self::Damaged(text) | Self::Failed(text) => text,
+        }
+    }
+}
+
+impl From<rusqlite::Error> for OpenFault {
+    fn from(error: rusqlite::Error) -> Self {
+        match error.sqlite_error_code() {
+            Some(ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase) => Self::Damaged(error.to_string()),
+            _ => Self::Failed(error.to_string()),
+        }
+    }
+}
+
+/// Opens the file, checks it and creates its tables, where there are none: then nothing is written, so that a full disk does not matter.
+fn prepare(path: &Path) -> Result<Connection, OpenFault> {
     let database = Connection::open(path)?;
     database.pragma_update(None, "journal_mode", "wal")?;
     database.pragma_update(None, "synchronous", "full")?;
     database.pragma_update(None, "wal_autocheckpoint", CHECKPOINT_PAGES)?;
     let check: String = database.query_row("PRAGMA quick_check(1)", [], |row| row.get(0))?;
     let version: i64 = database.query_row("PRAGMA user_version", [], |row| row.get(0))?;
-    if check != "ok" || version > VERSION {
-        return Err(rusqlite::Error::InvalidParameterName(format!("check {check}, layout {version}")));
+    if check != "ok" {
+        return Err(OpenFault::Damaged(check));
+    }
+    match version {
+        VERSION => return Ok(database),
+        0 => {}
+        _ => {
+            return Err(OpenFault::Failed(format!("{FILE} has layout {version}, must be {VERSION}: a newer program's")));
+        }
     }
     // AUTOINCREMENT: no number is used twice, also when the queue was empty meanwhile.
     database.execute_batch(&format!(
-        "CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);
+        "BEGIN;
+         CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);
          CREATE INDEX IF NOT EXISTS message_class ON message (class, id);
          CREATE TABLE IF NOT EXISTS dropped (class INTEGER PRIMARY KEY, count INTEGER NOT NULL);
          CREATE TABLE IF NOT EXISTS seen (one INTEGER PRIMARY KEY CHECK (one = 0), text TEXT NOT NULL);
-         PRAGMA user_version = {VERSION};"
+         PRAGMA user_version = {VERSION};
+         COMMIT;"
     ))?;
     Ok(database)
 }

@@ -89,3 +89,24 @@ fn a_second_uplink_is_refused_and_a_damaged_file_is_put_aside() {
     assert_eq!(queue.fill().messages, 1);
     assert!(folder.path().join("queue.damaged").exists());
 }
+
+#[test]
+fn a_queue_that_the_disk_does_not_open_or_a_newer_program_wrote_stays_as_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = || Queue::open(&settings(folder.path(), 10, 1000));
+    open().unwrap().add(&[event("e1")], None).unwrap();
+
+    let in_the_way = folder.path().join("queue.db-wal");
+    std::fs::create_dir(&in_the_way).unwrap();
+    open().unwrap_err();
+    std::fs::remove_dir(&in_the_way).unwrap();
+    assert_eq!(texts(&open().unwrap()), ["e1"]);
+
+    let database = Connection::open(folder.path().join(FILE)).unwrap();
+    database.pragma_update(None, "user_version", VERSION + 1).unwrap();
+    let refusal = open().unwrap_err();
+    assert!(refusal.ends_with("queue.db has layout 2, must be 1: a newer program's"), "{refusal}");
+    database.pragma_update(None, "user_version", VERSION).unwrap();
+    assert_eq!(texts(&open().unwrap()), ["e1"]);
+    assert!(!folder.path().join("queue.damaged").exists());
+}
