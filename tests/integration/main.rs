@@ -79,6 +79,7 @@ mod score_cli;
 mod simulate_cli;
 mod store_cli;
 mod support;
+mod uplink_cli;
 #[cfg(feature = "lab")]
 mod whatif_cli;
 mod yocto_recipe;

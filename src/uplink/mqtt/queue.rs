@@ -241,7 +241,9 @@ fn prepare(path: &Path) -> Result<Connection, OpenFault> {
         VERSION => return Ok(database),
         0 => {}
         _ => {
-            return Err(OpenFault::Failed(format!("{FILE} has layout {version}, must be {VERSION}: a newer program's")));
+            return Err(OpenFault::Failed(format!(
+                "{FILE} has layout {version}, must be {VERSION}: a newer program's"
+            )));
         }
     }
     // AUTOINCREMENT: no number is used twice, also when the queue was empty meanwhile.

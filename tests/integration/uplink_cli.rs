@@ -1,0 +1,53 @@
+//! `packwatch mqtt`, `kuksa` and `vss` become the program `packwatch-uplink`, where it is installed.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The program in a folder of its own, beside which nothing lies.
+fn alone(folder: &Path) -> PathBuf {
+    let (built, own) = (Path::new(env!("CARGO_BIN_EXE_packwatch")), folder.join("packwatch"));
+    if fs::hard_link(built, &own).is_err() {
+        fs::copy(built, &own).unwrap();
+    }
+    own
+}
+
+fn run(program: &Path, arguments: &[&str], path: &Path) -> Output {
+    Command::new(program).args(arguments).env("PATH", path).output().unwrap()
+}
+
+/// A program that prints its arguments, a line each.
+fn put_uplink(folder: &Path, word: &str) {
+    let uplink = folder.join("packwatch-uplink");
+    fs::write(&uplink, format!("#!/bin/sh\necho {word}\nprintf '%s\\n' \"$@\"\nexit 7\n")).unwrap();
+    fs::set_permissions(&uplink, fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+#[test]
+fn without_the_uplink_its_commands_name_the_package() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = alone(folder.path());
+    for command in ["mqtt", "kuksa", "vss"] {
+        let output = run(&program, &[command, "-c", "uplink.toml"], folder.path());
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert!(text.starts_with(&format!("packwatch {command}: packwatch-uplink is not installed")), "{text}");
+        assert_eq!(output.status.code(), Some(1));
+    }
+}
+
+#[test]
+fn the_uplink_gets_every_argument_and_gives_its_exit_code() {
+    let (folder, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let program = alone(folder.path());
+    let arguments = ["mqtt", "-c", "a b.toml", "--help", "--log=debug"];
+    put_uplink(elsewhere.path(), "of-path");
+    let output = run(&program, &arguments, elsewhere.path());
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), "of-path\nmqtt\n-c\na b.toml\n--help\n--log=debug\n");
+    assert_eq!(output.status.code(), Some(7));
+    // That beside the program comes first: both are of one version.
+    put_uplink(folder.path(), "beside");
+    let output = run(&program, &["vss"], elsewhere.path());
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), "beside\nvss\n");
+}
