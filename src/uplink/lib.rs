@@ -6,6 +6,7 @@
 //!
 //! | module | what lives there |
 //! | --- | --- |
+//! | `files` | files that the settings name, read within bounds |
 //! | `kuksa` | provider of a KUKSA databroker |
 //! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
 //! | `options` | options of the commands that run for ever |
@@ -13,6 +14,7 @@
 //! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
 //! | `vss` | the overlay of the vehicle signal specification |
 
+mod files;
 pub mod kuksa;
 pub mod mqtt;
 mod options;

@@ -1,18 +1,16 @@
 //! The uplink's settings: one TOML file, apart from the daemon's configuration, so that another broker changes neither the
 //! daemon nor the digest of its configuration.
 //!
-//! In: the file of `-c`. Out: checked settings. A fault names file, line, key and what is allowed.
+//! In: the file of `-c`. Out: checked settings. A fault names file, key and what is allowed, and the line where one key alone is wrong.
 
 use std::path::{Path, PathBuf};
 
 use packwatch_host::status::standard_path;
 use serde::Deserialize;
 
+use crate::files;
 use crate::kuksa::settings::KuksaSettings;
 use crate::mqtt::settings::MqttSettings;
-
-/// Longest file, bytes: a hundred times what a person writes.
-const MAX_BYTES: u64 = 1 << 20;
 
 /// What the file may hold.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
@@ -47,13 +45,10 @@ impl Settings {
     /// When it cannot be read, or with file, line and reason what is wrong in it.
     pub fn read(path: &Path) -> Result<Self, String> {
         let at = path.display();
-        let size = std::fs::metadata(path).map_err(|error| format!("{at}: {error}"))?.len();
-        if size > MAX_BYTES {
-            return Err(format!("{at}: {size} bytes, must be at most {MAX_BYTES}"));
-        }
-        let text = std::fs::read_to_string(path).map_err(|error| format!("{at}: {error}"))?;
+        let text = String::from_utf8(files::read(path)?).map_err(|error| format!("{at}: {error}"))?;
         let settings = Self::parse(&text).map_err(|fault| format!("{at}:{fault}"))?;
-        settings.kuksa.check().map_err(|fault| format!("{at}: {fault}"))?;
+        let checked = settings.kuksa.check().and_then(|()| settings.mqtt.as_ref().map_or(Ok(()), MqttSettings::check));
+        checked.map_err(|fault| format!("{at}: {fault}"))?;
         Ok(settings)
     }
 

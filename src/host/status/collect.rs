@@ -24,7 +24,7 @@ use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
 /// Events in the document: a screenful.
-const MAX_EVENTS: usize = 32;
+pub const MAX_EVENTS: usize = 32;
 
 /// Half the width of the 95 % interval, in standard deviations.
 const Z95: f64 = 1.96;

@@ -285,6 +285,19 @@ pub struct AlarmStatus {
     pub omitted: usize,
 }
 
+impl AlarmStatus {
+    /// Whether there are thresholds and each of them is judged: without raised alarms all is well then, else it is not known.
+    pub fn are_judged(&self) -> bool {
+        self.thresholds > 0 && self.unknown.is_empty()
+    }
+
+    /// The highest severity of a raised alarm, or "none"; `None` = not known.
+    pub fn level(&self) -> Option<&'static str> {
+        let none = (self.raised == 0 && self.are_judged()).then_some("none");
+        self.highest_severity.map(Severity::name).or(none)
+    }
+}
+
 /// Counters. All start at 0 with the program, also those of interfaces, protected messages, controllers and floods, except `lifetime`: a
 /// stored count may be a minute old after a power cut, and a falling counter is wrong for readers that sum differences.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -169,7 +169,7 @@ pub(crate) enum Action {
     Answer(GetProviderValueResponse),
 }
 
-/// The broker lacks nothing to accept the claim.
+/// The broker accepts the claim.
 #[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
 pub(crate) struct ProvideSignalResponse {}
 

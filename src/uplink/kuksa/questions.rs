@@ -1,7 +1,7 @@
 //! Questions of the broker: a reader wants a value now, and the broker asks the provider.
 //!
 //! The databroker (0.7) reads nothing else of the provider while it waits, for a second, for the answer; and an answer that comes later
-//! it takes for that to its next question, of another signal. A batch that crosses a question so holds up the answer behind it.
+//! it takes for that to its next question, of another signal. A batch sent while the broker waits delays the answer behind it.
 //! Therefore:
 //!
 //! * A question waits until the broker has read everything; one that has waited for [`DEADLINE`] gets no answer, and the broker answers

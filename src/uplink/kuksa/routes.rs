@@ -5,8 +5,8 @@
 //! A value outside the broker's limits is withheld: its data point has no value.
 
 use std::collections::{BTreeMap, HashMap};
-use std::time::{SystemTime, UNIX_EPOCH};
 
+use packwatch_host::io::clock::Reading;
 use packwatch_host::quantity::Timestamp as StatusTime;
 use packwatch_host::status::document::StatusDocument;
 
@@ -139,11 +139,7 @@ fn timestamp(time: StatusTime) -> Timestamp {
 }
 
 fn now() -> Timestamp {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    Timestamp {
-        seconds: i64::try_from(since.as_secs()).unwrap_or(i64::MAX),
-        nanos: i32::try_from(since.subsec_nanos()).unwrap_or_default(),
-    }
+    timestamp(StatusTime::from_nanos(Reading::now().realtime_ns))
 }
 
 #[cfg(test)]

@@ -22,6 +22,7 @@ use super::questions::Questions;
 use super::routes::Routes;
 use super::settings::KuksaSettings;
 use super::signals::STANDARD_BRANCH;
+use crate::files::read_credential;
 use crate::status_stream::Documents;
 
 /// Longest wait for the connection, and for the answer to each call.
@@ -30,6 +31,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
+/// Longest time for which the broker reads none of the batches: then its readers take old values for present ones.
+const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
 
@@ -54,6 +57,7 @@ pub(crate) async fn run(
                 if changed.is_err() { break }
                 let document = documents.borrow_and_update();
                 session.publish(document.as_deref(), journal);
+                session.check_reading()?;
             }
             () = wait_until(session.questions.due()) => session.handle_time()?,
             message = session.incoming.message() => match message.map_err(|status| words(&status))? {
@@ -73,6 +77,8 @@ struct Session {
     incoming: Streaming<FromBroker>,
     questions: Questions,
     request_id: u32,
+    /// When the broker was last known to have read something.
+    latest_read: Instant,
 }
 
 impl Session {
@@ -93,7 +99,14 @@ impl Session {
         let mut incoming = call("OpenProviderStream", client.open_provider_stream(messages)).await?;
         call("ProvideSignalRequest", accepted(&mut incoming)).await?;
         journal.note_connected(&settings.address, routes.len());
-        Ok(Self { routes, outbox, incoming, questions: Questions::default(), request_id: 0 })
+        Ok(Self {
+            routes,
+            outbox,
+            incoming,
+            questions: Questions::default(),
+            request_id: 0,
+            latest_read: Instant::now(),
+        })
     }
 
     /// Sends a value of every signal; without a document, that there is none.
@@ -105,11 +118,22 @@ impl Session {
         self.outbox.publish(PublishValuesRequest { request_id: self.request_id, data_points: points.by_id });
     }
 
+    /// Ends a connection whose broker keeps it and reads nothing, or gives no receipts.
+    fn check_reading(&self) -> Result<(), String> {
+        if self.latest_read.elapsed() <= UNREAD_LIMIT {
+            return Ok(());
+        }
+        Err(format!("the broker has confirmed no value for {} s", UNREAD_LIMIT.as_secs()))
+    }
+
     fn handle(&mut self, message: FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
         let now = Instant::now();
         match message.event {
             Some(Event::Asked(question)) => journal.note_unanswered(u64::from(!self.questions.ask(question, now))),
-            Some(Event::Provided(_)) => self.questions.note_read(self.outbox.acknowledge()),
+            Some(Event::Provided(_)) => {
+                self.latest_read = now;
+                self.questions.note_read(self.outbox.acknowledge());
+            }
             Some(Event::Rejected(rejected)) => {
                 for (id, rejection) in &rejected.status {
                     journal.note_rejected(self.routes.name(*id).unwrap_or("an unknown id"), &rejection.message);
@@ -187,7 +211,7 @@ fn endpoint(settings: &KuksaSettings) -> Result<Endpoint, String> {
     let at = &settings.address;
     let mut endpoint = Endpoint::from_shared(at.clone()).map_err(|error| format!("{at}: {error}"))?;
     if let Some(file) = &settings.ca_file {
-        let pem = std::fs::read(file).map_err(|error| format!("{}: {error}", file.display()))?;
+        let pem = read_credential(file)?;
         let mut tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(pem));
         if let Some(name) = &settings.server_name {
             tls = tls.domain_name(name);
@@ -223,7 +247,7 @@ fn causes(error: &dyn std::error::Error) -> String {
 fn token(file: Option<&Path>) -> Result<Option<MetadataValue<Ascii>>, String> {
     let Some(file) = file else { return Ok(None) };
     let at = file.display();
-    let text = std::fs::read_to_string(file).map_err(|error| format!("{at}: {error}"))?;
+    let text = String::from_utf8(read_credential(file)?).map_err(|error| format!("{at}: {error}"))?;
     let token = text.trim();
     if token.is_empty() || token.len() > MAX_TOKEN_BYTES {
         return Err(format!("{at}: a token of {} bytes, must be 1 to {MAX_TOKEN_BYTES}", token.len()));

@@ -116,13 +116,8 @@ fn alarm_codes(document: &StatusDocument) -> Option<Value> {
         })
         .collect();
     // An empty list means "no error": only where that is known.
-    let is_known = !codes.is_empty() || (alarms.raised == 0 && are_judged(document));
+    let is_known = !codes.is_empty() || (alarms.raised == 0 && alarms.are_judged());
     is_known.then_some(Value::Texts(codes))
-}
-
-/// Whether there are thresholds and each of them is judged.
-fn are_judged(document: &StatusDocument) -> bool {
-    document.alarms.thresholds > 0 && document.alarms.unknown.is_empty()
 }
 
 #[cfg(test)]

@@ -6,8 +6,9 @@ use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::{ConnectReturnCode, LastWill};
 use rumqttc::{AsyncClient, Broker, ConnectionError, EventLoop, MqttOptions, TlsConfiguration, Transport};
 
-use super::settings::{MqttSettings, TlsSettings, read};
+use super::settings::{MqttSettings, TlsSettings};
 use super::{OFFLINE, topic};
+use crate::files::read_credential;
 
 /// Longest wait for the connection and the broker's answer, s.
 const CONNECT_LIMIT_S: u64 = 15;
@@ -49,14 +50,13 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
 }
 
 fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
+    // The settings' check has found those together that belong together.
     let client_auth = match (&tls.certificate_file, &tls.key_file) {
-        (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
-        (None, None) => None,
-        _ => return Err("mqtt.tls: certificate_file and key_file must be given together".to_owned()),
+        (Some(certificate), Some(key)) => Some((read_credential(certificate)?, read_credential(key)?)),
+        _ => None,
     };
     match &tls.ca_file {
-        Some(path) => Ok(TlsConfiguration::Simple { ca: read(path)?, alpn: None, client_auth }),
-        None if client_auth.is_some() => Err("mqtt.tls: certificate_file needs ca_file".to_owned()),
+        Some(path) => Ok(TlsConfiguration::Simple { ca: read_credential(path)?, alpn: None, client_auth }),
         None => TlsConfiguration::try_default_rustls().map_err(|error| format!("authorities of the system: {error}")),
     }
 }

@@ -157,9 +157,7 @@ pub const ENTITIES: &[Entity] = &[
     number("shortest_lived_cell", "Shortest-lived Cell", |d| cell_number(d.pack.shortest_lived_cell)),
     word("validity", "Validity of the Estimates", |d| Value::from(super::payload::word(&d.state))),
     number("alarms_raised", "Alarms Raised", |d| Value::from(d.alarms.raised)),
-    word("event_level", "Event Level", |d| {
-        d.alarms.highest_severity.map_or_else(|| Value::from("none"), |severity| Value::from(severity.name()))
-    }),
+    word("event_level", "Event Level", |d| Value::from(d.alarms.level())),
     diagnostic(measured("uptime", "Uptime", SECONDS, |d| rounded(Some(d.uptime_s), 0))),
     diagnostic(number("late_ticks", "Late Ticks", |d| Value::from(d.counters.service.missed_deadlines))),
     diagnostic(word("software_version", "packwatch Version", |d| Value::from(d.program_version.as_str()))),

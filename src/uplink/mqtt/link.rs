@@ -2,9 +2,11 @@
 //!
 //! In: the daemon's documents and the [`Queue`]. Out: messages with QoS 1. Each connection starts with nothing in memory, so no value of an
 //! earlier one is repeated: current values are those of the newest document, and a message leaves the queue only after the broker
-//! acknowledged it. After a lost connection the pause doubles up to `retry_max_s`.
+//! acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; a connection that lasts longer than that begins anew.
+//! A message that the broker refuses ends nothing: one of the queue is tried again after `retry_max_s`, a current value with the next one.
 
 use std::convert::Infallible;
+use std::fmt;
 use std::pin::{Pin, pin};
 use std::time::Duration;
 
@@ -14,9 +16,9 @@ use rumqttc::mqttbytes::QoS;
 use rumqttc::{AsyncClient, Event, EventLoop, Packet, PublishNoticeError, PublishOptions};
 use serde_json::json;
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
+use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, timeout};
 
-use super::queue::{Class, Fill, Queue, Stored};
+use super::queue::{Class, Fill, Queue, QueuedMessage};
 use super::settings::MqttSettings;
 use super::{OFFLINE, ONLINE, connect, discovery, payload, topic};
 use crate::status_stream::Documents;
@@ -25,8 +27,10 @@ use crate::status_stream::Documents;
 const RETRY: Duration = Duration::from_secs(1);
 /// Messages of the queue that are on their way at once: what most brokers accept.
 const WINDOW: usize = 20;
-/// Longest wait for the acknowledgement of messages: a connection that lives and acknowledges nothing ends then.
+/// Longest wait for the acknowledgement of the next message: a connection that lives and acknowledges nothing ends then.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
+/// Pause before the queue on disk is tried again.
+const QUEUE_RETRY: Duration = Duration::from_secs(5);
 /// Time to say farewell to the broker.
 const FAREWELL: Duration = Duration::from_secs(2);
 
@@ -48,20 +52,19 @@ impl Message {
     }
 }
 
-/// Why messages were not published.
-#[derive(Debug, PartialEq, Eq)]
+/// Why a message was not published.
+#[derive(Debug, Clone, PartialEq, Eq)]
 enum Fault {
-    /// The broker does not accept one of them.
+    /// The broker does not accept it.
     Refused(String),
-    /// The connection does not carry them.
+    /// The connection does not carry it.
     Lost(String),
 }
 
-impl From<Fault> for String {
-    fn from(fault: Fault) -> Self {
-        match fault {
-            Fault::Refused(text) | Fault::Lost(text) => text,
-        }
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (Self::Refused(text) | Self::Lost(text)) = self;
+        f.write_str(text)
     }
 }
 
@@ -81,9 +84,9 @@ impl Link<'_> {
         let most = Duration::from_secs(self.settings.retry_max_s);
         let (mut pause, mut latest) = (RETRY, String::new());
         while !*stopped.borrow() {
-            let mut was_connected = false;
-            let Err(error) = self.connection(&mut stopped, &mut was_connected).await else { return };
-            if was_connected {
+            let began = Instant::now();
+            let Err(error) = self.connection(&mut stopped).await else { return };
+            if began.elapsed() > most {
                 (pause, latest) = (RETRY, String::new());
             }
             // Once for each reason, not at each attempt.
@@ -109,14 +112,13 @@ impl Link<'_> {
     }
 
     /// One connection, until it fails or `stopped` changes.
-    async fn connection(&self, stopped: &mut watch::Receiver<bool>, was_connected: &mut bool) -> Result<(), String> {
+    async fn connection(&self, stopped: &mut watch::Receiver<bool>) -> Result<(), String> {
         let (client, mut events) = connect::client(self.settings)?;
         let mut driven = pin!(drive(&mut events));
+        // Each class by itself: where the broker refuses one, the other flows.
         let work = async {
-            publish(&client, vec![Message::retained(self.settings.topic(topic::STATUS), ONLINE)]).await?;
-            tracing::info!(broker = self.broker(), waiting = self.queue.fill().messages, "connected");
-            *was_connected = true;
-            tokio::try_join!(self.current(&client), self.forward(&client)).map(|_| ())
+            let (samples, events) = (self.forward(&client, Class::Sample), self.forward(&client, Class::Event));
+            tokio::try_join!(self.current(&client), samples, events).map(|_| ())
         };
         tokio::select! {
             error = &mut driven => return Err(error),
@@ -130,7 +132,7 @@ impl Link<'_> {
     /// Publishes what the last will would, and disconnects.
     async fn farewell(&self, client: &AsyncClient, driven: Pin<&mut impl Future<Output = String>>) {
         let farewell = async {
-            let _ = publish(client, vec![Message::retained(self.settings.topic(topic::STATUS), OFFLINE)]).await;
+            publish(client, vec![Message::retained(self.settings.topic(topic::STATUS), OFFLINE)]).await;
             let _ = client.disconnect().await;
             std::future::pending::<()>().await;
         };
@@ -147,13 +149,26 @@ impl Link<'_> {
     /// Publishes current values every period, and at once when the daemon falls silent or comes back.
     async fn current(&self, client: &AsyncClient) -> Result<Infallible, String> {
         let mut documents = self.documents.clone();
-        let mut rhythm = interval(Duration::from_secs(self.settings.period_s));
+        let period = Duration::from_secs(self.settings.period_s);
+        let mut rhythm = interval_at(Instant::now() + period, period);
         rhythm.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut published = Published::default();
+        let mut state = PublishedState::default();
+        let (mut is_connected, mut refused) = (false, false);
         loop {
             let document = documents.borrow_and_update().clone();
             let is_online = document.is_some();
-            publish(client, published.news(self.settings, document.as_deref(), self.queue.fill())).await?;
+            let news = state.news(self.settings, document.as_deref(), self.queue.fill());
+            let faults: Vec<Fault> = publish(client, news).await.into_iter().filter_map(Result::err).collect();
+            if let Some(Fault::Lost(error)) = faults.iter().find(|fault| matches!(fault, Fault::Lost(_))) {
+                return Err(error.clone());
+            }
+            if !std::mem::replace(&mut is_connected, true) {
+                tracing::info!(broker = self.broker(), waiting = self.queue.fill().messages, "connected");
+            }
+            if let Some(fault) = faults.first().filter(|_| !refused) {
+                tracing::error!(count = faults.len(), first = %fault, "the broker refuses current values");
+                refused = true;
+            }
             tokio::select! {
                 _ = rhythm.tick() => {}
                 changed = documents.wait_for(|document| document.is_some() != is_online) => {
@@ -164,79 +179,100 @@ impl Link<'_> {
         }
     }
 
-    /// Sends the queue, oldest first, and removes what the broker acknowledged. What it refuses stays until the next connection.
-    async fn forward(&self, client: &AsyncClient) -> Result<Infallible, String> {
-        let mut reported = self.queue.fill();
+    /// Sends the queue's messages of a class, oldest first, and removes what the broker acknowledged.
+    async fn forward(&self, client: &AsyncClient, class: Class) -> Result<Infallible, String> {
+        let topic = match class {
+            Class::Sample => topic::HISTORY,
+            Class::Event => topic::EVENTS,
+        };
+        let topic = self.settings.topic(topic);
+        let mut refused = String::new();
         loop {
-            reported = report_drops(reported, self.queue.fill());
-            let batch = self.queue.oldest(WINDOW)?;
+            let mut batch = persist("read", || self.queue.oldest(class, WINDOW)).await;
             if batch.is_empty() {
                 self.queue.wait().await;
                 continue;
             }
-            let messages = batch.iter().map(|stored| self.message(stored)).collect();
-            match publish(client, messages).await {
-                Ok(()) => self.queue.remove(&batch)?,
-                Err(Fault::Lost(error)) => return Err(error),
-                Err(Fault::Refused(error)) => {
-                    tracing::error!(
-                        error,
-                        "the broker refuses messages of the queue: they wait for the next connection"
-                    );
-                    std::future::pending::<()>().await;
+            let messages = batch.iter().map(|queued| numbered(&topic, queued)).collect();
+            let outcomes = publish(client, messages).await;
+            let fault = outcomes.iter().find_map(|outcome| outcome.clone().err());
+            let mut is_acknowledged = outcomes.iter().map(Result::is_ok);
+            batch.retain(|_| is_acknowledged.next().unwrap_or(false));
+            persist("write", || self.queue.remove(&batch)).await;
+            match fault {
+                None => {}
+                Some(Fault::Lost(error)) => return Err(error),
+                Some(Fault::Refused(error)) => {
+                    if error != refused {
+                        tracing::error!(error, "the broker refuses messages of the queue: they are tried again");
+                        refused = error;
+                    }
+                    sleep(Duration::from_secs(self.settings.retry_max_s)).await;
                 }
             }
         }
     }
-
-    /// The message of the queue with its number, by which a reader finds gaps and repetitions.
-    fn message(&self, stored: &Stored) -> Message {
-        let topic = match stored.class {
-            Class::Sample => topic::HISTORY,
-            Class::Event => topic::EVENTS,
-        };
-        let rest = stored.body.strip_prefix('{').unwrap_or_default();
-        let text = format!("{{\"sequence\":{},{rest}", stored.sequence);
-        Message { topic: self.settings.topic(topic), text, is_retained: false }
-    }
 }
 
-/// Logs messages that fell out of the queue since `before`.
-fn report_drops(before: Fill, now: Fill) -> Fill {
-    let (samples, events) = (now.dropped_samples - before.dropped_samples, now.dropped_events - before.dropped_events);
-    if samples + events > 0 {
-        tracing::warn!(samples, events, "the queue was full: the oldest messages were dropped");
+/// A message of the queue with its number, by which a reader finds gaps and repetitions.
+fn numbered(topic: &str, queued: &QueuedMessage) -> Message {
+    let rest = queued.body.strip_prefix('{').unwrap_or_default();
+    let text = format!("{{\"sequence\":{},{rest}", queued.sequence);
+    Message { topic: topic.to_owned(), text, is_retained: false }
+}
+
+/// Does something with the queue as soon as the disk lets it.
+async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>) -> T {
+    let mut has_failed = false;
+    loop {
+        match attempt() {
+            Ok(done) if has_failed => {
+                tracing::info!(action, "the queue works again");
+                return done;
+            }
+            Ok(done) => return done,
+            Err(error) => {
+                if !std::mem::replace(&mut has_failed, true) {
+                    tracing::error!(action, error, "the queue cannot be used: it waits");
+                }
+                sleep(QUEUE_RETRY).await;
+            }
+        }
     }
-    now
 }
 
 /// What this connection has published, so that only news is.
 #[derive(Debug, Default)]
-struct Published {
+struct PublishedState {
+    has_status: bool,
     discovery: Option<(usize, Vec<Rule>, String, String)>,
     topics: Vec<String>,
     is_online: Option<bool>,
     fill: Option<Fill>,
 }
 
-impl Published {
-    /// Messages that are due: discovery when the entities changed, the values, whether the daemon is online, how full the queue is.
+impl PublishedState {
+    /// Messages that are due: the values, whether the daemon is online, how full the queue is, whether this program is online, discovery
+    /// when the entities changed. In this order, so that no reader takes earlier values as current.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
+        let retained = |name: &str, text: String| Message::retained(settings.topic(name), text);
         let mut news = Vec::new();
         if let Some(document) = document {
-            if settings.discovery.enabled {
-                news.extend(self.discovery(settings, document));
-            }
-            news.push(Message::retained(settings.topic(topic::INFO), payload::info(document).to_string()));
-            news.push(Message::retained(settings.topic(topic::CELLS), payload::spec_data(document).to_string()));
+            news.push(retained(topic::INFO, payload::info(document).to_string()));
+            news.push(retained(topic::CELLS, payload::spec_data(document).to_string()));
         }
-        // After the values, so that no reader takes earlier ones as current.
         if self.is_online.replace(document.is_some()) != Some(document.is_some()) {
             let word = if document.is_some() { ONLINE } else { OFFLINE };
-            news.push(Message::retained(settings.topic(topic::DAEMON), word));
+            news.push(retained(topic::DAEMON, word.to_owned()));
         }
         if self.fill.replace(fill) != Some(fill) {
-            news.push(Message::retained(settings.topic(topic::UPLINK), uplink(fill)));
+            news.push(retained(topic::UPLINK, uplink(fill)));
+        }
+        if !std::mem::replace(&mut self.has_status, true) {
+            news.push(retained(topic::STATUS, ONLINE.to_owned()));
+        }
+        if let Some(document) = document.filter(|_| settings.discovery.enabled) {
+            news.extend(self.discovery(settings, document));
         }
         news
     }
@@ -281,28 +317,43 @@ async fn drive(events: &mut EventLoop) -> String {
     }
 }
 
-/// Publishes messages with QoS 1, in order, and waits until the broker has acknowledged all.
-async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Result<(), Fault> {
-    let acknowledged = timeout(ACKNOWLEDGEMENT, publish_all(client, messages)).await;
-    acknowledged.unwrap_or_else(|_| Err(Fault::Lost(format!("no acknowledgement within {ACKNOWLEDGEMENT:?}"))))
-}
-
-async fn publish_all(client: &AsyncClient, messages: Vec<Message>) -> Result<(), Fault> {
+/// Publishes messages with QoS 1, in order; returns what became of each.
+async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Vec<Result<(), Fault>> {
+    let late = || Fault::Lost(format!("no acknowledgement within {ACKNOWLEDGEMENT:?}"));
     let mut notices = Vec::with_capacity(messages.len());
     for Message { topic, text, is_retained } in messages {
         let options = PublishOptions::new(QoS::AtLeastOnce).retain(is_retained);
-        let notice = client.publish_tracked(topic.clone(), text, options).await;
-        notices.push((notice.map_err(|error| Fault::Lost(format!("{topic}: {error}")))?, topic));
+        let notice = timeout(ACKNOWLEDGEMENT, client.publish_tracked(topic.clone(), text, options)).await;
+        let notice = notice
+            .map_err(|_| late())
+            .and_then(|notice| notice.map_err(|error| Fault::Lost(format!("{topic}: {error}"))));
+        let is_lost = notice.is_err();
+        notices.push((topic, notice));
+        if is_lost {
+            break;
+        }
     }
-    for (notice, topic) in notices {
-        notice.wait_completion_async().await.map_err(|error| match error {
-            PublishNoticeError::V5PubAck(reason) => {
-                Fault::Refused(format!("{topic}: the broker refuses it: {reason:?}"))
-            }
-            other => Fault::Lost(format!("{topic}: {other}")),
-        })?;
+    let mut outcomes = Vec::with_capacity(notices.len());
+    for (topic, notice) in notices {
+        let outcome = match notice {
+            Err(fault) => Err(fault),
+            Ok(notice) => match timeout(ACKNOWLEDGEMENT, notice.wait_completion_async()).await {
+                Err(_) => Err(late()),
+                Ok(completion) => completion.map(|_| ()).map_err(|error| match error {
+                    PublishNoticeError::V5PubAck(reason) => {
+                        Fault::Refused(format!("{topic}: the broker refuses it: {reason:?}"))
+                    }
+                    other => Fault::Lost(format!("{topic}: {other}")),
+                }),
+            },
+        };
+        let is_lost = matches!(outcome, Err(Fault::Lost(_)));
+        outcomes.push(outcome);
+        if is_lost {
+            break;
+        }
     }
-    Ok(())
+    outcomes
 }
 
 #[cfg(test)]

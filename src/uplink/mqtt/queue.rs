@@ -1,6 +1,6 @@
 //! The queue on disk: messages that the broker has not acknowledged yet, oldest first.
 //!
-//! In: messages of the recorder. Out: the oldest messages in order, until they are removed. A message that was accepted survives a
+//! In: messages of the recorder. Out: the oldest messages of a class in order, until they are removed. A message that was accepted survives a
 //! power cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. When it is
 //! full, the oldest samples are dropped, and the oldest events only when no sample is left. Drops are counted for ever. A
 //! file that is damaged is put aside and a new one begun; where the disk fails or a newer program wrote the file, it stays as it is.
@@ -9,6 +9,7 @@ use std::cell::{Cell, RefCell};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use packwatch_host::io::clock::Reading;
 use rusqlite::{Connection, ErrorCode, OptionalExtension as _, Transaction, params};
 use tokio::sync::Notify;
 
@@ -18,7 +19,7 @@ const FILE: &str = "queue.db";
 const LOCK: &str = "queue.lock";
 /// Layout of the file.
 const VERSION: i64 = 1;
-/// A page of a message of one MB: a WAL of this many pages is copied back into the file.
+/// Pages (4 KiB) of the write-ahead log before it is copied into the file: 1 MiB.
 const CHECKPOINT_PAGES: i64 = 256;
 
 /// What is dropped first.
@@ -32,11 +33,9 @@ pub enum Class {
 
 /// A message in the queue.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Stored {
+pub struct QueuedMessage {
     /// Its number: rises by one with each message, also over restarts.
     pub sequence: i64,
-    /// Its class.
-    pub class: Class,
     /// Its text.
     pub body: String,
 }
@@ -77,12 +76,14 @@ impl Queue {
         let lock = File::create(folder.join(LOCK)).map_err(|error| at(&error))?;
         lock.try_lock().map_err(|_| at(&"used by another uplink"))?;
         let path = folder.join(FILE);
-        let database = match prepare(&path) {
+        let database = match prepare(&path, 0) {
             Ok(database) => database,
             Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
                 tracing::error!(error, aside = %aside.display(), "the queue is damaged: put aside, a new one begins");
-                prepare(&path).map_err(|fault| at(&fault.text()))?
+                // Beyond every number of the old one: a reader takes a number that it knows for a repetition.
+                let millis = Reading::now().realtime_ns / 1_000_000;
+                prepare(&path, millis).map_err(|fault| at(&fault.text()))?
             }
             Err(OpenFault::Failed(error)) => return Err(at(&error)),
         };
@@ -97,9 +98,9 @@ impl Queue {
         self.fill.get()
     }
 
-    /// Waits until a message is added.
-    pub async fn wait(&self) {
-        self.added.notified().await;
+    /// Waits until a message is added after this call.
+    pub fn wait(&self) -> impl Future<Output = ()> {
+        self.added.notified()
     }
 
     /// Adds messages and notes `seen` for [`Self::seen`], all or nothing. On return they are on disk.
@@ -110,7 +111,7 @@ impl Queue {
         let mut database = self.database.borrow_mut();
         let fill = self.try_add(&mut database, messages, seen).map_err(|error| error.to_string())?;
         self.fill.set(fill);
-        self.added.notify_one();
+        self.added.notify_waiters();
         Ok(())
     }
 
@@ -151,17 +152,17 @@ impl Queue {
         })
     }
 
-    /// The oldest messages, at most `count`.
+    /// The oldest messages of a class, at most `count`.
     ///
     /// # Errors
     /// When the disk cannot be read.
-    pub fn oldest(&self, count: usize) -> Result<Vec<Stored>, String> {
+    pub fn oldest(&self, class: Class, count: usize) -> Result<Vec<QueuedMessage>, String> {
         let database = self.database.borrow();
         let read = || {
-            let mut query = database.prepare_cached("SELECT id, class, body FROM message ORDER BY id LIMIT ?")?;
-            let rows = query.query_map([i64::try_from(count).unwrap_or(i64::MAX)], |row| {
-                let class = if row.get::<_, i64>(1)? == Class::Event as i64 { Class::Event } else { Class::Sample };
-                Ok(Stored { sequence: row.get(0)?, class, body: row.get(2)? })
+            let of_class = "SELECT id, body FROM message WHERE class = ? ORDER BY id LIMIT ?";
+            let mut query = database.prepare_cached(of_class)?;
+            let rows = query.query_map(params![class as i64, i64::try_from(count).unwrap_or(i64::MAX)], |row| {
+                Ok(QueuedMessage { sequence: row.get(0)?, body: row.get(1)? })
             })?;
             rows.collect::<rusqlite::Result<Vec<_>>>()
         };
@@ -172,7 +173,7 @@ impl Queue {
     ///
     /// # Errors
     /// When the disk does not take it: they are sent again then.
-    pub fn remove(&self, messages: &[Stored]) -> Result<(), String> {
+    pub fn remove(&self, messages: &[QueuedMessage]) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let mut fill = self.fill.get();
         let mut remove = || {
@@ -226,8 +227,8 @@ impl From<rusqlite::Error> for OpenFault {
     }
 }
 
-/// Opens the file, checks it and creates its tables, where there are none: then nothing is written, so that a full disk does not matter.
-fn prepare(path: &Path) -> Result<Connection, OpenFault> {
+/// Opens the file and checks it. Where it has no tables, they are created; the first message has the number after `latest`.
+fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     let database = Connection::open(path)?;
     database.pragma_update(None, "journal_mode", "wal")?;
     database.pragma_update(None, "synchronous", "full")?;
@@ -253,6 +254,7 @@ fn prepare(path: &Path) -> Result<Connection, OpenFault> {
          CREATE INDEX IF NOT EXISTS message_class ON message (class, id);
          CREATE TABLE IF NOT EXISTS dropped (class INTEGER PRIMARY KEY, count INTEGER NOT NULL);
          CREATE TABLE IF NOT EXISTS seen (one INTEGER PRIMARY KEY CHECK (one = 0), text TEXT NOT NULL);
+         INSERT INTO sqlite_sequence (name, seq) VALUES ('message', {latest});
          PRAGMA user_version = {VERSION};
          COMMIT;"
     ))?;

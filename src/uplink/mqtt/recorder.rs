@@ -2,16 +2,18 @@
 //!
 //! In: the daemon's documents. Out: messages in the [`Queue`], whether the broker can be reached or not. A sample is due by the
 //! daemon's clock. The document lists the latest events; those that an earlier document listed are recognised by their place in that
-//! list, also over a restart of this program. Events that leave the list while this program is not running are not seen.
+//! list, also over a restart of this program. Events that leave the list between two documents, or while this program is not running,
+//! are not seen; the first is logged.
 
 use std::cell::Cell;
 
 use packwatch_host::quantity::Timestamp;
+use packwatch_host::status::collect::MAX_EVENTS;
 use packwatch_host::status::document::StatusDocument;
 use serde_json::Value;
 
 use super::payload;
-use super::queue::{Class, Queue};
+use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
 /// A document that comes this much before a sample is due is taken: the daemon's documents come about once a second.
@@ -25,13 +27,14 @@ pub struct Recorder<'a> {
     due: Option<Timestamp>,
     events: Vec<Value>,
     works: Cell<bool>,
+    drops: Cell<bool>,
 }
 
 impl<'a> Recorder<'a> {
     /// A recorder that takes a sample every `period_s` seconds, none for 0.
     pub fn new(queue: &'a Queue, period_s: u64) -> Self {
         let events = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok()).unwrap_or_default();
-        Self { queue, period_s, due: None, events, works: Cell::new(true) }
+        Self { queue, period_s, due: None, events, works: Cell::new(true), drops: Cell::new(false) }
     }
 
     /// Takes documents, for ever.
@@ -48,6 +51,9 @@ impl<'a> Recorder<'a> {
     /// Queues what is new in a document. What the disk does not take is tried again with the next one.
     pub fn take(&mut self, document: &StatusDocument) {
         let news = new_events(&self.events, &document.events);
+        if !self.events.is_empty() && news.len() == document.events.len() && news.len() >= MAX_EVENTS {
+            tracing::warn!(listed = news.len(), "the daemon had more new events than it lists: some are missed");
+        }
         let mut messages: Vec<_> =
             news.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
         let next = self.next_due(document.time);
@@ -58,7 +64,9 @@ impl<'a> Recorder<'a> {
             return;
         }
         let seen = (!news.is_empty()).then(|| Value::from(document.events.clone()).to_string());
+        let before = self.queue.fill();
         let result = self.queue.add(&messages, seen.as_deref());
+        self.note_drops(before, self.queue.fill());
         if self.works.replace(result.is_ok()) != result.is_ok() {
             match &result {
                 Ok(()) => tracing::info!("the queue can be written again"),
@@ -69,6 +77,19 @@ impl<'a> Recorder<'a> {
             self.due = next.or(self.due);
             self.events.clone_from(&document.events);
         }
+    }
+
+    /// Logs that messages fall out of the queue, once until none does.
+    fn note_drops(&self, before: Fill, now: Fill) {
+        let is_dropping = (before.dropped_samples, before.dropped_events) != (now.dropped_samples, now.dropped_events);
+        if is_dropping && !self.drops.get() {
+            tracing::warn!(
+                messages = now.messages,
+                bytes = now.bytes,
+                "the queue is full: the oldest messages are dropped"
+            );
+        }
+        self.drops.set(is_dropping);
     }
 
     /// When the next sample is due, if one is due `now`. After a pause or a step of the clock the rhythm begins again.

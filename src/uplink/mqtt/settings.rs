@@ -3,14 +3,12 @@
 //! In: TOML. Out: checked settings; a number or text outside its range is a fault of its line. Files are read at each connection,
 //! so that a new certificate or password needs no restart.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Deserializer, de};
 
-/// Environment variable with systemd's folder of credentials.
-const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
-/// Longest password or certificate file, bytes.
-const MAX_FILE_BYTES: u64 = 1 << 20;
+use crate::files::read_credential;
+
 /// Longest topic, bytes: MQTT's own limit of 65,535 less what is appended, by far.
 const MAX_TOPIC_BYTES: usize = 200;
 
@@ -151,13 +149,28 @@ impl MqttSettings {
         self.topic.chars().map(|c| if allowed(c) { c } else { '_' }).collect()
     }
 
+    /// Checks what several keys together may be.
+    ///
+    /// # Errors
+    /// Names the keys and what is allowed.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        let Some(tls) = &self.tls else { return Ok(()) };
+        if tls.certificate_file.is_some() != tls.key_file.is_some() {
+            return Err("mqtt.tls: certificate_file and key_file must be given together".to_owned());
+        }
+        if tls.certificate_file.is_some() && tls.ca_file.is_none() {
+            return Err("mqtt.tls.certificate_file needs mqtt.tls.ca_file".to_owned());
+        }
+        Ok(())
+    }
+
     /// Reads the password; the line end after it does not belong to it.
     ///
     /// # Errors
     /// When the file cannot be read or is empty.
     pub fn password(&self) -> Result<Option<Vec<u8>>, String> {
         let Some(path) = &self.password_file else { return Ok(None) };
-        let mut password = read(path)?;
+        let mut password = read_credential(path)?;
         while matches!(password.last(), Some(b'\n' | b'\r')) {
             password.pop();
         }
@@ -166,21 +179,6 @@ impl MqttSettings {
         }
         Ok(Some(password))
     }
-}
-
-/// Reads a file of the settings; a relative path is below systemd's credentials, if there are any.
-///
-/// # Errors
-/// With the file's name, when it cannot be read or is too long.
-pub fn read(path: &Path) -> Result<Vec<u8>, String> {
-    let folder = std::env::var_os(CREDENTIALS).map(PathBuf::from).unwrap_or_default();
-    let path = folder.join(path);
-    let at = path.display();
-    let bytes = std::fs::metadata(&path).map_err(|error| format!("{at}: {error}"))?.len();
-    if bytes > MAX_FILE_BYTES {
-        return Err(format!("{at}: {bytes} bytes, must be at most {MAX_FILE_BYTES}"));
-    }
-    std::fs::read(&path).map_err(|error| format!("{at}: {error}"))
 }
 
 fn whole<'de, const LEAST: u64, const MOST: u64, D: Deserializer<'de>>(source: D) -> Result<u64, D::Error> {

@@ -7,7 +7,7 @@ use packwatch_host::quantity::Mode;
 use packwatch_host::status::document::{CellStatus, StatusDocument};
 
 use super::super::value::{DataType, Value, single};
-use super::{Origin, Signal, are_judged, cells, float, in_order, negated, number, percent, word};
+use super::{Origin, Signal, cells, float, in_order, negated, number, percent, word};
 
 const fn signal(
     name: &'static str,
@@ -322,7 +322,7 @@ pub(super) static SIGNALS: &[Signal] = &[
         DataType::Text,
         None,
         "alarms.highest_severity",
-        highest_severity,
+        |status| status.alarms.level().map(|word| Value::Text(word.to_owned())),
         "Of the raised alarms: info, warning or severe; none only when every threshold was judged.",
     ),
     signal(
@@ -494,12 +494,6 @@ pub(super) static SIGNALS: &[Signal] = &[
         "Whether the filter of the cell is consistent, each cell.",
     ),
 ];
-
-fn highest_severity(status: &StatusDocument) -> Option<Value> {
-    let severity = status.alarms.highest_severity.map(|severity| severity.name());
-    let none = (status.alarms.raised == 0 && are_judged(status)).then_some("none");
-    severity.or(none).map(|word| Value::Text(word.to_owned()))
-}
 
 /// Without estimates nothing is looked for: an empty list would look healthy.
 fn findings(status: &StatusDocument) -> Option<Value> {

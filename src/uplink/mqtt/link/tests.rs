@@ -13,7 +13,7 @@ fn topics(messages: &[Message]) -> Vec<&str> {
 #[test]
 fn discovery_is_repeated_only_when_the_entities_change_and_entities_that_are_gone_are_removed() {
     let settings = MqttSettings::default();
-    let mut published = Published::default();
+    let mut published = PublishedState::default();
     let mut document = document();
     let first = published.news(&settings, Some(&document), Fill::default());
     assert!(first.len() > 50 && first.iter().all(|message| message.is_retained), "{}", first.len());
@@ -29,13 +29,28 @@ fn discovery_is_repeated_only_when_the_entities_change_and_entities_that_are_gon
 fn a_daemon_is_online_after_its_values_and_offline_without_them() {
     let mut settings = MqttSettings::default();
     settings.discovery.enabled = false;
-    let mut published = Published::default();
+    let mut published = PublishedState::default();
     let fill = Fill::default();
-    assert_eq!(topics(&published.news(&settings, None, fill)), ["packwatch/daemon", "packwatch/uplink"]);
+    assert_eq!(
+        topics(&published.news(&settings, None, fill)),
+        ["packwatch/daemon", "packwatch/uplink", "packwatch/status"]
+    );
     let news = published.news(&settings, Some(&document()), fill);
     assert_eq!(topics(&news), ["packwatch/info", "packwatch/spec_data", "packwatch/daemon"]);
     assert_eq!(news[2].text, "online");
     let news = published.news(&settings, None, Fill { messages: 1, ..fill });
     assert_eq!(topics(&news), ["packwatch/daemon", "packwatch/uplink"]);
     assert_eq!(news[0].text, "offline");
+}
+
+#[test]
+fn a_connection_is_online_after_its_values_and_before_discovery() {
+    let mut published = PublishedState::default();
+    let news = published.news(&MqttSettings::default(), Some(&document()), Fill::default());
+    let place = |topic: &str| topics(&news).iter().position(|it| *it == topic).unwrap();
+    let first_of_discovery = topics(&news).iter().position(|topic| topic.starts_with("homeassistant/")).unwrap();
+    assert!(
+        place("packwatch/info") < place("packwatch/daemon") && place("packwatch/daemon") < place("packwatch/status")
+    );
+    assert!(place("packwatch/status") < first_of_discovery);
 }

@@ -65,6 +65,28 @@ fn what_is_not_known_is_null_everywhere() {
 }
 
 #[test]
+fn the_event_level_is_none_only_when_every_threshold_is_judged() {
+    let mut document = document();
+    let of = |document: &StatusDocument| info(document)["event_level"].clone();
+    let unknown = std::mem::take(&mut document.alarms.unknown);
+    (document.alarms.raised, document.alarms.highest_severity, document.alarms.thresholds) = (0, None, 2);
+    assert_eq!(of(&document), json!("none"));
+    let rule = document.alarms.list[0].rule;
+    document.alarms.unknown = unknown;
+    document.alarms.unknown.push(packwatch_host::control::protocol::UnknownAlarms {
+        rule,
+        severity: packwatch_host::alarm::Severity::Warning,
+        alarms: 1,
+    });
+    assert_eq!(of(&document), Value::Null);
+    document.alarms.highest_severity = Some(packwatch_host::alarm::Severity::Severe);
+    assert_eq!(of(&document), json!("severe"));
+    (document.alarms.highest_severity, document.alarms.thresholds) = (None, 0);
+    document.alarms.unknown.clear();
+    assert_eq!(of(&document), Value::Null, "nothing is watched");
+}
+
+#[test]
 fn an_alarm_that_may_be_raised_is_not_shown_as_healthy() {
     let mut document = document();
     let of = |document: &StatusDocument, rule: &str| info(document)["alarms"][rule].clone();

@@ -72,6 +72,8 @@ fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
     let mut uplink = Uplink::start(&broker, &daemon, EAGER);
     daemon.send(&document(96, 0));
     reader.wait_for_messages(4);
+    // A message that the broker has but did not confirm would come a second time.
+    wait_for("the broker's receipts", || fill(&uplink).messages == 0);
     broker.stop();
     for second in 1..=HOUR {
         if second == HOUR / 2 {
@@ -90,6 +92,7 @@ fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
     wait_for("the rest", || fill(&uplink).messages == 0);
     daemon.send(&document(96, HOUR + 1));
     reader.wait_for_topic_time("packwatch/info", HOUR + 1);
+    reader.wait_for_topic_time("packwatch/history", HOUR + 1);
 
     let messages = reader.messages();
     let samples: Vec<&Value> =
@@ -152,6 +155,35 @@ fn a_full_queue_drops_the_oldest_samples_first_and_counts_them() {
         let uplink = Reader::retained(&broker, "packwatch/uplink").pop().map(|(_, text)| text).unwrap_or_default();
         uplink == "{\"dropped_events\":0,\"dropped_samples\":170,\"queue_bytes\":0,\"queue_messages\":0}"
     });
+}
+
+#[test]
+fn a_topic_that_the_broker_refuses_does_not_stop_the_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let rights = folder.path().join("rights");
+    fs::write(&rights, "topic read #\ntopic write packwatch/history\ntopic write packwatch/status\n").unwrap();
+    let (mut broker, daemon) = (Broker::start(&format!("acl_file {}\n", rights.display())), Daemon::start());
+    let reader = Reader::start(&broker, &["packwatch/history", "packwatch/events"]);
+    let uplink = Uplink::start(&broker, &daemon, EAGER);
+    for second in 0..5 {
+        daemon.send(&document(1, second));
+        reader.wait_for_topic_time("packwatch/history", second);
+    }
+    let topics = |reader: &Reader| reader.messages().into_iter().map(|(topic, _)| topic).collect::<Vec<_>>();
+    assert!(!topics(&reader).contains(&"packwatch/events".to_owned()));
+    let log = uplink.log();
+    assert!(log.contains("packwatch/events: the broker refuses it: NotAuthorized"), "{log}");
+    for topic in ["packwatch/events", "packwatch/info", "homeassistant/"] {
+        assert!(log.lines().filter(|line| line.contains(topic)).count() <= 1, "once, not each time: {log}");
+    }
+    assert_eq!(log.matches("connected broker").count(), 1, "the connection stays: {log}");
+    wait_for("the refused events alone", || fill(&uplink).messages == 2);
+
+    broker.stop();
+    fs::write(&rights, "topic readwrite #\n").unwrap();
+    broker.restart();
+    wait_for("the events", || topics(&reader).iter().filter(|topic| *topic == "packwatch/events").count() == 2);
+    wait_for("an empty queue", || fill(&uplink).messages == 0);
 }
 
 #[test]

@@ -67,7 +67,7 @@ impl Broker {
         let anonymous = if more.contains("allow_anonymous") { "" } else { "allow_anonymous true\n" };
         // As root it would become another user, who cannot read the test's folder.
         let text = format!(
-            "user root\nlistener {port} 127.0.0.1\n{anonymous}{more}persistence true\npersistence_location {}/\nmax_queued_messages 0\n",
+            "user root\nlistener {port} 127.0.0.1\n{anonymous}{more}persistence true\npersistence_location {}/\nmax_queued_messages 100000\n",
             folder.path().display()
         );
         fs::write(folder.path().join("mosquitto.conf"), text).unwrap();
