@@ -8,7 +8,7 @@ use packwatch_host::quantity::Mode;
 use packwatch_host::status::document::{CellStatus, PackStatus, StatusDocument};
 use serde_json::Value;
 
-/// Topic that carries the value, below the base topic.
+/// What kind of value an entity has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A quantity with unit, device class and state class of Home Assistant; empty = none.
