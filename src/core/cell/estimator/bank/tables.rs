@@ -68,6 +68,8 @@ struct CachedLines<const L: usize, const W: usize> {
     /// Upper ends of the intervals.
     to: Lanes<L>,
     row: [Lanes<L>; W],
+    /// The part of the open-circuit voltage's line, in `row` too, that follows from the capacity.
+    offset_v: [Lanes<L>; 2],
 }
 
 /// Points on the lines of L cells.
@@ -165,8 +167,7 @@ impl<const W: usize> Tables<W> {
                 cache.temperature_c[lane] = temperature_c.0[lane];
                 let isotherm = self.isotherm(temperature_c.0[lane], cache.isotherms[lane]);
                 cache.isotherms[lane] = isotherm;
-                let capacity_ah = cache.capacity_ah[lane];
-                cache.places.iter_mut().for_each(|lines| self.copy((isotherm, capacity_ah), lines, lane));
+                cache.places.iter_mut().for_each(|lines| self.copy(isotherm, lines, lane));
             }
         }
     }
@@ -187,7 +188,10 @@ impl<const W: usize> Tables<W> {
             cache.capacity_ah[lane] = capacity_ah.0[lane];
             let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
             cache.isotherms[lane] = isotherm;
-            cache.places.iter_mut().for_each(|lines| self.copy((isotherm, capacity_ah.0[lane]), lines, lane));
+            for lines in &mut cache.places {
+                self.age(capacity_ah.0[lane], lines, lane);
+                self.copy(isotherm, lines, lane);
+            }
         }
     }
 
@@ -223,25 +227,32 @@ impl<const W: usize> Tables<W> {
                     (lines.from.0[lane], lines.to.0[lane]) = (self.borders[interval], self.borders[interval + 1]);
                     let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
                     cache.isotherms[lane] = isotherm;
-                    self.copy((isotherm, cache.capacity_ah[lane]), lines, lane);
+                    self.age(cache.capacity_ah[lane], lines, lane);
+                    self.copy(isotherm, lines, lane);
                 }
             }
         }
     }
 
-    /// Copies the lines of a lane's interval into the cache, at an isotherm and for a capacity, Ah.
-    fn copy<const L: usize>(&self, (isotherm, capacity_ah): (usize, f64), lines: &mut CachedLines<L, W>, lane: usize) {
-        let interval = lines.interval[lane];
-        let row = &self.rows[isotherm * self.intervals() + interval];
-        lines.row.iter_mut().zip(row).for_each(|(lanes, value)| lanes.0[lane] = *value);
+    /// Brings what follows from a lane's capacity, Ah, to its interval. [`Self::copy`] adds it to the open-circuit voltage.
+    fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
-            self.model.aged_ocv.line(&self.model.soc, interval, capacity_ah);
+            self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
         for k in 0..2 {
-            lines.row[OCV_V + k].0[lane] += offset_v.0[k];
+            lines.offset_v[k].0[lane] = offset_v.0[k];
             for (i, change_v) in std::iter::once(&per_ah_v).chain(&mixes_v).enumerate() {
                 lines.row[OCV_PER_AH + 2 * i + k].0[lane] = change_v.0[k];
             }
         }
+    }
+
+    /// Copies the lines of a lane's interval into the cache, at an isotherm.
+    fn copy<const L: usize>(&self, isotherm: usize, lines: &mut CachedLines<L, W>, lane: usize) {
+        let row = &self.rows[isotherm * self.intervals() + lines.interval[lane]];
+        for k in 0..2 {
+            lines.row[OCV_V + k].0[lane] = row[OCV_V + k] + lines.offset_v[k].0[lane];
+        }
+        lines.row[R0_OHM..].iter_mut().zip(&row[R0_OHM..]).for_each(|(lanes, value)| lanes.0[lane] = *value);
     }
 }
 
@@ -254,6 +265,7 @@ impl<const L: usize, const W: usize> LineCache<L, W> {
             from: Lanes::splat(tables.borders[0]),
             to: Lanes::splat(tables.borders[1]),
             row: [zero; W],
+            offset_v: [zero; 2],
         };
         Self {
             temperature_c: [f64::NAN; L],
