@@ -39,7 +39,7 @@ impl GaussianProcess {
         progress: bool,
     ) -> PyResult<Self> {
         let inputs = arrays::reals("inputs", inputs)?;
-        let targets = arrays::reals("output", output)?;
+        let targets = arrays::column("output", output)?;
         check_rows("output", targets.rows, "inputs", inputs.rows)?;
         check_known("inputs", &inputs)?;
         check_known("output", &targets)?;

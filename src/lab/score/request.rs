@@ -116,19 +116,20 @@ impl ScoreRun {
 }
 
 impl ScoreRequest {
-    /// Reads the configuration, the tables and the files to learn from.
+    /// Reads the configuration, the tables and the files to learn from; `progress` as in [`learn`].
     ///
     /// # Errors
     /// Faults of the configuration; a number out of its range, arguments that do not fit together, a table or a file to learn from that cannot be read.
-    pub fn prepare(&self) -> Result<ScoreRun, RequestError> {
+    pub fn prepare(&self, progress: &dyn Fn()) -> Result<ScoreRun, RequestError> {
         self.check()?;
         let config = self.source.load()?;
-        let settings = self.settings(&config)?;
+        let settings = self.settings(&config, progress)?;
         let jobs = self.jobs()?;
         Ok(ScoreRun { config, settings, jobs, cases: self.cases() })
     }
 
     fn check(&self) -> Result<(), LabError> {
+        self.check_lists()?;
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
             return Err(LabError(format!("--cycles given {tables} times for {files} files, must be once per file")));
@@ -140,6 +141,25 @@ impl ScoreRequest {
         }
         check_distinct(&self.files)?;
         self.check_numbers()
+    }
+
+    /// No list without which there is nothing to score is empty.
+    fn check_lists(&self) -> Result<(), LabError> {
+        let lists = [
+            ("files", self.files.len()),
+            ("start", self.start.len()),
+            ("soc_error_points", self.soc_error_points.len()),
+            ("capacity_error_percent", self.capacity_error_percent.len()),
+            ("current_offset_a", self.current_offset_a.len()),
+            ("seeds", self.seeds.len()),
+        ];
+        if let Some((name, _)) = lists.into_iter().find(|(_, values)| *values == 0) {
+            return Err(LabError(format!("no {name}, must be one or more")));
+        }
+        if !self.learn.is_empty() && !self.cycles.is_empty() {
+            return Err("learn must not be given together with cycles".into());
+        }
+        Ok(())
     }
 
     /// The ranges of the command line's arguments.
@@ -179,7 +199,7 @@ impl ScoreRequest {
         Ok(())
     }
 
-    fn settings(&self, config: &Config) -> Result<ScoreSettings, LabError> {
+    fn settings(&self, config: &Config, progress: &dyn Fn()) -> Result<ScoreSettings, LabError> {
         let mut monitor = config.monitor.clone();
         if monitor.sample.cells != 1 {
             let found = monitor.sample.cells;
@@ -198,7 +218,10 @@ impl ScoreRequest {
                 "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
             ));
         }
-        let learned = (!self.learn.is_empty()).then(|| learn(&self.learn, &monitor, self.sleep_gap_s)).transpose()?;
+        let learned = match &self.learn[..] {
+            [] => None,
+            files => Some(learn(files, &monitor, self.sleep_gap_s, progress)?),
+        };
         Ok(ScoreSettings {
             learned,
             truth_capacity_ah: self.truth_capacity_ah.unwrap_or(monitor.model.capacity_ah),
