@@ -255,7 +255,7 @@ fn check_range(records: &[Record]) -> Result<(), LabError> {
         return Ok(());
     }
     let found = if high > low { format!("SOC {:.2} to {:.2}", low, high) } else { "no usable row".to_owned() };
-    Err(LabError(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
+    Err(LabError::Data(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
 }
 
 fn by_file(

@@ -7,13 +7,15 @@ use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
 use arrow_buffer::ScalarBuffer;
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyList, PyString};
+use pyo3::types::PyList;
 use pyo3_arrow::PyArray;
 
 use crate::error::data;
 
 /// Kinds of NumPy's dtypes that are numbers: bool, signed, unsigned, real, and objects that each convert to a real.
 const NUMBERS: [&str; 5] = ["b", "i", "u", "f", "O"];
+/// Type of what pandas has in an array of objects where a number is missing.
+const MISSING: &str = "NAType";
 /// Layout that is needed: C order, aligned, a plain array and none of a subclass.
 const LAYOUT: &str = "CAE";
 
@@ -45,7 +47,11 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
 
     /// The matrix, which must have one column.
     fn one_column(self, name: &str) -> PyResult<Self> {
-        if self.columns == 1 { Ok(self) } else { Err(data(format!("{name} has {} columns, must have 1", self.columns))) }
+        if self.columns == 1 {
+            Ok(self)
+        } else {
+            Err(data(format!("{name} has {} columns, must have 1", self.columns)))
+        }
     }
 
     /// Index of a value, as NumPy writes it.
@@ -128,7 +134,7 @@ fn is_masked(array: &Bound<'_, PyAny>) -> PyResult<bool> {
     array.py().import("numpy.ma")?.call_method1("isMaskedArray", (array,))?.extract()
 }
 
-/// Rejects an array of texts, times, complex numbers or records: NumPy converts some of them to reals without a word.
+/// Rejects an array of texts, times, complex numbers or records: NumPy and pandas convert some of them to reals without a word.
 fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;
@@ -138,9 +144,12 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     }
     if kind == "O" {
         let objects = array.call_method0("ravel")?.call_method0("tolist")?;
-        let is_text = |object: &Bound<'_, PyAny>| object.is_instance_of::<PyString>() || object.is_instance_of::<PyBytes>();
-        if let Some(text) = objects.cast::<PyList>()?.iter().find(is_text) {
-            return refused(text.get_type().name()?.to_string());
+        for object in objects.cast::<PyList>()? {
+            let kind = object.get_type().name()?;
+            let is_number = object.hasattr("__float__")? || object.hasattr("__index__")?;
+            if !is_number && !object.is_none() && kind != MISSING {
+                return refused(kind.to_string());
+            }
         }
     }
     Ok(())

@@ -75,7 +75,9 @@ impl Monitor {
                 return Err(data("text must not be given together with config, cell or chemistry"));
             }
             Some(text) => of_text(text, folder.as_deref().unwrap_or(Path::new("")))?,
-            None if folder.is_some() => return Err(data("folder must be given together with text, whose files are there")),
+            None if folder.is_some() => {
+                return Err(data("folder must be given together with text, whose files are there"));
+            }
             None if !is_cell => return Err(data("no configuration: config, text, cell or chemistry must be given")),
             None => py.detach(|| source.load()).map_err(config_error)?,
         };

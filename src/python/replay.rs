@@ -130,6 +130,7 @@ fn of_replay(failure: ReplayError) -> PyErr {
             PyBrokenPipeError::new_err(error.to_string())
         }
         ReplayError::Write(error) => error::file(error),
-        failure => error::of_library(failure),
+        ReplayError::Log(error) => error::of_library(error),
+        failure => data(failure),
     }
 }

@@ -44,7 +44,11 @@ pub(crate) fn rul<'py>(
     if let Some(part) = at.iter().flatten().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
         return Err(data(format!("at and alpha: found {part}, must be above 0 and below 1")));
     }
-    for (name, is_empty) in [("files", files.is_empty()), ("end_of_life", thresholds.is_empty()), ("at", at.as_ref().is_some_and(Vec::is_empty))] {
+    for (name, is_empty) in [
+        ("files", files.is_empty()),
+        ("end_of_life", thresholds.is_empty()),
+        ("at", at.as_ref().is_some_and(Vec::is_empty)),
+    ] {
         if is_empty {
             return Err(data(format!("no {name}, must be one or more")));
         }

@@ -32,11 +32,11 @@ def test_every_case_of_score_has_a_plot(record, tmp_path):
 
 def assert_last_argument_counts(file, given, options, **known):
     """The call gives what the command gives with these options, and something else without the last argument."""
-    files = [value for name in known.items() for value in (f"--{name[0]}", name[1])]
-    with_it = pw.score(file, **known, **given)
+    files = [word for option, path in known.items() for word in (f"--{option}", path)]
+    score = pw.score(file, **known, **given)
+    assert score.json() == packwatch("score", file, *files, *options.split(), "--json")
     without = dict(list(given.items())[:-1])
-    assert with_it.json() == packwatch("score", file, *files, *options.split(), "--json")
-    assert with_it.scores != pw.score(file, **known, **without).scores
+    assert score.scores != pw.score(file, **known, **without).scores
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,14 @@ def assert_last_argument_counts(file, given, options, **known):
         ({"current_offset_a": 0.05}, "--current-offset 0.05"),
         ({"settle_s": 120.0}, "--settle 120"),
         ({"truth_capacity_ah": 2.5}, "--truth-capacity 2.5"),
-        ({"sleep_gap_s": 0.5}, "--sleep-gap 0.5"),
+        ({"sleep_gap_s": 200.0}, "--sleep-gap 200"),
         ({"learn": ["cell.csv"]}, "--learn cell.csv"),
     ],
 )
-def test_every_argument_of_score_changes_it_as_the_option_does(record, monkeypatch, given, options):
-    monkeypatch.chdir(record.csv.parent)
+def test_every_argument_of_score_changes_it_as_the_option_does(record, tmp_path, monkeypatch, given, options):
+    monkeypatch.chdir(tmp_path)
+    rows = record.csv.read_text().splitlines(keepends=True)
+    (tmp_path / "cell.csv").write_text("".join(rows[:4000] + rows[4120:]))  # a gap of 120 s
     assert_last_argument_counts("cell.csv", given, options, cell=CELL)
 
 
@@ -185,13 +187,24 @@ def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases,
     pack = (CONFIG / "example.toml").read_text().replace('"pack96.dbc"', f'"{CONFIG}/pack96.dbc"')
     (tmp_path / "pack.toml").write_text(pack.replace('"cells/', f'"{CONFIG}/cells/'))
     done = subprocess.run([BINARY, *map(str, command)], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1 and done.stdout == ""
+    assert done.returncode == (78 if kind is pw.ConfigError else 1) and done.stdout == ""
     with pytest.raises(kind) as caught:
         call(type(tmp_path)())
     assert type(caught.value) is kind and f"{caught.value}\n" == done.stderr != "\n"
     assert issubclass(kind, bases) and issubclass(kind, pw.PackwatchError)
     if kind is pw.ConfigError:
         assert caught.value.faults == str(caught.value).splitlines()
+
+
+def test_the_text_of_an_error_does_not_say_whose_it_is(tmp_path):
+    path = tmp_path / "a (os error 2).csv"
+    path.write_text(CSV_FAULT)
+    with pytest.raises(pw.DataError, match=r"\(os error 2\).csv:3"):
+        pw.read(path)
+    (tmp_path / "folder.csv").mkdir()
+    for call in (pw.read, lambda path: pw.replay(PAPER, path), pw.gp.load):
+        with pytest.raises(pw.FileError, match="folder.csv: .*Is a directory"):
+            call(tmp_path / "folder.csv")
 
 
 @pytest.mark.parametrize(
@@ -231,6 +244,7 @@ def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases,
         (lambda: pw.fit("a.csv", "x", voltage_min_v=np.nan), "--voltage-min = NaN, must be a finite number above 0"),
         (lambda: pw.fit("a.csv", "x", voltage_max_v=-4.2), "--voltage-max = -4.2, must be a finite number above 0"),
         (lambda: pw.fit("a.csv", "x", capacity_ah=0.0), "--capacity = 0, must be a finite number above 0"),
+        (lambda: pw.fit("a.csv", "x", first_cycles=0), "--first-cycles = 0, must be 1 or more"),
         (lambda: pw.fit("a.csv", "x", capacity_ah=2.0, first_cycles=3), "--capacity must not be given together with --first-cycles"),
         (lambda: pw.gp.fit([[1.0]], [1.0, 2.0]), "output has 2 rows, inputs has 1: must agree"),
         (lambda: pw.gp.fit([[1.0]], [[1.0, 2.0]]), "output has 2 columns, must have 1"),
@@ -248,11 +262,11 @@ def test_bad_arguments_are_named(call, text):
 
 def test_a_signal_ends_a_score_that_still_learns(record):
     learn = [record.csv] * 3000
-    assert interrupted(lambda: pw.score(record.csv, cell=CELL, learn=learn)) < 1.0
+    assert interrupted(lambda: pw.score(record.csv, cell=CELL, learn=learn)) < 3.0
 
 
 def test_a_signal_ends_the_forecasts(tmp_path):
     rows = "".join(f"{86400 * n},{2.0 - 0.0002 * n:.6f}\n" for n in range(3000))
     (tmp_path / "life.csv").write_text(f"date,capacity_ah\n{rows}")
     parts = np.linspace(0.01, 0.99, 99)
-    assert interrupted(lambda: pw.rul(tmp_path / "life.csv", [1.4 + 0.01 * n for n in range(30)], at=parts)) < 1.0
+    assert interrupted(lambda: pw.rul(tmp_path / "life.csv", [1.4 + 0.01 * n for n in range(30)], at=parts)) < 3.0

@@ -74,11 +74,14 @@ impl FitRequest {
         if let (Some(low_v), Some(high_v)) = (self.voltage_min_v, self.voltage_max_v)
             && low_v >= high_v
         {
-            return Err(LabError(format!("--voltage-min = {low_v}, must be below --voltage-max = {high_v}")));
+            return Err(LabError::Data(format!("--voltage-min = {low_v}, must be below --voltage-max = {high_v}")));
+        }
+        if self.first_cycles == Some(0) {
+            return Err("--first-cycles = 0, must be 1 or more".into());
         }
         for (key, is_given) in [("--ocv", !self.ocv.is_empty()), ("--capacity", self.capacity_ah.is_some())] {
             if is_given && self.first_cycles.is_some() {
-                return Err(LabError(format!("{key} must not be given together with --first-cycles")));
+                return Err(LabError::Data(format!("{key} must not be given together with --first-cycles")));
             }
         }
         Ok(())
@@ -86,14 +89,14 @@ impl FitRequest {
 
     fn check_branches(&self) -> Result<(), LabError> {
         if let Some(found) = self.branches.filter(|found| !(1..=MAX_BRANCHES).contains(found)) {
-            return Err(LabError(format!("--branches = {found}, must be 1 to {MAX_BRANCHES}")));
+            return Err(LabError::Data(format!("--branches = {found}, must be 1 to {MAX_BRANCHES}")));
         }
         let Some(tau_s) = &self.tau_s else { return Ok(()) };
         check_list("--tau", tau_s, 1..=MAX_BRANCHES)?;
         check("--tau", tau_s.iter().copied(), is_above_0, "finite numbers above 0")?;
         match (tau_s.len(), self.branches) {
             (found, Some(branches)) if found != branches => {
-                Err(LabError(format!("--tau has {found} values, --branches is {branches}: must agree")))
+                Err(LabError::Data(format!("--tau has {found} values, --branches is {branches}: must agree")))
             }
             _ => Ok(()),
         }
@@ -124,18 +127,18 @@ fn check(
     allowed: &str,
 ) -> Result<(), LabError> {
     let found = values.into_iter().find(|value| !is_allowed(*value));
-    found.map_or(Ok(()), |value| Err(LabError(format!("{key} = {value}, must be {allowed}"))))
+    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{key} = {value}, must be {allowed}"))))
 }
 
 /// Rejects a list of another length, and one that does not rise.
 fn check_list(key: &str, list: &[f64], allowed: std::ops::RangeInclusive<usize>) -> Result<(), LabError> {
     if !allowed.contains(&list.len()) {
         let (found, least, most) = (list.len(), allowed.start(), allowed.end());
-        return Err(LabError(format!("{key} has {found} values, must have {least} to {most}")));
+        return Err(LabError::Data(format!("{key} has {found} values, must have {least} to {most}")));
     }
     // Not a >= b: a NaN must not pass.
     let falling = list.array_windows().find(|[a, b]| a.partial_cmp(b) != Some(std::cmp::Ordering::Less));
-    falling.map_or(Ok(()), |[a, b]| Err(LabError(format!("{key}: {b} follows {a}, must rise"))))
+    falling.map_or(Ok(()), |[a, b]| Err(LabError::Data(format!("{key}: {b} follows {a}, must rise"))))
 }
 
 #[cfg(test)]
@@ -159,13 +162,17 @@ mod tests {
             (FitRequest::default(), "no files, must be one or more"),
             (FitRequest { capacity_ah: Some(0.0), ..usual() }, "--capacity = 0, must be a finite number above 0"),
             (FitRequest { rated_ah: nan, ..usual() }, "--rated = NaN, must be a finite number above 0"),
-            (FitRequest { voltage_min_v: Some(-1.0), ..usual() }, "--voltage-min = -1, must be a finite number above 0"),
+            (
+                FitRequest { voltage_min_v: Some(-1.0), ..usual() },
+                "--voltage-min = -1, must be a finite number above 0",
+            ),
             (FitRequest { voltage_max_v: nan, ..usual() }, "--voltage-max = NaN, must be a finite number above 0"),
             (
                 FitRequest { voltage_min_v: Some(4.2), voltage_max_v: Some(4.2), ..usual() },
                 "--voltage-min = 4.2, must be below --voltage-max = 4.2",
             ),
             (FitRequest { ageing_shift: Some(1.5), ..usual() }, "--ageing-shift = 1.5, must be 0 to 1"),
+            (FitRequest { first_cycles: Some(0), ..usual() }, "--first-cycles = 0, must be 1 or more"),
             (
                 FitRequest { first_cycles: Some(3), capacity_ah: Some(2.0), ..usual() },
                 "--capacity must not be given together with --first-cycles",
@@ -194,7 +201,7 @@ mod tests {
             (FitRequest { soc: list(&[0.0, 0.5, 0.5, 1.0]), ..usual() }, "--soc-nodes: 0.5 follows 0.5, must rise"),
         ];
         for (request, text) in cases {
-            assert_eq!(request.check(), Err(LabError(text.to_owned())));
+            assert_eq!(request.check(), Err(LabError::Data(text.to_owned())));
         }
     }
 }

@@ -107,7 +107,7 @@ impl ScoreRun {
     pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
         if let Some(folder) = &self.settings.plots {
             let created = std::fs::create_dir_all(folder);
-            created.map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
+            created.map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))?;
         }
         let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;
         let Self { config, settings, cases, .. } = self;
@@ -132,7 +132,9 @@ impl ScoreRequest {
         self.check_lists()?;
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
-            return Err(LabError(format!("--cycles given {tables} times for {files} files, must be once per file")));
+            return Err(LabError::Data(format!(
+                "--cycles given {tables} times for {files} files, must be once per file"
+            )));
         }
         if self.source.config.is_none() && self.source.cell.is_none() && self.source.label.is_none() {
             return Err(
@@ -154,7 +156,7 @@ impl ScoreRequest {
             ("seeds", self.seeds.len()),
         ];
         if let Some((name, _)) = lists.into_iter().find(|(_, values)| *values == 0) {
-            return Err(LabError(format!("no {name}, must be one or more")));
+            return Err(LabError::Data(format!("no {name}, must be one or more")));
         }
         if !self.learn.is_empty() && !self.cycles.is_empty() {
             return Err("learn must not be given together with cycles".into());
@@ -187,14 +189,14 @@ impl ScoreRequest {
             self.window.filter(|(least, most)| !(*least > 0.0 && least <= most && *most <= 1.0))
         {
             let allowed = "two parts above 0 and at most 1, the smaller first";
-            return Err(LabError(format!("window = {least}, {most}, must be {allowed}")));
+            return Err(LabError::Data(format!("window = {least}, {most}, must be {allowed}")));
         }
         let unfit = |[current_a, temperature_c, cutoff_v]: &[f64; 3]| {
             !(above_0(*current_a) && temperature_c.is_finite() && above_0(*cutoff_v))
         };
         if let Some([current_a, temperature_c, cutoff_v]) = self.load.filter(unfit) {
             let allowed = "amperes above 0, degrees C and volts above 0";
-            return Err(LabError(format!("load = {current_a}, {temperature_c}, {cutoff_v}, must be {allowed}")));
+            return Err(LabError::Data(format!("load = {current_a}, {temperature_c}, {cutoff_v}, must be {allowed}")));
         }
         Ok(())
     }
@@ -203,7 +205,7 @@ impl ScoreRequest {
         let mut monitor = config.monitor.clone();
         if monitor.sample.cells != 1 {
             let found = monitor.sample.cells;
-            return Err(LabError(format!(
+            return Err(LabError::Data(format!(
                 "{}: pack.cells = {found}, must be 1 to score files of one cell",
                 config.path.display()
             )));
@@ -281,5 +283,5 @@ fn check(
     allowed: &str,
 ) -> Result<(), LabError> {
     let found = values.into_iter().find(|value| !is_allowed(*value));
-    found.map_or(Ok(()), |value| Err(LabError(format!("{name} = {value}, must be {allowed}"))))
+    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{name} = {value}, must be {allowed}"))))
 }
