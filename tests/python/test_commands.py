@@ -51,14 +51,14 @@ def assert_last_argument_counts(file, given, options, **known):
         ({"current_offset_a": 0.05}, "--current-offset 0.05"),
         ({"settle_s": 120.0}, "--settle 120"),
         ({"truth_capacity_ah": 2.5}, "--truth-capacity 2.5"),
-        ({"sleep_gap_s": 200.0}, "--sleep-gap 200"),
+        ({"sleep_gap_s": 1000.0}, "--sleep-gap 1000"),
         ({"learn": ["cell.csv"]}, "--learn cell.csv"),
     ],
 )
 def test_every_argument_of_score_changes_it_as_the_option_does(record, tmp_path, monkeypatch, given, options):
     monkeypatch.chdir(tmp_path)
     rows = record.csv.read_text().splitlines(keepends=True)
-    (tmp_path / "cell.csv").write_text("".join(rows[:4000] + rows[4120:]))  # a gap of 120 s
+    (tmp_path / "cell.csv").write_text("".join(rows[:3000] + rows[3200:]))  # a gap of 200 s
     assert_last_argument_counts("cell.csv", given, options, cell=CELL)
 
 
