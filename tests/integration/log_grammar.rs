@@ -306,7 +306,7 @@ fn bad_lines_are_counted_and_the_first_is_shown() {
         "{first}"
     );
     let strict = read(&[path], true, |_| {}).expect_err("strict");
-    assert_eq!(strict.0, first);
+    assert_eq!(strict.to_string(), first);
 }
 
 #[test]
