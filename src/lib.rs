@@ -27,7 +27,7 @@
 //! | | `failure` | why a command ended: text and exit code of every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
-//! | `src/python` | `python` | the Python module: doors to the rooms above; stubs and Python code in its folder `packwatch` |
+//! | `src/python` | `python` | the Python module: the library as classes and functions; stubs and Python code in its folder `packwatch` |
 //! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame

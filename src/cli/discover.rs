@@ -120,7 +120,7 @@ fn write(
         }),
     };
     let failed = |what: &str| Failure::new(format!("{}: not written:\n{what}", file.display()));
-    let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.0))?;
+    let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.to_string()))?;
     let own = file.with_extension("dbc");
     let read = |path: &Path| match &pack.database {
         _ if path == file => Ok(pack.text.clone().into_bytes()),

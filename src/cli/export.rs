@@ -77,7 +77,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     bar.finish_and_clear();
     let (good, failed): (Vec<_>, Vec<_>) = results.map_err(failure)?.into_iter().partition(Result::is_ok);
     let good: Vec<ExportResult> = good.into_iter().flatten().collect();
-    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).map(|error| error.0).collect();
+    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).map(|error| error.to_string()).collect();
     unless_closed(match args.json {
         true => print_json(&json!({ "version": VERSION, "logs": good, "failed": failed })),
         false => table(&good),

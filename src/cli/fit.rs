@@ -9,14 +9,13 @@ use std::time::Instant;
 
 use super::Failure;
 use super::label::{LabelArgs, one_of_chemistries};
-use super::numbers::{above_0, finite, share};
+use super::numbers::finite;
 use super::output::{failure, print, progress_bar, unless_closed};
 use super::replay::{InputArgs, log_options};
-use crate::cell::MAX_BRANCHES;
 use crate::config;
 use crate::lab;
 use crate::lab::fit::logs::LogRequest;
-use crate::lab::fit::{self, FitProgress, FitRequest};
+use crate::lab::fit::{self, FitProgress, FitRequest, MAX_SOC_NODES};
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
@@ -41,21 +40,21 @@ pub(crate) struct Args {
     #[arg(long, required_unless_present = "log")]
     name: Option<String>,
     /// Capacity that defines SOC, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
-    #[arg(long, value_name = "AH", value_parser = above_0)]
+    #[arg(long, value_name = "AH", value_parser = finite)]
     capacity: Option<f64>,
     /// Capacity on the label, Ah [default: the capacity]
-    #[arg(long, value_name = "AH", value_parser = above_0)]
+    #[arg(long, value_name = "AH", value_parser = finite)]
     rated: Option<f64>,
     /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
     /// of a new cell determines it [default: the electrodes found in the slow test say it; without them 0, for an ageing cell 0.5,
     /// chosen on two whole lives]
-    #[arg(long, value_name = "SHARE", value_parser = share)]
+    #[arg(long, value_name = "SHARE", value_parser = finite)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: where discharges end; pulses do not count]
-    #[arg(long, value_name = "V", value_parser = above_0)]
+    #[arg(long, value_name = "V", value_parser = finite)]
     voltage_min: Option<f64>,
     /// Highest voltage under charge [default: where charges end; pulses do not count]
-    #[arg(long, value_name = "V", value_parser = above_0)]
+    #[arg(long, value_name = "V", value_parser = finite)]
     voltage_max: Option<f64>,
     /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
     #[arg(long, value_name = "FILE")]
@@ -90,10 +89,10 @@ struct StartArgs {
 #[derive(Debug, clap::Args)]
 struct GridArgs {
     /// RC branches [default: 2, for an ageing cell 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=MAX_BRANCHES as i64))]
-    branches: Option<u8>,
+    #[arg(long, value_name = "N")]
+    branches: Option<usize>,
     /// Starting time constants, s, rising
-    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = above_0)]
+    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = finite)]
     tau: Option<Vec<f64>>,
     /// Temperature nodes, degrees C, rising [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
@@ -103,19 +102,17 @@ struct GridArgs {
     soc_nodes: Option<SocNodes>,
 }
 
-/// SOC breakpoints as checked on the command line.
+/// SOC breakpoints, which the request checks.
 #[derive(Debug, Clone)]
 struct SocNodes(Vec<f64>);
 
 fn soc_nodes(text: &str) -> Result<SocNodes, String> {
     if let Ok(count) = text.parse::<u16>() {
-        let last = count.checked_sub(1).filter(|last| (1..=100).contains(last)).ok_or("must be 2 to 101 nodes")?;
+        let is_allowed = (2..=MAX_SOC_NODES).contains(&usize::from(count));
+        let last = count.checked_sub(1).filter(|_| is_allowed).ok_or(format!("must be 2 to {MAX_SOC_NODES} nodes"))?;
         return Ok(SocNodes((0..count).map(|k| f64::from(k) / f64::from(last)).collect()));
     }
-    let nodes = text.split(',').map(finite).collect::<Result<Vec<f64>, _>>()?;
-    let rising = nodes.windows(2).all(|pair| pair[0] < pair[1]);
-    let whole = nodes.len() >= 2 && nodes[0] == 0.0 && nodes[nodes.len() - 1] == 1.0;
-    if rising && whole { Ok(SocNodes(nodes)) } else { Err("must rise from 0 to 1".to_owned()) }
+    text.split(',').map(finite).collect::<Result<_, _>>().map(SocNodes)
 }
 
 /// Runs the command.
@@ -180,7 +177,7 @@ fn request(args: &Args) -> FitRequest {
         voltage_max_v: args.voltage_max,
         ageing_shift: args.ageing_shift,
         ocv: args.ocv.clone(),
-        branches: args.grid.branches.map(usize::from),
+        branches: args.grid.branches,
         tau_s: args.grid.tau.clone(),
         temperature_c: args.grid.temperatures.clone(),
         soc: args.grid.soc_nodes.as_ref().map(|nodes| nodes.0.clone()),

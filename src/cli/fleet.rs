@@ -141,7 +141,7 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
     let usual = config::load(&args.config)?;
     let config_of = |vehicle: &Vehicle| match &vehicle.config {
         None => Ok(usual.clone()),
-        Some(path) => config::load(path).map_err(|faults| LabError(faults.0.join("; "))),
+        Some(path) => config::load(path).map_err(|faults| LabError::Data(faults.0.join("; "))),
     };
     let open = |config: &Config, found: &[PathBuf]| logs::open(&args.input, config, found);
     let settings = ExportSettings {

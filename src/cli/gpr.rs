@@ -205,7 +205,7 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
         // The reader of the output has closed it: no failure.
-        Err(error) if to_stdout && error.0.contains("Broken pipe") => return Ok(()),
+        Err(error) if to_stdout && error.to_string().contains("Broken pipe") => return Ok(()),
         written => written.map_err(failure)?,
     }
     let known = |row: &usize| !table.row(*row)[trained.inputs.len()].is_nan();

@@ -54,7 +54,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
         report::now_table(&forecasts)
     } else {
-        let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);
+        let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha, &|| ());
         let scored: Vec<HistoryScore> = each(args, score)?;
         if args.json {
             return print(&rul::scored_json(&scored, args.alpha).map_err(failure)?);

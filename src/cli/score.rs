@@ -10,7 +10,7 @@ use super::output::{failure, print};
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let run = args.request().prepare()?;
+    let run = args.request().prepare(&|| ())?;
     let bar = bar::Bar::new(run.jobs());
     let report = run.run(&|index, part| bar.advance(index, part));
     bar.clear();

@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.inc(bytes));
     bar.finish_and_clear();
     let results = results.map_err(failure)?;
-    let failed = results.iter().filter_map(|result| Some(result.as_ref().err()?.0.clone())).collect();
+    let failed = results.iter().filter_map(|result| Some(result.as_ref().err()?.to_string())).collect();
     let rules = args.rules(&grid);
     let good: Vec<&LogResult> = results.iter().filter_map(|result| result.as_ref().ok()).collect();
     let shown = report::WhatifReport { grid: &grid, settings: &settings, rated_ah, rules: &rules, logs: &good, failed };

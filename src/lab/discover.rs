@@ -206,6 +206,6 @@ impl Discoverer {
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };
-        writer.write().map_err(|questions| LabError(questions.join("\n")))
+        writer.write().map_err(|questions| LabError::Data(questions.join("\n")))
     }
 }

@@ -8,8 +8,14 @@ use crate::io::table::TableError;
 
 /// Why offline work failed: one line per fault.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct LabError(pub String);
+pub enum LabError {
+    /// Data or arguments that cannot be used.
+    #[error("{0}")]
+    Data(String),
+    /// The operating system does not let a file be read or written.
+    #[error("{0}")]
+    File(String),
+}
 
 /// Why a request for offline work cannot be worked on.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -24,32 +30,52 @@ pub enum RequestError {
 
 /// Errors that already name their place.
 macro_rules! convert {
-    ($($error:ty),+ $(,)?) => {
+    ($variant:ident: $($error:ty),+ $(,)?) => {
         $(impl From<$error> for LabError {
             fn from(error: $error) -> Self {
-                Self(error.to_string())
+                Self::$variant(error.to_string())
             }
         })+
     };
 }
 
 convert!(
-    String,
+    Data: String,
     &str,
-    std::io::Error,
     csv::Error,
     serde_json::Error,
     parquet::errors::ParquetError,
     crate::regress::RegressionError,
-    PlotError,
-    TableError,
 );
+convert!(File: PlotError);
+
+impl LabError {
+    /// A failed read or write, as [`TableError::of_io`].
+    pub fn of_io(text: String, error: &std::io::Error) -> Self {
+        TableError::of_io(text, error).into()
+    }
+}
+
+impl From<std::io::Error> for LabError {
+    fn from(error: std::io::Error) -> Self {
+        Self::of_io(error.to_string(), &error)
+    }
+}
+
+impl From<TableError> for LabError {
+    fn from(error: TableError) -> Self {
+        match error {
+            TableError::Data(text) => Self::Data(text),
+            TableError::File(text) => Self::File(text),
+        }
+    }
+}
 
 impl From<RequestError> for Failure {
     fn from(error: RequestError) -> Self {
         match error {
             RequestError::Config(faults) => faults.into(),
-            RequestError::Lab(error) => Self::new(error.0),
+            RequestError::Lab(error) => Self::new(error.to_string()),
         }
     }
 }

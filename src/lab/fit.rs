@@ -14,6 +14,7 @@ mod nodes;
 mod picture;
 mod prepare;
 mod range;
+mod request;
 mod toml;
 mod verdict;
 
@@ -25,11 +26,12 @@ pub use cells::CellDeviation;
 pub use document::document;
 pub use picture::write as write_plot;
 pub use range::MeasuredRange;
+pub use request::{FitRequest, MAX_SOC_NODES};
 pub use toml::text;
 pub(crate) use toml::{quoted, table as toml_table};
 
 use super::measured::MeasuredFile;
-use crate::cell::{AgedOcv, MAX_BRANCHES, Thermal};
+use crate::cell::{AgedOcv, Thermal};
 use crate::error::LabError;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
@@ -65,56 +67,6 @@ const ELECTRODES_C: f64 = 25.0;
 /// fit of a new cell determines it. 0 = the curve shrinks evenly, 1 = pure loss of lithium. The value was
 /// chosen on two measured whole lives.
 pub const AGEING_SHIFT: f64 = 0.5;
-
-/// What to fit.
-#[derive(Debug, Clone, Default)]
-pub struct FitRequest {
-    /// Display name of the cell.
-    pub name: String,
-    /// Capacity that defines SOC, Ah; `None` = from the slow test or the deepest discharge.
-    pub capacity_ah: Option<f64>,
-    /// Label capacity, Ah; `None` = the capacity.
-    pub rated_ah: Option<f64>,
-    /// Lowest voltage under load, V; `None` = from the data.
-    pub voltage_min_v: Option<f64>,
-    /// Highest voltage under charge, V; `None` = from the data.
-    pub voltage_max_v: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity; `None` = by the electrodes found in a slow test, without them
-    /// 0, of an ageing cell [`AGEING_SHIFT`].
-    pub ageing_shift: Option<f64>,
-    /// Slow tests.
-    pub ocv: Vec<PathBuf>,
-    /// RC branches, 1 to 3; `None` = 2, of an ageing cell 1.
-    pub branches: Option<usize>,
-    /// Starting time constants, s.
-    pub tau_s: Option<Vec<f64>>,
-    /// Temperature breakpoints; `None` = from the data.
-    pub temperature_c: Option<Vec<f64>>,
-    /// SOC breakpoints; `None` = a default set.
-    pub soc: Option<Vec<f64>>,
-    /// Number of first half-cycles of an ageing cell to use; `None` = not an ageing cell.
-    pub first_cycles: Option<usize>,
-    /// Files to fit.
-    pub files: Vec<PathBuf>,
-}
-
-impl FitRequest {
-    /// Checks the lists.
-    ///
-    /// # Errors
-    /// A list that does not rise, or more time constants than a model has branches.
-    pub fn check(&self) -> Result<(), LabError> {
-        for (key, list) in [("--tau", &self.tau_s), ("--temperatures", &self.temperature_c)] {
-            if let Some([a, b]) = list.as_ref().and_then(|list| list.array_windows().find(|[a, b]| a >= b)) {
-                return Err(LabError(format!("{key}: {b} follows {a}, must rise")));
-            }
-        }
-        if self.tau_s.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
-            return Err(LabError(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
-        }
-        Ok(())
-    }
-}
 
 /// Progress of the fit, for a progress bar.
 #[derive(Debug, Clone, Copy)]
@@ -185,11 +137,12 @@ pub struct LogsOutcome {
 /// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
-/// Files that cannot be read or used, and data that do not support a fit: one line each.
+/// A request that [`FitRequest::check`] rejects, files that cannot be read or used, and data that do not support a fit: one line each.
 pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
+    request.check()?;
     let (files, slow) = read_all(request, &mut progress)?;
     let prepared = prepare::prepare(request, &files, &slow)?;
-    let settings = settings(request, &prepared)?;
+    let settings = settings(request, &prepared);
     let (records, scale) = prepared.records(&settings.grid);
     check_range(&records)?;
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(FitProgress::Pass(pass, cost)));
@@ -271,30 +224,24 @@ fn read_all(
     Ok((read, slow))
 }
 
-fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSettings, LabError> {
+fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings {
     let ageing = request.first_cycles.is_some();
-    let tau_s = match (&request.tau_s, request.branches) {
-        (Some(tau_s), Some(branches)) if tau_s.len() != branches => {
-            let found = tau_s.len();
-            return Err(LabError(format!("--tau has {found} values, --branches is {branches}: must agree")));
-        }
-        (Some(tau_s), _) => tau_s.clone(),
-        (None, branches) => TAU_S[branches.unwrap_or(if ageing { 1 } else { 2 }) - 1].to_vec(),
-    };
+    let branches = request.branches.unwrap_or(if ageing { 1 } else { 2 });
+    let tau_s = request.tau_s.clone().unwrap_or_else(|| TAU_S[branches - 1].to_vec());
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
         (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
         (false, Some(_)) => (nodes::by_curvature(&SLOW_TEST_SOC_NODES, &prepared.ocv), PriorDeviations::SLOW_TEST),
         (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
-    Ok(FitSettings {
+    FitSettings {
         grid: Grid { soc: request.soc.clone().unwrap_or(default_soc), temperature_c },
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
         deviations,
-    })
+    }
 }
 
 /// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
@@ -308,7 +255,7 @@ fn check_range(records: &[Record]) -> Result<(), LabError> {
         return Ok(());
     }
     let found = if high > low { format!("SOC {:.2} to {:.2}", low, high) } else { "no usable row".to_owned() };
-    Err(LabError(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
+    Err(LabError::Data(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
 }
 
 fn by_file(

@@ -31,7 +31,7 @@ pub fn in_parallel<T: Sync, R: Send>(
 ) -> Result<Vec<R>, LabError> {
     let threads = jobs.unwrap_or(0).min(items.len().max(1));
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-    let pool = pool.map_err(|error| LabError(format!("threads cannot be started: {error}")))?;
+    let pool = pool.map_err(|error| LabError::Data(format!("threads cannot be started: {error}")))?;
     // One by one: logs differ much in length.
     Ok(pool.install(|| items.par_iter().enumerate().with_max_len(1).map(|(index, item)| work(index, item)).collect()))
 }

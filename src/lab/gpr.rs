@@ -88,7 +88,7 @@ fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<Str
     for row in rows {
         out.write_record(row)?;
     }
-    let file = out.into_inner().map_err(|error| LabError(error.error().to_string()))?;
+    let file = out.into_inner().map_err(|error| LabError::Data(error.error().to_string()))?;
     Ok(file.finish()?)
 }
 

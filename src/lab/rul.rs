@@ -172,11 +172,22 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForeca
     }
 }
 
-/// Forecasts at these parts of the life, judged.
-pub fn score(history: &History, name: &str, threshold: Threshold, at: &[f64], alpha: f64) -> HistoryScore {
+/// Forecasts at these parts of the life, judged. `progress` is called before each; it may unwind to end the work.
+pub fn score(
+    history: &History,
+    name: &str,
+    threshold: Threshold,
+    at: &[f64],
+    alpha: f64,
+    progress: &dyn Fn(),
+) -> HistoryScore {
     let threshold_ah = threshold.ampere_hours(history);
     let end_of_life = end_of_life(history, threshold_ah);
-    let judge = |end: f64| at.iter().map(|&at| judge(history, threshold_ah, end, at, alpha)).collect();
+    let judge_at = |end: f64, at: f64| {
+        progress();
+        judge(history, threshold_ah, end, at, alpha)
+    };
+    let judge = |end: f64| at.iter().map(|&at| judge_at(end, at)).collect();
     HistoryScore {
         name: name.to_owned(),
         axis: history.axis,

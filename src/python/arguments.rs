@@ -1,4 +1,4 @@
-//! Arguments that several doors take: paths, and where a configuration comes from.
+//! Arguments that several functions take: paths, and where a configuration comes from.
 
 use std::path::{Path, PathBuf};
 
@@ -41,6 +41,12 @@ pub(crate) fn cell_source(
     let (chemistry, rated_ah, voltage_min_v, voltage_max_v) = label;
     if chemistry.is_some() && (config.is_some() || cell.is_some()) {
         return Err(error::data("chemistry must not be given together with config or cell, which state it"));
+    }
+    let label = [("rated_ah", rated_ah), ("voltage_min_v", voltage_min_v), ("voltage_max_v", voltage_max_v)];
+    if chemistry.is_none()
+        && let Some((name, _)) = label.iter().find(|(_, value)| value.is_some())
+    {
+        return Err(error::data(format!("{name} must be given together with chemistry")));
     }
     let label = chemistry.map(|chemistry| LabelKeys { chemistry, rated_ah, voltage_min_v, voltage_max_v });
     Ok(CellSource { config, cell, label })

@@ -1,12 +1,23 @@
-//! Arrays from Python: anything that NumPy can see as numbers, without a copy where it is contiguous and of the type already.
+//! Arrays from Python: anything that NumPy sees as numbers, without a copy where it is contiguous, aligned and of the type already.
+//!
+//! Masked reals and missing values are NaN. A whole number is never rounded and never wraps: one that is unknown, has a fraction or is
+//! out of range is a fault with its index. An array of anything but numbers is a fault with its dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
 use arrow_buffer::ScalarBuffer;
 use pyo3::prelude::*;
+use pyo3::types::PyList;
 use pyo3_arrow::PyArray;
 
 use crate::error::data;
+
+/// Kinds of NumPy's dtypes that are numbers: bool, signed, unsigned, real, and objects that each convert to a real.
+const NUMBERS: [&str; 5] = ["b", "i", "u", "f", "O"];
+/// Type of what pandas has in an array of objects where a number is missing.
+const MISSING: &str = "NAType";
+/// Layout that is needed: C order, aligned, a plain array and none of a subclass.
+const LAYOUT: &str = "CAE";
 
 /// Numbers, row after row.
 #[derive(Debug)]
@@ -17,6 +28,8 @@ pub(crate) struct Matrix<T: ArrowPrimitiveType> {
     pub(crate) rows: usize,
     /// Values of a row.
     pub(crate) columns: usize,
+    /// Whether the array has two dimensions.
+    has_columns: bool,
 }
 
 /// Numbers.
@@ -31,21 +44,41 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
     pub(crate) fn row(&self, row: usize) -> &[T::Native] {
         &self.values[row * self.columns..][..self.columns]
     }
+
+    /// The matrix, which must have one column.
+    fn one_column(self, name: &str) -> PyResult<Self> {
+        if self.columns == 1 {
+            Ok(self)
+        } else {
+            Err(data(format!("{name} has {} columns, must have 1", self.columns)))
+        }
+    }
+
+    /// Index of a value, as NumPy writes it.
+    fn index(&self, at: usize) -> String {
+        let (row, column) = (at / self.columns.max(1), at % self.columns.max(1));
+        if self.has_columns { format!("[{row}, {column}]") } else { format!("[{row}]") }
+    }
 }
 
 /// Reals of one or two dimensions; `name` is the argument's.
 pub(crate) fn reals(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
-    matrix(name, "float64", values)
+    matrix(name, &float64(name, values)?)
 }
 
-/// Whole numbers of one dimension.
+/// Reals of one column.
+pub(crate) fn column(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
+    reals(name, values)?.one_column(name)
+}
+
+/// Whole numbers of one column.
 pub(crate) fn words(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Words> {
-    matrix(name, "uint32", values)
+    whole(name, "uint32", values, u32::MAX)?.one_column(name)
 }
 
-/// Bytes of two dimensions.
+/// Bytes of one or two dimensions.
 pub(crate) fn bytes(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Bytes> {
-    matrix(name, "uint8", values)
+    whole(name, "uint8", values, u8::MAX)
 }
 
 /// Checks that an array has as many rows as another.
@@ -57,20 +90,90 @@ pub(crate) fn check_rows(name: &str, rows: usize, of: &str, expected: usize) -> 
     }
 }
 
-fn matrix<T: ArrowPrimitiveType>(name: &str, dtype: &str, values: &Bound<'_, PyAny>) -> PyResult<Matrix<T>> {
-    let py = values.py();
-    let made = py.import("numpy")?.call_method1("ascontiguousarray", (values, dtype));
-    let array = made.map_err(|error| data(format!("{name}: no array of numbers: {error}")))?;
+/// Values as a contiguous array of float64; masked ones are NaN. `name` is for the fault.
+#[pyfunction]
+pub(crate) fn float64<'py>(name: &str, values: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    let numpy = values.py().import("numpy")?;
+    let none = |error: PyErr| data(format!("{name}: no array of numbers: {error}"));
+    let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
+    check_numbers(name, &array)?;
+    if !is_masked(&array)? {
+        // Of the values as given: a column of another library knows its own missing values.
+        return laid_out(values, "float64").map_err(none);
+    }
+    let filled = array.call_method1("astype", ("float64",)).and_then(|array| array.call_method1("filled", (f64::NAN,)));
+    laid_out(&filled.map_err(none)?, "float64")
+}
+
+/// Whole numbers from 0 to `most`, the largest of `T`: as they are where they are of that dtype, else checked one by one.
+fn whole<T>(name: &str, dtype: &str, values: &Bound<'_, PyAny>, most: T::Native) -> PyResult<Matrix<T>>
+where
+    T: ArrowPrimitiveType,
+    T::Native: TryFrom<u64> + std::fmt::Display,
+{
+    if let Ok(found) = values.getattr("dtype")
+        && found.eq(dtype)?
+        && !is_masked(values)?
+    {
+        return matrix(name, &laid_out(values, dtype)?);
+    }
+    let found = reals(name, values)?;
+    let converted = |(at, value): (usize, &f64)| {
+        // Exact: `as` keeps every whole number that both types have, and the comparison rejects all others, NaN too.
+        let whole = Some(*value as u64).filter(|whole| *whole as f64 == *value);
+        whole.and_then(|whole| T::Native::try_from(whole).ok()).ok_or_else(|| {
+            data(format!("{name}{} = {value}, must be a whole number from 0 to {most}", found.index(at)))
+        })
+    };
+    let whole = found.values.iter().enumerate().map(converted).collect::<PyResult<Vec<T::Native>>>()?;
+    let Reals { rows, columns, has_columns, .. } = found;
+    Ok(Matrix { values: ScalarBuffer::from(whole), rows, columns, has_columns })
+}
+
+fn is_masked(array: &Bound<'_, PyAny>) -> PyResult<bool> {
+    array.py().import("numpy.ma")?.call_method1("isMaskedArray", (array,))?.extract()
+}
+
+/// Rejects an array of texts, times, complex numbers or records: NumPy and pandas convert some of them to reals without a word.
+fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
+    let dtype = array.getattr("dtype")?;
+    let kind: String = dtype.getattr("kind")?.extract()?;
+    let refused = |what: String| Err(data(format!("{name} is an array of {what}, must be one of numbers")));
+    if !NUMBERS.contains(&kind.as_str()) {
+        return refused(dtype.str()?.to_string());
+    }
+    if kind == "O" {
+        let objects = array.call_method0("ravel")?.call_method0("tolist")?;
+        for object in objects.cast::<PyList>()? {
+            let kind = object.get_type().name()?;
+            let is_number = object.hasattr("__float__")? || object.hasattr("__index__")?;
+            if !is_number && !object.is_none() && kind != MISSING {
+                return refused(kind.to_string());
+            }
+        }
+    }
+    Ok(())
+}
+
+fn laid_out<'py>(values: &Bound<'py, PyAny>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
+    let array = values.py().import("numpy")?.call_method1("require", (values, dtype, LAYOUT))?;
+    // A single number is an array of one.
+    if array.getattr("ndim")?.eq(0)? { array.call_method1("reshape", (-1,)) } else { Ok(array) }
+}
+
+/// A matrix of an array that has its dtype and the layout.
+fn matrix<T: ArrowPrimitiveType>(name: &str, array: &Bound<'_, PyAny>) -> PyResult<Matrix<T>> {
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
     let (rows, columns) = match shape[..] {
         [rows] => (rows, 1),
         [rows, columns] => (rows, columns),
         _ => return Err(data(format!("{name} has {} dimensions, must have 1 or 2", shape.len()))),
     };
+    let has_columns = shape.len() == 2;
     if rows * columns == 0 {
-        return Ok(Matrix { values: ScalarBuffer::from(Vec::new()), rows, columns });
+        return Ok(Matrix { values: ScalarBuffer::from(Vec::new()), rows, columns, has_columns });
     }
     let array: PyArray = array.call_method1("reshape", (-1,))?.extract()?;
     let values = array.array().as_primitive::<T>().values().clone();
-    Ok(Matrix { values, rows, columns })
+    Ok(Matrix { values, rows, columns, has_columns })
 }

@@ -101,7 +101,7 @@ impl CellModel {
     /// The model at these SOC and this temperature: open-circuit voltage, series and branch resistances, time constants.
     #[pyo3(signature = (soc, temperature_c=25.0))]
     fn table(&self, soc: &Bound<'_, PyAny>, temperature_c: f64) -> PyResult<Table> {
-        let (soc, model) = (arrays::reals("soc", soc)?, self.model());
+        let (soc, model) = (arrays::column("soc", soc)?, self.model());
         if let Some(found) = soc.values.iter().find(|soc| !(0.0..=1.0).contains(*soc)) {
             return Err(data(format!("soc: found {found}, must be fractions from 0 to 1")));
         }

@@ -3,16 +3,13 @@
 use std::fmt::Display;
 
 use packwatch_host::config::ConfigFaults;
-use packwatch_lab::error::RequestError;
+use packwatch_lab::error::{LabError, RequestError};
 use pyo3::PyErr;
 
 // Their bases are ValueError and OSError, besides the class they share: so they are defined in Python.
 pyo3::import_exception!(packwatch._errors, ConfigError);
 pyo3::import_exception!(packwatch._errors, DataError);
 pyo3::import_exception!(packwatch._errors, FileError);
-
-/// In the text of every error of the operating system.
-const OF_THE_SYSTEM: &str = "(os error ";
 
 /// A fault of data or arguments.
 pub(crate) fn data(error: impl Display) -> PyErr {
@@ -30,10 +27,12 @@ pub(crate) fn config(faults: ConfigFaults) -> PyErr {
     ConfigError::new_err((text, faults.0))
 }
 
-/// An error of the library, which is a text: of a file where the operating system gave it, else of data.
-pub(crate) fn of_library(error: impl Display) -> PyErr {
-    let text = error.to_string();
-    if text.contains(OF_THE_SYSTEM) { file(text) } else { data(text) }
+/// An error of the library.
+pub(crate) fn of_library(error: impl Into<LabError>) -> PyErr {
+    match error.into() {
+        LabError::Data(text) => data(text),
+        LabError::File(text) => file(text),
+    }
 }
 
 /// An error of a request.

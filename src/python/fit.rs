@@ -103,7 +103,6 @@ pub(crate) fn fit(
         first_cycles,
         files: files.list(),
     };
-    request.check().map_err(of_library)?;
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };
     let outcome = work::run(py, shown, |work| {

@@ -8,7 +8,7 @@ use packwatch_regress::{Basis, FitProgress, GprSettings, Kernel, ProgressCallbac
 use pyo3::prelude::*;
 
 use crate::arrays::{self, check_rows};
-use crate::error::{data, file, of_library};
+use crate::error::{data, of_library};
 use crate::table::{Table, reals};
 use crate::work::{self, Progress};
 
@@ -39,7 +39,7 @@ impl GaussianProcess {
         progress: bool,
     ) -> PyResult<Self> {
         let inputs = arrays::reals("inputs", inputs)?;
-        let targets = arrays::reals("output", output)?;
+        let targets = arrays::column("output", output)?;
         check_rows("output", targets.rows, "inputs", inputs.rows)?;
         check_known("inputs", &inputs)?;
         check_known("output", &targets)?;
@@ -89,7 +89,7 @@ impl GaussianProcess {
 
     /// Writes the model, completely or not at all; it holds the rows it learned from.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
-        py.detach(|| self.0.save(&path)).map_err(file)
+        py.detach(|| self.0.save(&path)).map_err(of_library)
     }
 
     /// Predicts rows: mean, standard deviation of a measurement, and the ends of its 95 % interval.

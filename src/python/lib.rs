@@ -1,4 +1,4 @@
-//! The Python module `packwatch._packwatch`: doors to the library that the command line uses too.
+//! The Python module `packwatch._packwatch`: the library that the command line uses too, as classes and functions.
 //!
 //! In: paths, NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Out: Arrow tables, texts and dictionaries, the
 //! same as the command line writes. A value that is not known is null or NaN, never a default number. Bad input is a Python exception
@@ -10,7 +10,8 @@
 //! | `outputs.rs`, `table.rs` | what comes out: estimates, events, frames as Arrow tables |
 //! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
 //! | `cell_model.rs`, `measured.rs` | cell models, measured files |
-//! | `arrays.rs`, `work.rs`, `error.rs`, `arguments.rs` | arrays in, progress and Ctrl-C, exceptions, arguments shared |
+//! | `arrays.rs`, `error.rs`, `arguments.rs` | arrays in, exceptions, arguments shared |
+//! | `work.rs`, `turn.rs` | progress and Ctrl-C, one call of a monitor at a time |
 
 mod arguments;
 mod arrays;
@@ -25,6 +26,7 @@ mod replay;
 mod rul;
 mod score;
 mod table;
+mod turn;
 mod work;
 
 use pyo3::prelude::*;
@@ -41,6 +43,7 @@ fn _packwatch(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<replay::Replay>()?;
     module.add_class::<score::Score>()?;
     module.add_class::<table::Table>()?;
+    module.add_function(wrap_pyfunction!(arrays::float64, module)?)?;
     module.add_function(wrap_pyfunction!(fit::fit, module)?)?;
     module.add_function(wrap_pyfunction!(measured::read, module)?)?;
     module.add_function(wrap_pyfunction!(replay::replay, module)?)?;

@@ -1,10 +1,10 @@
 //! `Monitor`: rows or frames in, tables out.
 //!
 //! A row becomes the frames that would have carried it, with the resolution of the configured signals, as in a replay of a CSV file:
-//! the same rows give the same estimates as `packwatch replay`.
+//! the same rows give the same estimates as `packwatch replay`. After Ctrl-C, what was taken stays taken: its outputs come with those of
+//! the next call.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use packwatch_host::can::decode::{Channel, SensorIndex};
 use packwatch_host::can::{CanId, Frame};
@@ -12,12 +12,14 @@ use packwatch_host::config::Config;
 use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
 use packwatch_host::replay::MonitorDriver;
 use packwatch_host::sample::VoltageSource;
+use packwatch_lab::single_cell::CellSource;
 use pyo3::prelude::*;
 
 use crate::arguments::{cell_source, of_text};
 use crate::arrays::{self, Reals, check_rows};
 use crate::error::{config as config_error, data};
 use crate::outputs::{Columns, Outputs, Wanted};
+use crate::turn::Turns;
 use crate::work::{self, Progress, Work};
 
 /// Rows between two reports of progress.
@@ -28,13 +30,14 @@ const EXTENDED: u32 = 0x8000_0000;
 /// The monitor of a pack.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Monitor {
-    state: Mutex<State>,
+    state: Turns,
     interfaces: Vec<String>,
     cells: u16,
     is_pack_total: bool,
 }
 
-struct State {
+/// What the inputs so far have made of it.
+pub(crate) struct State {
     driver: MonitorDriver,
     columns: Columns,
     wanted: Wanted,
@@ -65,18 +68,18 @@ impl Monitor {
             return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));
         }
         let wanted = Wanted::new(estimates_period_s)?;
+        let source = cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?;
+        let is_cell = source != CellSource::default();
         let config = match &text {
-            Some(_) if config.is_some() || cell.is_some() || chemistry.is_some() => {
+            Some(_) if is_cell => {
                 return Err(data("text must not be given together with config, cell or chemistry"));
             }
             Some(text) => of_text(text, folder.as_deref().unwrap_or(Path::new("")))?,
-            None if config.is_none() && cell.is_none() && chemistry.is_none() => {
-                return Err(data("no configuration: config, text, cell or chemistry must be given"));
+            None if folder.is_some() => {
+                return Err(data("folder must be given together with text, whose files are there"));
             }
-            None => {
-                let source = cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?;
-                py.detach(|| source.load()).map_err(config_error)?
-            }
+            None if !is_cell => return Err(data("no configuration: config, text, cell or chemistry must be given")),
+            None => py.detach(|| source.load()).map_err(config_error)?,
         };
         Ok(Self::of(&config, sleep_gap_s, wanted))
     }
@@ -95,8 +98,8 @@ impl Monitor {
 
     /// Values of rows that no frame of the configuration can carry, so far.
     #[getter]
-    fn uncarried_values(&self) -> usize {
-        self.state().driver.uncarried_values
+    fn uncarried_values(&self, py: Python<'_>) -> PyResult<usize> {
+        Ok(self.state.wait(py)?.driver.uncarried_values)
     }
 
     /// Takes rows.
@@ -112,7 +115,7 @@ impl Monitor {
     ) -> PyResult<Outputs> {
         let time_s = times(time_s)?;
         let input = RowInput {
-            current_a: arrays::reals("current_a", current_a)?,
+            current_a: arrays::column("current_a", current_a)?,
             voltage_v: arrays::reals("voltage_v", voltage_v)?,
             temperature_c: temperature_c.map(|values| arrays::reals("temperature_c", values)).transpose()?,
             is_pack_total: self.is_pack_total,
@@ -163,14 +166,14 @@ impl Monitor {
         if !time_s.is_finite() {
             return Err(data(format!("time_s = {time_s}, must be a finite number")));
         }
-        let mut state = self.state();
+        let mut state = self.state.wait(py)?;
         state.driver.handle_unknown_gap(Timestamp::from_secs(time_s));
         state.finish(py, &self.interfaces)
     }
 
     /// Ends the record: its last samples become estimates.
     fn finish(&self, py: Python<'_>) -> PyResult<Outputs> {
-        let mut state = self.state();
+        let mut state = self.state.wait(py)?;
         state.driver.finish();
         state.finish(py, &self.interfaces)
     }
@@ -184,13 +187,8 @@ impl Monitor {
             interfaces: config.interface_names(),
             cells: sample.cells,
             is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            state: Mutex::new(State { driver, columns: Columns::default(), wanted, cells: sample.cells.into() }),
+            state: Turns::new(State { driver, columns: Columns::default(), wanted, cells: sample.cells.into() }),
         }
-    }
-
-    /// The state; a panic in an earlier call has left it whole enough to be read.
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn bus(&self, interface: Option<&str>) -> PyResult<BusIndex> {
@@ -209,8 +207,10 @@ impl Monitor {
         take: impl FnOnce(&mut State, &Work) + Send,
     ) -> PyResult<Outputs> {
         let progress = Progress { is_shown, total: Some(rows as u64), unit: "row" };
-        work::run(py, progress, |work| take(&mut self.state(), work))?;
-        self.state().finish(py, &self.interfaces)
+        let mut turn = self.state.wait(py)?;
+        let state: &mut State = &mut turn;
+        work::run(py, progress, |work| take(state, work))?;
+        turn.finish(py, &self.interfaces)
     }
 }
 
@@ -258,8 +258,8 @@ impl RowInput {
         }
         let most = usize::from(u16::MAX);
         let sensors = self.temperature_c.as_ref().map_or(0, |of| of.columns);
-        if self.current_a.columns != 1 || sensors > most {
-            return Err(data(format!("current_a must have 1 column, temperature_c at most {most}")));
+        if sensors > most {
+            return Err(data(format!("temperature_c has {sensors} columns, must have at most {most}")));
         }
         Ok(())
     }
@@ -295,10 +295,9 @@ fn report(row: usize, work: &Work) {
 
 /// Times, which must be known.
 fn times(time_s: &Bound<'_, PyAny>) -> PyResult<Reals> {
-    let time_s = arrays::reals("time_s", time_s)?;
+    let time_s = arrays::column("time_s", time_s)?;
     match time_s.values.iter().position(|time_s| !time_s.is_finite()) {
         Some(row) => Err(data(format!("time_s[{row}] = {}, must be a finite number", time_s.values[row]))),
-        None if time_s.columns != 1 => Err(data(format!("time_s has {} columns, must have 1", time_s.columns))),
         None => Ok(time_s),
     }
 }

@@ -111,7 +111,7 @@ struct EstimateColumns {
     /// Time of the record's first estimate, and the period of each cell's last row.
     first: Option<Timestamp>,
     periods: Vec<Option<i64>>,
-    /// The latest period with a row, and how many cells have one in it.
+    /// The period of the last row, and how many cells have one in it.
     latest: Option<(i64, usize)>,
 }
 
@@ -145,7 +145,7 @@ impl EstimateColumns {
         self.reals.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
     }
 
-    /// Whether it is its cell's first of a period since the record's start.
+    /// Whether it is its cell's first of a period since the record's start. After the clock went back, periods begin again.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);
@@ -153,11 +153,11 @@ impl EstimateColumns {
         if self.periods.len() <= cell {
             self.periods.resize(cell + 1, None);
         }
-        let begins = self.periods[cell].is_none_or(|last| period > last);
+        let begins = self.periods[cell].is_none_or(|last| period != last);
         if begins {
             self.periods[cell] = Some(period);
             let (latest, cells) = self.latest.unwrap_or((period, 0));
-            self.latest = if period > latest { Some((period, 1)) } else { Some((latest, cells + 1)) };
+            self.latest = if period == latest { Some((latest, cells + 1)) } else { Some((period, 1)) };
         }
         begins
     }
@@ -165,7 +165,7 @@ impl EstimateColumns {
     /// Whether an estimate of `time` may become a row.
     fn wants(&self, period_ns: i64, time: Timestamp, cells: usize) -> bool {
         let (Some(first), Some((latest, done))) = (self.first, self.latest) else { return true };
-        done < cells || time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns) > latest
+        done < cells || time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns) != latest
     }
 
     fn finish(&mut self) -> PyResult<Table> {

@@ -87,6 +87,9 @@ pub(crate) fn replay(
     let columns = columns.unwrap_or_default().into_iter().collect();
     let reading = LogReading { strict, columns, charge_positive, start_times };
     let logs = logs.list();
+    if logs.is_empty() {
+        return Err(data("no logs, must be one or more"));
+    }
     let config = py.detach(|| config::load(&config)).map_err(error::config)?;
     let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
     let result = work::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
@@ -127,6 +130,7 @@ fn of_replay(failure: ReplayError) -> PyErr {
             PyBrokenPipeError::new_err(error.to_string())
         }
         ReplayError::Write(error) => error::file(error),
-        failure => error::of_library(failure),
+        ReplayError::Log(error) => error::of_library(error),
+        failure => data(failure),
     }
 }

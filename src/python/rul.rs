@@ -1,5 +1,7 @@
 //! `rul`: remaining useful life of measured capacity histories.
 
+use std::path::PathBuf;
+
 use packwatch_host::io::paths::{check_distinct, short_names};
 use packwatch_lab::error::LabError;
 use packwatch_lab::rul::{self as lab_rul, History, Threshold};
@@ -7,7 +9,7 @@ use pyo3::prelude::*;
 
 use crate::arguments::Paths;
 use crate::error::{data, of_library};
-use crate::work::{self, Progress};
+use crate::work::{self, Progress, Work};
 
 /// An end of life: Ah, or a text like "70 %".
 #[derive(FromPyObject)]
@@ -33,35 +35,51 @@ pub(crate) fn rul<'py>(
     at: Option<Vec<f64>>,
     alpha: f64,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let (files, at) = (files.list(), at.unwrap_or_default());
+    let files = files.list();
     let ends = match end_of_life {
         Ends::One(end) => vec![end],
         Ends::Several(ends) => ends,
     };
     let thresholds = ends.into_iter().map(End::threshold).collect::<PyResult<Vec<Threshold>>>()?;
-    if let Some(part) = at.iter().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
+    if let Some(part) = at.iter().flatten().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
         return Err(data(format!("at and alpha: found {part}, must be above 0 and below 1")));
     }
+    for (name, is_empty) in [
+        ("files", files.is_empty()),
+        ("end_of_life", thresholds.is_empty()),
+        ("at", at.as_ref().is_some_and(Vec::is_empty)),
+    ] {
+        if is_empty {
+            return Err(data(format!("no {name}, must be one or more")));
+        }
+    }
     check_distinct(&files).map_err(data)?;
-    let document =
-        work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| -> Result<String, LabError> {
-            let mut histories = Vec::new();
-            for (path, name) in files.iter().zip(short_names(&files)) {
-                histories.push((History::read(path)?, name));
-            }
-            let all =
-                histories.iter().flat_map(|(history, name)| thresholds.iter().map(move |end| (history, name, *end)));
-            if at.is_empty() {
-                return lab_rul::now_json(
-                    &all.map(|(history, name, end)| lab_rul::now(history, name, end)).collect::<Vec<_>>(),
-                );
-            }
-            let scored: Vec<_> =
-                all.map(|(history, name, end)| lab_rul::score(history, name, end, &at, alpha)).collect();
-            lab_rul::scored_json(&scored, alpha)
-        })?;
+    let document = work::run(py, Progress::hidden(), |work| document(&files, &thresholds, at.as_deref(), alpha, work))?;
     let document = document.map_err(of_library)?;
     py.import("json")?.call_method1("loads", (document,))
+}
+
+/// The document: forecasts at the end, or judged ones at parts of the life.
+fn document(
+    files: &[PathBuf],
+    thresholds: &[Threshold],
+    at: Option<&[f64]>,
+    alpha: f64,
+    work: &Work,
+) -> Result<String, LabError> {
+    let progress = || work.advance(1);
+    let (mut now, mut scored) = (Vec::new(), Vec::new());
+    for (path, name) in files.iter().zip(short_names(files)) {
+        let history = History::read(path)?;
+        for &end in thresholds {
+            progress();
+            match at {
+                None => now.push(lab_rul::now(&history, &name, end)),
+                Some(at) => scored.push(lab_rul::score(&history, &name, end, at, alpha, &progress)),
+            }
+        }
+    }
+    if at.is_none() { lab_rul::now_json(&now) } else { lab_rul::scored_json(&scored, alpha) }
 }
 
 impl End {

@@ -100,6 +100,9 @@ pub(crate) fn score(
     plots: Option<PathBuf>,
     progress: bool,
 ) -> PyResult<Score> {
+    if seeds.is_some() && window.is_none() {
+        return Err(data("seeds must be given together with window"));
+    }
     let usual = ScoreRequest::default();
     let numbers = |given: Option<Numbers>, usual: Vec<f64>| given.map_or(usual, Numbers::list);
     let request = ScoreRequest {
@@ -129,7 +132,7 @@ pub(crate) fn score(
 
 fn run(py: Python<'_>, request: &ScoreRequest, is_shown: bool) -> PyResult<Score> {
     let sizes: Vec<f64> = request.files.iter().map(|path| bytes(std::slice::from_ref(path)) as f64).collect();
-    let prepared = work::run(py, Progress { is_shown: false, total: None, unit: "" }, |_| request.prepare())?;
+    let prepared = work::run(py, Progress::hidden(), |work| request.prepare(&|| work.advance(1)))?;
     let prepared = prepared.map_err(of_request)?;
     let progress = Progress { is_shown, total: Some(bytes(&request.files)), unit: "B" };
     let report = work::run(py, progress, |work| {

@@ -45,6 +45,13 @@ pub(crate) struct Progress<'a> {
     pub(crate) unit: &'a str,
 }
 
+impl Progress<'_> {
+    /// No bar.
+    pub(crate) fn hidden() -> Self {
+        Self { is_shown: false, total: None, unit: "" }
+    }
+}
+
 /// Runs work.
 pub(crate) fn run<T: Send>(
     py: Python<'_>,

@@ -80,6 +80,10 @@ fn unusable_data_are_refused_with_the_reason() {
     assert_eq!(disagree, "--tau has 1 values, --branches is 2: must agree\n");
     let falling = refused(folder.path(), &["--temperatures", "25,0", &path("pulses.csv")]);
     assert_eq!(falling, "--temperatures: 0 follows 25, must rise\n");
+    let many = refused(folder.path(), &["--branches", "4", &path("pulses.csv")]);
+    assert_eq!(many, "--branches = 4, must be 1 to 3\n");
+    let open = refused(folder.path(), &["--soc-nodes", "0,0.5", &path("pulses.csv")]);
+    assert_eq!(open, "--soc-nodes = 0.5, must be a list that ends with 1\n");
 }
 
 #[test]

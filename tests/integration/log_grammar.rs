@@ -306,7 +306,7 @@ fn bad_lines_are_counted_and_the_first_is_shown() {
         "{first}"
     );
     let strict = read(&[path], true, |_| {}).expect_err("strict");
-    assert_eq!(strict.0, first);
+    assert_eq!(strict.to_string(), first);
 }
 
 #[test]
@@ -430,7 +430,7 @@ fn broken_journal_lines_are_bad_lines() {
     let (records, counts) = read(&[file(folder.path(), "j", text)], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines, counts.ignored_lines), (1, 3, 2));
     let newer = file(folder.path(), "n", b"PACKWATCH-JOURNAL 2\n");
-    assert!(read(&[newer], false, |_| {}).expect_err("another version").0.contains("this program reads"));
+    assert!(read(&[newer], false, |_| {}).expect_err("another version").to_string().contains("this program reads"));
 }
 
 #[test]
@@ -461,7 +461,9 @@ fn csv_columns_can_be_mapped_and_a_missing_one_is_named() {
     let path = file(folder.path(), "a.csv", b"t,I (A),U1,U2\n0,1,3,4\n");
     let error = read(std::slice::from_ref(&path), false, |_| {}).expect_err("no such column");
     assert!(
-        error.0.ends_with("a.csv:1: no column time_s for time, found t,I (A),U1,U2 (map it with --column time=NAME)"),
+        error
+            .to_string()
+            .ends_with("a.csv:1: no column time_s for time, found t,I (A),U1,U2 (map it with --column time=NAME)"),
         "{error}"
     );
     let columns = [("time", "t"), ("current", "I (A)"), ("voltage{n}", "U{n}")].map(|(r, c)| (r.into(), c.into()));

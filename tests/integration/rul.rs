@@ -36,7 +36,7 @@ fn forecasts_of_measured_lives_cover_the_truth_and_beat_both_baselines() {
         for file in files.iter().filter(|file| file.to_string_lossy().ends_with(ending)) {
             let history = History::read(file).unwrap();
             let name = file.file_stem().unwrap().to_string_lossy();
-            scored.extend(thresholds.iter().map(|&t| rul::score(&history, &name, t, &AT, ALPHA)));
+            scored.extend(thresholds.iter().map(|&t| rul::score(&history, &name, t, &AT, ALPHA, &|| ())));
         }
     }
     if scored.is_empty() {
@@ -137,7 +137,7 @@ fn fades_of_many_shapes_lie_in_the_interval_as_often_as_it_says() {
             let scored: Vec<HistoryScore> = (0..6)
                 .map(|_| {
                     let (history, end_ah) = life(shape, axis, &mut dice);
-                    rul::score(&history, "simulated", Threshold::AmpereHours(end_ah), &AT, ALPHA)
+                    rul::score(&history, "simulated", Threshold::AmpereHours(end_ah), &AT, ALPHA, &|| ())
                 })
                 .collect();
             let total = rul::total(&scored).unwrap();

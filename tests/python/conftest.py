@@ -4,7 +4,10 @@ PACKWATCH_BIN: the program, default target/release/packwatch. PACKWATCH_DATA: me
 """
 
 import os
+import signal
 import subprocess
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,6 +62,28 @@ def data() -> Path:
     if "PACKWATCH_DATA" not in os.environ:
         pytest.skip("no measured data (PACKWATCH_DATA)")
     return Path(os.environ["PACKWATCH_DATA"])
+
+
+class Interrupt(Exception):
+    """What the signal handler of :func:`interrupted` raises."""
+
+
+def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
+    """Calls, with a signal whose handler raises, as Ctrl-C's does; seconds from the signal to the end of the call."""
+
+    def handle(*_):
+        raise Interrupt
+
+    before = signal.signal(signal.SIGALRM, handle)
+    signal.setitimer(signal.ITIMER_REAL, after_s)
+    begin = time.monotonic()
+    try:
+        with pytest.raises(Interrupt):
+            call()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    return time.monotonic() - begin - after_s
 
 
 def read_csv(path: Path) -> dict[str, list]:

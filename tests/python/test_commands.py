@@ -1,4 +1,4 @@
-"""The doors of the commands: the same bytes, the same files, and exceptions with the same text."""
+"""The Python functions of the commands: the same bytes, the same files, and exceptions with the same text."""
 
 import json
 import subprocess
@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import BINARY, CELL, CONFIG, assert_same_estimates, packwatch
+from conftest import BINARY, CELL, CONFIG, assert_same_estimates, interrupted, packwatch
 
 import packwatch as pw
 
@@ -20,16 +20,60 @@ def test_score_gives_the_bytes_of_the_command(record):
     assert score.scores[0]["soc"]["samples"] == 8940
 
 
-def test_every_argument_of_score_reaches_it(record, tmp_path):
+def test_every_case_of_score_has_a_plot(record, tmp_path):
     score = pw.score(
-        record.csv, cell=CELL, start=["full", "middle"], remove=0.15, soc_error_points=[None, -5.0], soc_std_points=6.0,
-        capacity_error_percent=[0.0, 5.0], capacity_std_percent=4.0, current_offset_a=0.05, settle_s=120.0, truth_capacity_ah=2.6,
-        sleep_gap_s=30.0, plots=tmp_path / "plots", learn=[record.csv],
+        record.csv, cell=CELL, start=["full", "middle"], soc_error_points=[None, -5.0], capacity_error_percent=[0.0, 5.0],
+        plots=tmp_path / "plots",
     )  # fmt: skip
-    arguments = "--start full,middle --remove 0.15 --told none,-5 --soc-std 6 --capacity-error 0,5 --capacity-std 4 --current-offset 0.05"
-    arguments += f" --settle 120 --truth-capacity 2.6 --sleep-gap 30 --plot {tmp_path}/plots --learn {record.csv} --json"
+    arguments = f"--start full,middle --told none,-5 --capacity-error 0,5 --plot {tmp_path}/plots --json"
     assert score.json() == packwatch("score", record.csv, "--cell", CELL, *arguments.split())
     assert len(score.scores) == 8 and len(list((tmp_path / "plots").glob("*.svg"))) == 8
+
+
+def assert_last_argument_counts(file, given, options, **known):
+    """The call gives what the command gives with these options, and something else without the last argument."""
+    files = [word for option, path in known.items() for word in (f"--{option}", path)]
+    score = pw.score(file, **known, **given)
+    assert score.json() == packwatch("score", file, *files, *options.split(), "--json")
+    without = dict(list(given.items())[:-1])
+    assert score.scores != pw.score(file, **known, **without).scores
+
+
+@pytest.mark.parametrize(
+    ("given", "options"),
+    [
+        ({"start": "middle"}, "--start middle"),
+        ({"start": "middle", "remove": 0.15}, "--start middle --remove 0.15"),
+        ({"soc_error_points": [None, -5.0]}, "--told none,-5"),
+        ({"soc_error_points": -5.0, "soc_std_points": 6.0}, "--told -5 --soc-std 6"),
+        ({"capacity_error_percent": [0.0, 5.0]}, "--capacity-error 0,5"),
+        ({"capacity_error_percent": 5.0, "capacity_std_percent": 4.0}, "--capacity-error 5 --capacity-std 4"),
+        ({"current_offset_a": 0.05}, "--current-offset 0.05"),
+        ({"settle_s": 120.0}, "--settle 120"),
+        ({"truth_capacity_ah": 2.5}, "--truth-capacity 2.5"),
+        ({"sleep_gap_s": 1000.0}, "--sleep-gap 1000"),
+        ({"learn": ["cell.csv"]}, "--learn cell.csv"),
+    ],
+)
+def test_every_argument_of_score_changes_it_as_the_option_does(record, tmp_path, monkeypatch, given, options):
+    monkeypatch.chdir(tmp_path)
+    rows = record.csv.read_text().splitlines(keepends=True)
+    (tmp_path / "cell.csv").write_text("".join(rows[:3000] + rows[3200:]))  # a gap of 200 s
+    assert_last_argument_counts("cell.csv", given, options, cell=CELL)
+
+
+@pytest.mark.parametrize(
+    ("given", "options"),
+    [
+        ({"load": (2.0, 24.0, 2.7), "threshold_ah": 1.6}, "--load 2,24,2.7 --threshold 1.6"),
+        ({"load": (2.0, 24.0, 2.7), "skip_cycles": 50}, "--load 2,24,2.7 --skip-cycles 50"),
+        ({"load": (2.0, 24.0, 2.7), "window": (0.4, 0.7)}, "--load 2,24,2.7 --window 0.4,0.7"),
+        ({"load": (2.0, 24.0, 2.7), "window": (0.4, 0.7), "seeds": [5]}, "--load 2,24,2.7 --window 0.4,0.7 --seed 5"),
+    ],
+)
+def test_every_argument_of_a_life_changes_it_as_the_option_does(data, given, options):
+    life, cycles = (data / "nasa_pcoe_aging" / name for name in ("B0005.csv.gz", "B0005_cycles.csv"))
+    assert_last_argument_counts(life, given, options, cell=CONFIG / "cells/nasa_b0005.toml", cycles=cycles)
 
 
 def test_score_of_a_panasonic_drive_gives_the_bytes_of_the_command(data):
@@ -127,6 +171,8 @@ CSV_FAULT = "time_s,current_a,voltage_v,discharged_ah\n0,1,3.9,0\n1,x,3.9,0\n"
         (pw.FileError, OSError, lambda f: pw.score(f / "no.csv", cell=CELL), ["score", "no.csv", "--cell", CELL]),
         (pw.FileError, OSError, lambda f: pw.replay(PAPER, f / "no.log"), ["replay", "-c", PAPER, "no.log"]),
         (pw.FileError, OSError, lambda f: pw.rul(f / "no.csv", 1.4), ["rul", "no.csv", "--end-of-life", "1.4"]),
+        (pw.DataError, ValueError, lambda f: pw.fit(f / "bad.csv", "x", branches=4), ["fit", "bad.csv", "--name", "x", "--out", "m.toml", "--branches", "4"]),
+        (pw.DataError, ValueError, lambda f: pw.fit(f / "bad.csv", "x", soc_nodes=[0.1, 1.0]), ["fit", "bad.csv", "--name", "x", "--out", "m.toml", "--soc-nodes", "0.1,1"]),
         (pw.FileError, OSError, lambda f: pw.fit(f / "no.csv", "x"), ["fit", "no.csv", "--name", "x", "--out", "m.toml"]),
         (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", cell=CELL), ["score", "bad.csv", "--cell", CELL]),
         (pw.DataError, ValueError, lambda f: pw.score(f / "bad.csv", config=f / "pack.toml"), ["score", "bad.csv", "-c", "pack.toml"]),
@@ -141,13 +187,24 @@ def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases,
     pack = (CONFIG / "example.toml").read_text().replace('"pack96.dbc"', f'"{CONFIG}/pack96.dbc"')
     (tmp_path / "pack.toml").write_text(pack.replace('"cells/', f'"{CONFIG}/cells/'))
     done = subprocess.run([BINARY, *map(str, command)], capture_output=True, text=True, timeout=60)
-    assert done.returncode != 0
+    assert done.returncode == (78 if kind is pw.ConfigError else 1) and done.stdout == ""
     with pytest.raises(kind) as caught:
         call(type(tmp_path)())
-    assert str(caught.value) == (done.stderr or done.stdout).removesuffix("\n")
-    assert isinstance(caught.value, (bases, pw.PackwatchError)) and issubclass(kind, bases)
+    assert type(caught.value) is kind and f"{caught.value}\n" == done.stderr != "\n"
+    assert issubclass(kind, bases) and issubclass(kind, pw.PackwatchError)
     if kind is pw.ConfigError:
         assert caught.value.faults == str(caught.value).splitlines()
+
+
+def test_the_text_of_an_error_does_not_say_whose_it_is(tmp_path):
+    path = tmp_path / "a (os error 2).csv"
+    path.write_text(CSV_FAULT)
+    with pytest.raises(pw.DataError, match=r"\(os error 2\).csv:3"):
+        pw.read(path)
+    (tmp_path / "folder.csv").mkdir()
+    for call in (pw.read, lambda path: pw.replay(PAPER, path), pw.gp.load):
+        with pytest.raises(pw.FileError, match="folder.csv: .*Is a directory"):
+            call(tmp_path / "folder.csv")
 
 
 @pytest.mark.parametrize(
@@ -162,10 +219,38 @@ def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases,
         (lambda: pw.score("a.csv", cell=CELL, window=(0.7, 0.4)), "window = 0.7, 0.4, must be two parts above 0 and at most 1, the smaller first"),
         (lambda: pw.rul("a.csv", "soon"), 'end_of_life "soon": must be Ah above 0 like 1.4, or per cent'),
         (lambda: pw.rul("a.csv", 1.4, at=[1.0]), "at and alpha: found 1, must be above 0 and below 1"),
+        (lambda: pw.rul("a.csv", 1.4, at=[]), "no at, must be one or more"),
+        (lambda: pw.rul("a.csv", []), "no end_of_life, must be one or more"),
+        (lambda: pw.rul([], 1.4), "no files, must be one or more"),
+        (lambda: pw.replay(PAPER, []), "no logs, must be one or more"),
+        (lambda: pw.score([], cell=CELL), "no files, must be one or more"),
+        (lambda: pw.score("a.csv", cell=CELL, start=[]), "no start, must be one or more"),
+        (lambda: pw.score("a.csv", cell=CELL, soc_error_points=[]), "no soc_error_points, must be one or more"),
+        (lambda: pw.score("a.csv", cell=CELL, rated_ah=2.6), "rated_ah must be given together with chemistry"),
+        (lambda: pw.score("a.csv", cell=CELL, voltage_max_v=4.1), "voltage_max_v must be given together with chemistry"),
+        (lambda: pw.score("a.csv", cell=CELL, seeds=[2]), "seeds must be given together with window"),
+        (lambda: pw.score("a.csv", cell=CELL, learn="a.csv", cycles="b.csv"), "learn must not be given together with cycles"),
+        (lambda: pw.fit([], "x"), "no files, must be one or more"),
         (lambda: pw.fit("a.csv", "x", tau_s=[10.0, 5.0]), "--tau: 5 follows 10, must rise"),
+        (lambda: pw.fit("a.csv", "x", tau_s=[]), "--tau has 0 values, must have 1 to 3"),
+        (lambda: pw.fit("a.csv", "x", tau_s=[10.0, np.nan]), "--tau: NaN follows 10, must rise"),
+        (lambda: pw.fit("a.csv", "x", tau_s=[-10.0]), "--tau = -10, must be finite numbers above 0"),
+        (lambda: pw.fit("a.csv", "x", branches=0), "--branches = 0, must be 1 to 3"),
+        (lambda: pw.fit("a.csv", "x", temperatures_c=[]), "--temperatures has 0 values, must have 1 to 32"),
+        (lambda: pw.fit("a.csv", "x", temperatures_c=[np.inf]), "--temperatures = inf, must be -100 to 200 degrees C"),
+        (lambda: pw.fit("a.csv", "x", soc_nodes=[0.0]), "--soc-nodes has 1 values, must have 2 to 101"),
+        (lambda: pw.fit("a.csv", "x", soc_nodes=[0.0, 0.5, 2.0]), "--soc-nodes = 2, must be a list that ends with 1"),
+        (lambda: pw.fit("a.csv", "x", ageing_shift=-0.1), "--ageing-shift = -0.1, must be 0 to 1"),
+        (lambda: pw.fit("a.csv", "x", voltage_min_v=np.nan), "--voltage-min = NaN, must be a finite number above 0"),
+        (lambda: pw.fit("a.csv", "x", voltage_max_v=-4.2), "--voltage-max = -4.2, must be a finite number above 0"),
+        (lambda: pw.fit("a.csv", "x", capacity_ah=0.0), "--capacity = 0, must be a finite number above 0"),
+        (lambda: pw.fit("a.csv", "x", first_cycles=0), "--first-cycles = 0, must be 1 or more"),
+        (lambda: pw.fit("a.csv", "x", capacity_ah=2.0, first_cycles=3), "--capacity must not be given together with --first-cycles"),
         (lambda: pw.gp.fit([[1.0]], [1.0, 2.0]), "output has 2 rows, inputs has 1: must agree"),
+        (lambda: pw.gp.fit([[1.0]], [[1.0, 2.0]]), "output has 2 columns, must have 1"),
         (lambda: pw.gp.fit([[1.0]], [1.0], basis="cubic"), 'basis "cubic", must be zero, constant or linear'),
         (lambda: pw.CellModel.of_label("lead", 60.0), 'chemistry "lead", must be one of'),
+        (lambda: pw.CellModel(CELL).table([[0.1, 0.9]]), "soc has 2 columns, must have 1"),
         (lambda: pw.CellModel(CELL).table([1.5]), "soc: found 1.5, must be fractions from 0 to 1"),
     ],
 )
@@ -173,3 +258,15 @@ def test_bad_arguments_are_named(call, text):
     with pytest.raises(pw.DataError) as caught:
         call()
     assert text in str(caught.value)
+
+
+def test_a_signal_ends_a_score_that_still_learns(record):
+    learn = [record.csv] * 3000
+    assert interrupted(lambda: pw.score(record.csv, cell=CELL, learn=learn)) < 3.0
+
+
+def test_a_signal_ends_the_forecasts(tmp_path):
+    rows = "".join(f"{86400 * n},{2.0 - 0.0002 * n:.6f}\n" for n in range(3000))
+    (tmp_path / "life.csv").write_text(f"date,capacity_ah\n{rows}")
+    parts = np.linspace(0.01, 0.99, 99)
+    assert interrupted(lambda: pw.rul(tmp_path / "life.csv", [1.4 + 0.01 * n for n in range(30)], at=parts)) < 3.0

@@ -51,6 +51,14 @@ def test_a_table_in_memory_has_our_names_and_signs(record):
     np.testing.assert_array_equal(pw.from_bdf(frame, positive="discharge")["current_a"], -record.current_a)
 
 
+def test_a_masked_column_in_memory_is_unknown_and_a_text_is_refused():
+    table = {"Test Time / s": [0.0, 1.0], "Voltage / V": np.ma.array([3.9, 9.9], mask=[False, True]), "Current / A": [1, 2]}
+    columns = pw.from_bdf(table)
+    np.testing.assert_array_equal(columns["voltage_v"], [3.9, np.nan])
+    with pytest.raises(pw.DataError, match="Current / A is an array of <U1, must be one of numbers"):
+        pw.from_bdf(table | {"Current / A": ["1", "2"]})
+
+
 def test_the_sign_is_the_callers_where_a_file_differs(record, tmp_path):
     as_bdf(record).to_csv(tmp_path / "cell.bdf", index=False)
     np.testing.assert_allclose(pw.read(tmp_path / "cell.bdf", bdf_positive="discharge")["current_a"], -record.current_a, atol=1e-12)

@@ -185,7 +185,8 @@ impl LogSource {
             let Some(open) = &mut self.current else {
                 let first = self.files.front().map(|path| path.display().to_string()).unwrap_or_default();
                 let next = segments::next_log(&mut self.files);
-                let next = next.map_err(|error| LogError(format!("{first}: cannot be read: {error}")))?;
+                let next =
+                    next.map_err(|error| LogError::of_io(format!("{first}: cannot be read: {error}"), &error))?;
                 let Some(parts) = next else { return Ok(None) };
                 self.state.counts.deleted_segments += parts.deleted;
                 self.current = Some(self.open(&parts.paths)?);
@@ -243,13 +244,13 @@ impl LogSource {
     fn open(&mut self, paths: &[PathBuf]) -> Result<OpenLog, LogError> {
         let path = paths.first().map_or(Path::new(""), PathBuf::as_path);
         let name = path.display().to_string();
-        let failed = |e: std::io::Error| LogError(format!("{name}: cannot be read: {e}"));
+        let failed = |e: std::io::Error| LogError::of_io(format!("{name}: cannot be read: {e}"), &e);
         let mut lines = Lines::new(lines::open_parts(paths, &self.read_bytes).map_err(failed)?);
         let first = lines.peek().map_err(failed)?.trim_ascii_end();
         let journal = first == journal::HEADER.as_bytes();
         if first.starts_with(b"PACKWATCH-JOURNAL") && !journal {
             let found = String::from_utf8_lossy(first);
-            return Err(LogError(format!("{name}:1: found {found:?}, this program reads {:?}", journal::HEADER)));
+            return Err(LogError::Data(format!("{name}:1: found {found:?}, this program reads {:?}", journal::HEADER)));
         }
         let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
         (self.state.fresh, self.state.unknown) = (true, false);
@@ -300,7 +301,7 @@ impl ReadState {
     fn bad(&mut self, what: impl FnOnce() -> String) -> Result<(), LogError> {
         self.counts.bad_lines += 1;
         if self.strict {
-            return Err(LogError(what()));
+            return Err(LogError::Data(what()));
         }
         self.counts.first_bad_line.get_or_insert_with(what);
         Ok(())
@@ -404,7 +405,7 @@ impl ReadState {
                 Ok(None) => return Ok(None),
                 Ok(Some(row)) => row,
                 Err(error) => {
-                    self.bad(|| error.0)?;
+                    self.bad(|| error.to_string())?;
                     return Ok(None);
                 }
             };
@@ -416,7 +417,7 @@ impl ReadState {
                     }
                     return Ok(Some(time));
                 }
-                Err(error) => self.bad(|| error.0)?,
+                Err(error) => self.bad(|| error.to_string())?,
             }
         }
     }

@@ -25,8 +25,21 @@ const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
 
 /// A table that cannot be read or a field that cannot be used, with its place.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct TableError(pub String);
+pub enum TableError {
+    /// Content that cannot be used.
+    #[error("{0}")]
+    Data(String),
+    /// The operating system does not let the file be read.
+    #[error("{0}")]
+    File(String),
+}
+
+impl TableError {
+    /// A failed read: of the file where the operating system gave the error, else of its content, as a damaged compressed file.
+    pub fn of_io(text: String, error: &std::io::Error) -> Self {
+        if error.raw_os_error().is_some() { Self::File(text) } else { Self::Data(text) }
+    }
+}
 
 /// Whether `"` encloses fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,7 +84,7 @@ impl Table {
     pub fn open(path: &Path) -> Result<Self, TableError> {
         let file = path.display().to_string();
         let source = lines::open(path, &Arc::default());
-        let source = source.map_err(|error| TableError(format!("{file}: cannot be read: {error}")))?;
+        let source = source.map_err(|error| TableError::of_io(format!("{file}: cannot be read: {error}"), &error))?;
         Self::new(source, file, Quotes::Enclose)
     }
 
@@ -108,7 +121,11 @@ impl Table {
 }
 
 fn damaged(file: &str, error: &csv::Error) -> TableError {
-    TableError(format!("{file}: damaged: {error}"))
+    let text = format!("{file}: damaged: {error}");
+    match error.kind() {
+        csv::ErrorKind::Io(error) => TableError::of_io(text, error),
+        _ => TableError::Data(text),
+    }
 }
 
 impl Header {
@@ -138,12 +155,12 @@ impl Header {
 
     /// A fault of the header line.
     pub fn fault(&self, what: impl std::fmt::Display) -> TableError {
-        TableError(format!("{}:1: {what}", self.file))
+        TableError::Data(format!("{}:1: {what}", self.file))
     }
 
     /// A fault of the whole file.
     pub fn file_fault(&self, what: impl std::fmt::Display) -> TableError {
-        TableError(format!("{}: {what}", self.file))
+        TableError::Data(format!("{}: {what}", self.file))
     }
 }
 
@@ -199,7 +216,7 @@ impl<'t> Row<'t> {
 
     /// A fault of the row.
     pub fn row_fault(&self, what: impl std::fmt::Display) -> TableError {
-        TableError(format!("{}:{}: {what}", self.header.file, self.line))
+        TableError::Data(format!("{}:{}: {what}", self.header.file, self.line))
     }
 }
 
@@ -244,7 +261,7 @@ mod tests {
         assert_eq!(missing.0, "t.csv:1: no column ah or capacity_ah, found time,soc,name");
         let mut faults = Vec::new();
         while let Some(row) = table.next_row().expect("reads") {
-            faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.0));
+            faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.to_string()));
             faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").0));
         }
         assert_eq!(
@@ -265,7 +282,10 @@ mod tests {
                 Ok(mut table) => table.next_row().expect_err("never ends"),
                 Err(error) => error,
             };
-            assert_eq!(error.0, "t.csv: damaged: a row of more than 1048576 bytes, must be at most that many");
+            assert_eq!(
+                error.to_string(),
+                "t.csv: damaged: a row of more than 1048576 bytes, must be at most that many"
+            );
         }
         // Rows of the allowed length follow each other.
         let row = format!("{}\n", "7".repeat(crate::io::row_limit::MAX_ROW_BYTES - 10_000));
@@ -297,6 +317,6 @@ mod tests {
         let mut table = Table::open(&path).expect("opens");
         let _ = table.next_row();
         let error = table.next_row().expect_err("torn");
-        assert!(error.0.contains("t.csv.gz: damaged: "), "{error}");
+        assert!(error.to_string().contains("t.csv.gz: damaged: "), "{error}");
     }
 }

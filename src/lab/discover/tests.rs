@@ -90,7 +90,7 @@ fn a_configuration_needs_the_number_of_cells_and_then_has_all_inputs() {
         cell_model: "cell.toml".to_owned(),
         ..PackSettings::default()
     };
-    let question = discoverer.configuration(&discovery, &settings).unwrap_err().0;
+    let question = discoverer.configuration(&discovery, &settings).unwrap_err().to_string();
     assert!(question.contains("how many cells are in series") && question.contains("--cells"), "{question}");
     let pack = discoverer.configuration(&discovery, &PackSettings { cells: Some(96), ..settings }).unwrap();
     let table: toml::Table = pack.text.parse().unwrap();

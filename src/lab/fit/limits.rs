@@ -46,7 +46,7 @@ pub(super) fn voltage_limits(
 ) -> Result<((f64, f64), Vec<String>), LabError> {
     let all = || files.iter().chain(slow);
     let found = request.first_cycles.and_then(|first| cycle_limits(files, first)).or_else(|| held_limits(all()));
-    let ((low_v, low), (high_v, high)) = found.ok_or_else(|| LabError("no voltage in the data".into()))?;
+    let ((low_v, low), (high_v, high)) = found.ok_or_else(|| LabError::Data("no voltage in the data".into()))?;
     let mut notes = Vec::new();
     if request.voltage_min_v.is_none() {
         notes.push(format!("voltage_min_v = {low_v} by {}; --voltage-min sets another", low.place()));
@@ -60,7 +60,7 @@ pub(super) fn voltage_limits(
     }
     let (low_v, high_v) = (request.voltage_min_v.unwrap_or(low_v), request.voltage_max_v.unwrap_or(high_v));
     if low_v >= high_v {
-        return Err(LabError(format!("lowest voltage {low_v} V, highest {high_v} V: must be below it")));
+        return Err(LabError::Data(format!("lowest voltage {low_v} V, highest {high_v} V: must be below it")));
     }
     Ok(((low_v, high_v), notes))
 }

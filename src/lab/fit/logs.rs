@@ -173,7 +173,9 @@ pub fn run(request: &LogRequest<'_>, mut progress: impl FnMut(FitProgress)) -> R
     let stretches: Vec<Stretch> = read?.into_iter().flatten().filter(|s| s.part.len() >= LEAST_ROWS).collect();
     progress(FitProgress::Read(request.logs.len(), request.logs.len()));
     if stretches.is_empty() {
-        return Err(LabError(format!("no stretch of {LEAST_ROWS} readings with current and voltage in the logs")));
+        return Err(LabError::Data(format!(
+            "no stretch of {LEAST_ROWS} readings with current and voltage in the logs"
+        )));
     }
     fit_stretches(request, &stretches, progress)
 }
@@ -196,10 +198,11 @@ fn fit_stretches(
     };
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
-        .map_err(LabError)?;
+        .map_err(LabError::Data)?;
     // Two packs, or cells of no known kind: what the fit makes of them is of neither.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
-    let fit = if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError)? } else { fit };
+    let fit =
+        if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };
     let file_of_record: Vec<usize> = stretches.iter().map(|stretch| stretch.log).collect();
     let capacity_ah = fit.capacity_ah;
     let errors_v = error_table::table(&fit.fitted, &judged(&fit.records, &file_of_record), capacity_ah);
@@ -305,7 +308,8 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
     // The model that is fitted does not change on the way.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
-    replay::run(&mut source, monitor, sinks, settings, &mut |_| ()).map_err(|error| LabError(error.to_string()))?;
+    replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
+        .map_err(|error| LabError::Data(error.to_string()))?;
     let mut mean = mean.borrow_mut();
     mean.close();
     let stretches = std::mem::take(&mut mean.stretches);

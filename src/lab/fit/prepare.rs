@@ -92,7 +92,7 @@ pub(super) fn prepare(
         }
     };
     if capacity_ah <= 0.0 {
-        return Err(LabError("no discharge in the data".into()));
+        return Err(LabError::Data("no discharge in the data".into()));
     }
     let sources = taken.into_iter().map(|(file, mut part, out_ah)| {
         part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
@@ -121,7 +121,7 @@ fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -
             }
         }
     }
-    if refused.is_empty() { Ok(taken) } else { Err(LabError(refused.join("\n"))) }
+    if refused.is_empty() { Ok(taken) } else { Err(LabError::Data(refused.join("\n"))) }
 }
 
 fn key_text(part: &MeasuredPart) -> String {
@@ -150,7 +150,7 @@ impl SlowDischarge {
 }
 
 fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, LabError> {
-    let fail = |what: String| LabError(format!("{}: {what}", file.path.display()));
+    let fail = |what: String| LabError::Data(format!("{}: {what}", file.path.display()));
     let part = clean(&file.parts[0]);
     if part.time_s.is_empty() {
         return Err(fail("no row with current and voltage".into()));
@@ -184,7 +184,7 @@ fn slow_source(
 ) -> Result<AnchoredPart, LabError> {
     let mut part = clean(&file.parts[0]);
     let out_ah = part.taken_out_ah(voltage_max_v, capacity_ah);
-    let out_ah = out_ah.map_err(|e| LabError(format!("{}: {e}", file.path.display())))?;
+    let out_ah = out_ah.map_err(|e| LabError::Data(format!("{}: {e}", file.path.display())))?;
     let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
     // Rows after the discharge are not judged.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
@@ -195,7 +195,7 @@ fn slow_source(
 fn need_cycles(files: &[MeasuredFile]) -> Result<(), LabError> {
     let without = files.iter().find(|file| file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()));
     without.map_or(Ok(()), |file| {
-        Err(LabError(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
+        Err(LabError::Data(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
     })
 }
 
@@ -207,7 +207,7 @@ fn ageing_sources(
 ) -> Result<FitInputs, LabError> {
     let mut prepared = FitInputs { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
     for (number, file) in files.iter().enumerate() {
-        let fail = |what: String| LabError(format!("{}: {what}", file.path.display()));
+        let fail = |what: String| LabError::Data(format!("{}: {what}", file.path.display()));
         let mut early = Vec::new();
         for part in &file.parts {
             let cycle: usize = part.key.parse().map_err(|_| fail(format!("cycle {:?}: not a number", part.key)))?;

@@ -102,7 +102,7 @@ impl DriveSummary {
     /// The log held no record; the error includes the notes.
     pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), LabError> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
-        self.span.ok_or_else(|| LabError(format!("{}: holds no record{}", log.display(), why())))
+        self.span.ok_or_else(|| LabError::Data(format!("{}: holds no record{}", log.display(), why())))
     }
 
     fn note(&mut self, record: &Record) {

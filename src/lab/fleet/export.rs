@@ -115,7 +115,7 @@ pub(super) fn export(
 ) -> Result<ExportResult, LabError> {
     let folder = settings.out.join(name);
     std::fs::create_dir_all(&folder)
-        .map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
+        .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))?;
     let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
     let source = (settings.access.open)(config, logs);
@@ -142,7 +142,8 @@ pub(super) fn export(
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join(ABOUT);
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
-    std::fs::remove_file(&path).map_err(|error| LabError(format!("{}: cannot be removed: {error}", path.display())))?;
+    std::fs::remove_file(&path)
+        .map_err(|error| LabError::File(format!("{}: cannot be removed: {error}", path.display())))?;
     let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
     let other = about["metadata"]["packwatch.log"].as_str().filter(|other| Path::new(other) != log);
     Ok(other.map(|other| format!("replaced the tables of {other}")))

@@ -83,7 +83,7 @@ impl Truth {
         let table = CycleTable::read(path)?;
         let points: Vec<_> = table.discharges.iter().filter_map(|d| Some((d.start, d.capacity_ah?))).collect();
         let span = points.first().zip(points.last()).map(|(first, last)| (first.0, last.0));
-        let span = span.ok_or_else(|| TableError(format!("{}: no discharge has a capacity", path.display())))?;
+        let span = span.ok_or_else(|| TableError::Data(format!("{}: no discharge has a capacity", path.display())))?;
         Ok(Self { kind: EndOfLifeSource::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
     }
 
@@ -172,7 +172,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("t.csv");
         std::fs::write(&path, text).expect("written");
-        Truth::read(&path).map_err(|error| error.0.replace(&path.display().to_string(), "t.csv"))
+        Truth::read(&path).map_err(|error| error.to_string().replace(&path.display().to_string(), "t.csv"))
     }
 
     #[test]

@@ -58,7 +58,7 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
         let path = &std::path::absolute(path).map_err(|error| named(path, &error))?;
         let logs = if path.is_dir() { logs_in(path)? } else { vec![path.clone()] };
         let size = |log: &PathBuf| {
-            let meta = std::fs::metadata(log).map_err(|error| LabError(format!("{}: {error}", log.display())))?;
+            let meta = std::fs::metadata(log).map_err(|error| LabError::File(format!("{}: {error}", log.display())))?;
             Ok::<u64, LabError>(meta.len())
         };
         let bytes = logs.iter().map(size).sum::<Result<u64, LabError>>()?;
@@ -71,7 +71,7 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
 
 /// The logs in a folder by name.
 fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
-    let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
+    let failed = |error: std::io::Error| LabError::File(format!("{}: cannot be read: {error}", folder.display()));
     let mut logs = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(failed)? {
         let path = entry.map_err(failed)?.path();
@@ -81,7 +81,7 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     }
     logs.sort();
     if logs.is_empty() {
-        return Err(LabError(format!(
+        return Err(LabError::Data(format!(
             "{}: no log in this folder, must have .log, .journal or .csv files",
             folder.display()
         )));
@@ -104,7 +104,7 @@ fn is_log(name: &OsStr) -> bool {
 pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
     let line = |vehicle: &Vehicle| match serde_json::to_string(vehicle) {
         Ok(line) => Ok(line + "\n"),
-        Err(error) => Err(LabError(format!("vehicle {}: {error}", vehicle.vehicle))),
+        Err(error) => Err(LabError::Data(format!("vehicle {}: {error}", vehicle.vehicle))),
     };
     vehicles.iter().map(line).collect()
 }
@@ -115,27 +115,28 @@ pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
 /// The file cannot be read, a line is no vehicle, or two have one name: with the line.
 pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let shown = path.display();
-    let text = std::fs::read_to_string(path).map_err(|error| LabError(format!("{shown}: cannot be read: {error}")))?;
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| LabError::of_io(format!("{shown}: cannot be read: {error}"), &error))?;
     let mut lines = BTreeMap::new();
     let mut vehicles = Vec::new();
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
-        let vehicle: Vehicle =
-            serde_json::from_str(line).map_err(|error| LabError(format!("{shown}:{number}: no vehicle: {error}")))?;
+        let vehicle: Vehicle = serde_json::from_str(line)
+            .map_err(|error| LabError::Data(format!("{shown}:{number}: no vehicle: {error}")))?;
         let Vehicle { vehicle: name, logs, .. } = &vehicle;
         if name.is_empty() || export::clean(name) != *name {
             let allowed = "must be letters, digits, '.', '_' and '-', not '.' first";
-            return Err(LabError(format!("{shown}:{number}: vehicle \"{name}\", {allowed}")));
+            return Err(LabError::Data(format!("{shown}:{number}: vehicle \"{name}\", {allowed}")));
         }
         if logs.is_empty() {
-            return Err(LabError(format!("{shown}:{number}: vehicle {name} has no logs")));
+            return Err(LabError::Data(format!("{shown}:{number}: vehicle {name} has no logs")));
         }
         if let Some(first) = lines.insert(name.clone(), number) {
-            return Err(LabError(format!("{shown}:{number}: vehicle {name} is in line {first} already")));
+            return Err(LabError::Data(format!("{shown}:{number}: vehicle {name} is in line {first} already")));
         }
         vehicles.push(vehicle);
     }
     if vehicles.is_empty() {
-        return Err(LabError(format!("{shown}: no vehicle")));
+        return Err(LabError::Data(format!("{shown}: no vehicle")));
     }
     Ok(vehicles)
 }
@@ -292,9 +293,9 @@ fn replay(
         let config = config?;
         export::export(&config, &vehicle.logs, &vehicle.vehicle, settings, report)
     }));
-    match replayed
-        .unwrap_or_else(|_| Err(LabError("the program has a defect here: its message is on standard error".to_owned())))
-    {
+    match replayed.unwrap_or_else(|_| {
+        Err(LabError::Data("the program has a defect here: its message is on standard error".to_owned()))
+    }) {
         Ok(exported) => {
             record.rows = exported.rows.iter().map(|(table, rows)| ((*table).to_owned(), *rows)).collect();
             (record.days, record.notes) = (exported.days, exported.notes);
@@ -302,7 +303,7 @@ fn replay(
             Ok(Outcome::Replayed(record))
         }
         Err(error) => {
-            record.error = Some(error.0);
+            record.error = Some(error.to_string());
             write(&folder, &record)?;
             Ok(Outcome::Failed(record))
         }
@@ -318,7 +319,7 @@ fn write(folder: &Path, record: &VehicleRecord) -> Result<(), LabError> {
 }
 
 fn named(folder: &Path, error: &std::io::Error) -> LabError {
-    LabError(format!("{}: {error}", folder.display()))
+    LabError::of_io(format!("{}: {error}", folder.display()), error)
 }
 
 #[cfg(test)]
@@ -372,7 +373,7 @@ mod tests {
             (String::new(), ": no vehicle"),
         ] {
             std::fs::write(&path, &text).unwrap();
-            let error = read_manifest(&path).unwrap_err().0;
+            let error = read_manifest(&path).unwrap_err().to_string();
             assert!(error.contains(fault), "{fault}\n{error}");
         }
     }
@@ -390,7 +391,7 @@ mod tests {
         assert_eq!(vehicles, [Vehicle { vehicle: "car_1".to_owned(), bytes: 10, logs, config: None }]);
         let empty = place.path().join("empty");
         std::fs::create_dir(&empty).unwrap();
-        assert!(plan(&[empty]).unwrap_err().0.contains("no log in this folder"));
-        assert!(plan(&["missing.log".into()]).unwrap_err().0.contains("missing.log: "));
+        assert!(plan(&[empty]).unwrap_err().to_string().contains("no log in this folder"));
+        assert!(plan(&["missing.log".into()]).unwrap_err().to_string().contains("missing.log: "));
     }
 }

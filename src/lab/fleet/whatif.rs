@@ -182,7 +182,7 @@ fn judge_log(
     if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
-        return Err(LabError(format!(
+        return Err(LabError::Data(format!(
             "{file}: covers {a} to {b} s, must overlap the log's {c} to {d} s (--start-times dates a CSV)"
         )));
     }

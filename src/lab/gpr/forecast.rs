@@ -137,7 +137,10 @@ pub fn run(
     let windows = LagWindows::new(table, plan.lags);
     let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
     let from = windows.last_before(origin).ok_or_else(|| {
-        LabError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
+        LabError::Data(format!(
+            "lags = {}, must be at most the rows of a part before the origin (row {origin})",
+            plan.lags
+        ))
     })?;
     let list = horizons(plan.steps);
     let mut outputs = Vec::new();
@@ -175,7 +178,7 @@ impl HorizonTask<'_> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
-            LabError(format!(
+            LabError::Data(format!(
                 "fewer than {fewest} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
                  least as many: give fewer lags or steps, a later origin or more rows"
             ))

@@ -315,7 +315,7 @@ mod tests {
         let columns: Vec<String> = columns.iter().map(|name| (*name).to_owned()).collect();
         let wanted = ColumnSelection { columns: &columns, optional: &[], missing };
         let found = ColumnTable::read(std::slice::from_ref(&path), &wanted, &PartColumn::None);
-        found.map_err(|e| e.0.replace(&format!("{}/", folder.path().display()), ""))
+        found.map_err(|e| e.to_string().replace(&format!("{}/", folder.path().display()), ""))
     }
 
     const TEXT: &str = "time_s,voltage_v,voltage_mv\n0,3.5,3500\n1,,3400\n2,nan,3300\n3,3.2,3200\n";

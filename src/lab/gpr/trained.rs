@@ -76,12 +76,13 @@ impl TrainedModel {
     /// # Errors
     /// The file cannot be read, is no such model, is damaged, or is of another version.
     pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
-        let fail = |what: String| LabError(format!("{}: {what}", path.display()));
-        let size = std::fs::metadata(path).map_err(|error| fail(error.to_string()))?.len();
+        let fail = |what: String| LabError::Data(format!("{}: {what}", path.display()));
+        let unread = |error: std::io::Error| LabError::of_io(format!("{}: {error}", path.display()), &error);
+        let size = std::fs::metadata(path).map_err(unread)?.len();
         if size > MAX_BYTES {
             return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
         }
-        let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
+        let text = std::fs::read_to_string(path).map_err(unread)?;
         let (first, rest) =
             text.split_once('\n').ok_or_else(|| fail("one line only, must be three: no model".into()))?;
         let names: ModelHeader =

@@ -85,10 +85,10 @@ pub fn import(text: &str, settings: &BpxSettings) -> Result<BpxImport, LabError>
     let source = &settings.source;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let root: serde_json::Value = serde_json::from_str(text)
-        .map_err(|error| LabError(format!("{source}:{}:{}: no JSON: {error}", error.line(), error.column())))?;
+        .map_err(|error| LabError::Data(format!("{source}:{}:{}: no JSON: {error}", error.line(), error.column())))?;
     let failed = |faults: Vec<String>| {
         let lines: Vec<String> = faults.iter().map(|fault| format!("{source}: {fault}")).collect();
-        LabError(lines.join("\n"))
+        LabError::Data(lines.join("\n"))
     };
     let cell = document::read(&root).map_err(failed)?;
     let curve = Curve::new(&cell).map_err(failed)?;

@@ -54,7 +54,7 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     let is_empty = |kind| candidates.get(&kind).is_none_or(Vec::is_empty);
     if is_empty(InputKind::Current) && is_empty(InputKind::PackVoltage) && is_empty(InputKind::CellVoltage) {
         let what = format!("{file}: no signal of {} messages looks like a battery's", database.messages.len());
-        return Err(LabError(what));
+        return Err(LabError::Data(what));
     }
     Ok(text(file, &candidates))
 }
@@ -202,7 +202,7 @@ mod tests {
 
     #[test]
     fn a_dbc_without_a_battery_is_an_error() {
-        let fault = imported("BO_ 1 Doors: 8 A\n SG_ Open : 0|8@1+ (1,0) [0|0] \"\" A\n").unwrap_err().0;
+        let fault = imported("BO_ 1 Doors: 8 A\n SG_ Open : 0|8@1+ (1,0) [0|0] \"\" A\n").unwrap_err().to_string();
         assert!(fault.contains("car.dbc: no signal of 1 messages"), "{fault}");
     }
 }

@@ -63,18 +63,21 @@ pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<Diagnost
 fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Converter), LabError> {
     let source = &settings.source;
     if let Some(name) = settings.name.as_ref().filter(|name| !is_name(name)) {
-        return Err(LabError(format!("name is {name:?}, must be letters, digits and _")));
+        return Err(LabError::Data(format!("name is {name:?}, must be letters, digits and _")));
     }
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let document: SignalSetDocument = serde_json::from_str(text).map_err(|error| {
-        LabError(format!("{source}:{}:{}: no OBDb signal set: {error}", error.line(), error.column()))
+        LabError::Data(format!("{source}:{}:{}: no OBDb signal set: {error}", error.line(), error.column()))
     })?;
     let mut converter = Converter { year: settings.year, ..Converter::default() };
     converter.convert(&document);
     let Converter { tables, exclusions, .. } = &mut converter;
     if tables.is_empty() {
         let first = exclusions.first().map_or_else(|| "commands is empty".to_owned(), ToString::to_string);
-        return Err(LabError(format!("{source}: nothing can be converted, {} left out; {first}", exclusions.len())));
+        return Err(LabError::Data(format!(
+            "{source}: nothing can be converted, {} left out; {first}",
+            exclusions.len()
+        )));
     }
     rename(tables, settings.name.as_deref());
     tables.sort_by_key(|table| (table.request, table.response, table.extension));

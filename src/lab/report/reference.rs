@@ -113,7 +113,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("r.csv");
         std::fs::write(&path, text).expect("written");
-        read(&path).map_err(|error| error.0)
+        read(&path).map_err(|error| error.to_string())
     }
 
     #[test]

@@ -157,7 +157,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cell.csv");
         std::fs::write(&path, text).expect("written");
-        History::read(&path).map_err(|e| e.0.replace(&format!("{}/", folder.path().display()), ""))
+        History::read(&path).map_err(|e| e.to_string().replace(&format!("{}/", folder.path().display()), ""))
     }
 
     #[test]

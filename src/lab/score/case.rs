@@ -136,7 +136,7 @@ struct CaseStart {
 
 impl CaseStart {
     fn find(job: &ScoreJob, file: &MeasuredFile, case: &Case, settings: &ScoreSettings) -> Result<Self, LabError> {
-        let unfit = |what: String| Err(LabError(format!("{}: {what}", job.path.display())));
+        let unfit = |what: String| Err(LabError::Data(format!("{}: {what}", job.path.display())));
         let truths = || {
             let rows =
                 file.parts.iter().enumerate().flat_map(|(p, part)| (0..part.len()).map(move |row| (p, row, part)));
@@ -185,7 +185,7 @@ fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) 
         let initial = truth + points / 100.0;
         if !(-SOC_SLACK..=1.0 + SOC_SLACK).contains(&initial) {
             let (path, truth) = (job.path.display(), 100.0 * truth);
-            return Err(LabError(format!(
+            return Err(LabError::Data(format!(
                 "{path}: initial SOC is {truth:.1} % and {points:+} points: {:.1} %, must be 0 to 100 %",
                 100.0 * initial
             )));

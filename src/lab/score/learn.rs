@@ -21,15 +21,25 @@ pub struct Learned {
     pub capacity: ScalarGaussian,
 }
 
-/// Runs `files` through a monitor, with a gap of unknown length between them.
+/// Rows between two calls of `progress`: some milliseconds of work.
+const PROGRESS_ROWS: usize = 4096;
+
+/// Runs `files` through a monitor, with a gap of unknown length between them. `progress` is called at every file and at least every
+/// [`PROGRESS_ROWS`] rows; it may unwind to end the work.
 ///
 /// # Errors
 /// A file that cannot be read.
-pub fn learn(files: &[PathBuf], config: &MonitorConfig, sleep_gap_s: f64) -> Result<Learned, LabError> {
+pub fn learn(
+    files: &[PathBuf],
+    config: &MonitorConfig,
+    sleep_gap_s: f64,
+    progress: &dyn Fn(),
+) -> Result<Learned, LabError> {
     let mut feeder = Feeder::new(config.clone(), sleep_gap_s, None);
     feeder.out().want_estimates = false;
     let mut latest = Timestamp::ZERO;
     for path in files {
+        progress();
         for part in &MeasuredFile::read(path)?.parts {
             let Some(&first_s) = part.time_s.first() else { continue };
             let base = latest.plus_nanos(UNKNOWN_GAP_NS).plus_secs(-first_s);
@@ -39,6 +49,9 @@ pub fn learn(files: &[PathBuf], config: &MonitorConfig, sleep_gap_s: f64) -> Res
                 feeder.row(time, part.current_a[row], part.voltage_v[row], part.temperature_c[row]);
                 feeder.out().clear();
                 latest = latest.max(time);
+                if row % PROGRESS_ROWS == PROGRESS_ROWS - 1 {
+                    progress();
+                }
             }
         }
     }

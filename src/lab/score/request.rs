@@ -107,7 +107,7 @@ impl ScoreRun {
     pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
         if let Some(folder) = &self.settings.plots {
             let created = std::fs::create_dir_all(folder);
-            created.map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
+            created.map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))?;
         }
         let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;
         let Self { config, settings, cases, .. } = self;
@@ -116,22 +116,25 @@ impl ScoreRun {
 }
 
 impl ScoreRequest {
-    /// Reads the configuration, the tables and the files to learn from.
+    /// Reads the configuration, the tables and the files to learn from; `progress` as in [`learn`].
     ///
     /// # Errors
     /// Faults of the configuration; a number out of its range, arguments that do not fit together, a table or a file to learn from that cannot be read.
-    pub fn prepare(&self) -> Result<ScoreRun, RequestError> {
+    pub fn prepare(&self, progress: &dyn Fn()) -> Result<ScoreRun, RequestError> {
         self.check()?;
         let config = self.source.load()?;
-        let settings = self.settings(&config)?;
+        let settings = self.settings(&config, progress)?;
         let jobs = self.jobs()?;
         Ok(ScoreRun { config, settings, jobs, cases: self.cases() })
     }
 
     fn check(&self) -> Result<(), LabError> {
+        self.check_lists()?;
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
-            return Err(LabError(format!("--cycles given {tables} times for {files} files, must be once per file")));
+            return Err(LabError::Data(format!(
+                "--cycles given {tables} times for {files} files, must be once per file"
+            )));
         }
         if self.source.config.is_none() && self.source.cell.is_none() && self.source.label.is_none() {
             return Err(
@@ -140,6 +143,25 @@ impl ScoreRequest {
         }
         check_distinct(&self.files)?;
         self.check_numbers()
+    }
+
+    /// No list without which there is nothing to score is empty.
+    fn check_lists(&self) -> Result<(), LabError> {
+        let lists = [
+            ("files", self.files.len()),
+            ("start", self.start.len()),
+            ("soc_error_points", self.soc_error_points.len()),
+            ("capacity_error_percent", self.capacity_error_percent.len()),
+            ("current_offset_a", self.current_offset_a.len()),
+            ("seeds", self.seeds.len()),
+        ];
+        if let Some((name, _)) = lists.into_iter().find(|(_, values)| *values == 0) {
+            return Err(LabError::Data(format!("no {name}, must be one or more")));
+        }
+        if !self.learn.is_empty() && !self.cycles.is_empty() {
+            return Err("learn must not be given together with cycles".into());
+        }
+        Ok(())
     }
 
     /// The ranges of the command line's arguments.
@@ -167,23 +189,23 @@ impl ScoreRequest {
             self.window.filter(|(least, most)| !(*least > 0.0 && least <= most && *most <= 1.0))
         {
             let allowed = "two parts above 0 and at most 1, the smaller first";
-            return Err(LabError(format!("window = {least}, {most}, must be {allowed}")));
+            return Err(LabError::Data(format!("window = {least}, {most}, must be {allowed}")));
         }
         let unfit = |[current_a, temperature_c, cutoff_v]: &[f64; 3]| {
             !(above_0(*current_a) && temperature_c.is_finite() && above_0(*cutoff_v))
         };
         if let Some([current_a, temperature_c, cutoff_v]) = self.load.filter(unfit) {
             let allowed = "amperes above 0, degrees C and volts above 0";
-            return Err(LabError(format!("load = {current_a}, {temperature_c}, {cutoff_v}, must be {allowed}")));
+            return Err(LabError::Data(format!("load = {current_a}, {temperature_c}, {cutoff_v}, must be {allowed}")));
         }
         Ok(())
     }
 
-    fn settings(&self, config: &Config) -> Result<ScoreSettings, LabError> {
+    fn settings(&self, config: &Config, progress: &dyn Fn()) -> Result<ScoreSettings, LabError> {
         let mut monitor = config.monitor.clone();
         if monitor.sample.cells != 1 {
             let found = monitor.sample.cells;
-            return Err(LabError(format!(
+            return Err(LabError::Data(format!(
                 "{}: pack.cells = {found}, must be 1 to score files of one cell",
                 config.path.display()
             )));
@@ -198,7 +220,10 @@ impl ScoreRequest {
                 "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
             ));
         }
-        let learned = (!self.learn.is_empty()).then(|| learn(&self.learn, &monitor, self.sleep_gap_s)).transpose()?;
+        let learned = match &self.learn[..] {
+            [] => None,
+            files => Some(learn(files, &monitor, self.sleep_gap_s, progress)?),
+        };
         Ok(ScoreSettings {
             learned,
             truth_capacity_ah: self.truth_capacity_ah.unwrap_or(monitor.model.capacity_ah),
@@ -258,5 +283,5 @@ fn check(
     allowed: &str,
 ) -> Result<(), LabError> {
     let found = values.into_iter().find(|value| !is_allowed(*value));
-    found.map_or(Ok(()), |value| Err(LabError(format!("{name} = {value}, must be {allowed}"))))
+    found.map_or(Ok(()), |value| Err(LabError::Data(format!("{name} = {value}, must be {allowed}"))))
 }

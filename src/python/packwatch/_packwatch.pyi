@@ -10,7 +10,7 @@ import numpy.typing as npt
 _Path: TypeAlias = str | PathLike[str]
 _Paths: TypeAlias = _Path | Sequence[_Path]
 _Numbers: TypeAlias = Any
-"""Anything that NumPy takes as numbers: arrays, Arrow arrays, columns of a table, lists."""
+"""Anything that NumPy takes as numbers: arrays, Arrow arrays, columns of a table, lists. Masked and missing reals are NaN."""
 
 __all__ = [
     "BDF_COLUMNS",
@@ -24,6 +24,7 @@ __all__ = [
     "Table",
     "__version__",
     "fit",
+    "float64",
     "read",
     "replay",
     "rul",
@@ -71,7 +72,10 @@ class Monitor:
 
     The configuration is a file (``config``), a text (``text``, whose files are in ``folder``), or the built-in one of a single cell
     with a cell model (``cell``) or what is on a label (``chemistry``, ``rated_ah``). Of each cell, at most one estimate per
-    ``estimates_period_s`` is kept: 0 = every one, ``None`` = none.
+    ``estimates_period_s`` is kept: 0 = every one, ``None`` = none; periods begin again where the clock goes back.
+
+    Calls from several threads take turns. After Ctrl-C, the rows or frames that were taken stay taken, and their outputs come with those
+    of the next call. After a failure inside packwatch (``PanicException``), every call raises :class:`DataError`.
     """
 
     def __new__(
@@ -249,6 +253,9 @@ class GaussianProcess:
     @property
     def hyperparameters(self) -> list[tuple[str, float]]: ...
 
+def float64(name: str, values: _Numbers) -> npt.NDArray[np.float64]:
+    """Values as a contiguous array; masked ones are NaN. ``name`` is for the text of a :class:`packwatch.DataError`."""
+
 def read(path: _Path, *, bdf_positive: Literal["charge", "discharge"] = "charge") -> Table:
     """Reads a measured file, in our CSV or in the Battery Data Format.
 
@@ -298,7 +305,10 @@ def score(
     plots: _Path | None = None,
     progress: bool = False,
 ) -> Score:
-    """Scores measured files against truth, as ``packwatch score`` does; what is not given is as there."""
+    """Scores measured files against truth, as ``packwatch score`` does; what is not given is as there.
+
+    ``rated_ah``, ``voltage_min_v`` and ``voltage_max_v`` go with ``chemistry``, ``seeds`` with ``window``.
+    """
 
 def fit(
     files: _Paths,
@@ -317,7 +327,11 @@ def fit(
     first_cycles: int | None = None,
     progress: bool = False,
 ) -> Fit:
-    """Fits a cell model to measured files, as ``packwatch fit`` does."""
+    """Fits a cell model to measured files, as ``packwatch fit`` does.
+
+    ``branches`` is 1 to 3; ``tau_s`` has a value per branch. ``tau_s`` and ``temperatures_c`` rise, ``soc_nodes`` from 0 to 1.
+    ``first_cycles`` goes without ``ocv`` and ``capacity_ah``.
+    """
 
 def rul(
     files: _Paths,

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ._errors import DataError
-from ._packwatch import BDF_COLUMNS
+from ._packwatch import BDF_COLUMNS, float64
 
 REQUIRED = ("time_s", "current_a", "voltage_v")
 """Columns that the format requires."""
@@ -21,7 +21,7 @@ def from_bdf(table: Any, *, positive: Literal["charge", "discharge"] = "charge")
     The format does not state the sign of the current; ``positive`` says which way it flows.
 
     Raises:
-        DataError: a required column is missing, or ``positive`` is another word.
+        DataError: a required column is missing, a column is no numbers, or ``positive`` is another word.
     """
     if positive not in ("charge", "discharge"):
         raise DataError(f"positive {positive!r}, must be charge or discharge")
@@ -31,7 +31,7 @@ def from_bdf(table: Any, *, positive: Literal["charge", "discharge"] = "charge")
     for ours, label, name in BDF_COLUMNS:
         found = next((known for known in (label, name) if known in present), None)
         if found is not None and ours not in columns:
-            column = np.asarray(table[found], dtype="float64")
+            column = float64(found, table[found])
             columns[ours] = 0.0 - column if positive == "charge" and ours in SIGNED else column
     for ours in REQUIRED:
         if ours not in columns:

@@ -38,7 +38,8 @@ struct VehicleFolder {
 pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Result<MergeSummary, LabError> {
     let vehicles = read_all(folders)?;
     check(&vehicles, wanted)?;
-    std::fs::create_dir_all(out).map_err(|error| LabError(format!("{}: cannot be created: {error}", out.display())))?;
+    std::fs::create_dir_all(out)
+        .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", out.display())))?;
     let mut summary = MergeSummary { vehicles: vehicles.len(), ..MergeSummary::default() };
     let metadata = [("packwatch.version", env!("CARGO_PKG_VERSION").to_owned())];
     for table in ["half_cycles", "alarms", "estimates"] {
@@ -69,7 +70,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
 fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabError> {
     let mut vehicles: BTreeMap<String, VehicleFolder> = BTreeMap::new();
     for folder in folders {
-        let failed = |error: std::io::Error| LabError(format!("{}: cannot be read: {error}", folder.display()));
+        let failed = |error: std::io::Error| LabError::File(format!("{}: cannot be read: {error}", folder.display()));
         for entry in std::fs::read_dir(folder).map_err(failed)? {
             let folder = entry.map_err(failed)?.path();
             if !folder.is_dir() {
@@ -77,7 +78,7 @@ fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabE
             }
             let Some(record) = VehicleRecord::read(&folder) else {
                 let why = "not complete, or by another version: run it again, or remove the folder";
-                return Err(LabError(format!("{}: {why}", folder.display())));
+                return Err(LabError::Data(format!("{}: {why}", folder.display())));
             };
             let name = record.line.vehicle.clone();
             let Some(other) = vehicles.get(&name) else {
@@ -86,13 +87,13 @@ fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabE
             };
             if other.record != record {
                 let (one, two) = (other.folder.display(), folder.display());
-                return Err(LabError(format!("vehicle {name}: {one} and {two} differ")));
+                return Err(LabError::Data(format!("vehicle {name}: {one} and {two} differ")));
             }
         }
     }
     if vehicles.is_empty() {
         let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
-        return Err(LabError(format!(
+        return Err(LabError::Data(format!(
             "{}: no vehicle; `packwatch fleet run` writes {RECORD} for each",
             folders.join(", ")
         )));
@@ -107,7 +108,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
         let name = &other.line.vehicle;
         let period =
             period_s.map_or_else(|| "no estimates".to_owned(), |period_s| format!("an estimate each {period_s} s"));
-        return Err(LabError(format!(
+        return Err(LabError::Data(format!(
             "vehicle {name} is by packwatch {version} with {period}, unlike others: run it again"
         )));
     }
@@ -117,7 +118,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
         .filter(|vehicle| vehicles.get(&vehicle.vehicle).is_none_or(|found| found.record.line != **vehicle));
     let missing: Vec<&str> = missing.map(|vehicle| vehicle.vehicle.as_str()).collect();
     if !missing.is_empty() {
-        return Err(LabError(format!(
+        return Err(LabError::Data(format!(
             "{} of {} vehicles are not replayed: {}",
             missing.len(),
             wanted.len(),
@@ -127,7 +128,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
     let named: BTreeSet<&str> = wanted.iter().map(|vehicle| vehicle.vehicle.as_str()).collect();
     let others: Vec<&str> = vehicles.keys().map(String::as_str).filter(|name| !named.contains(name)).collect();
     if !others.is_empty() {
-        return Err(LabError(format!("{} vehicles are not in the manifest: {}", others.len(), some_of(&others))));
+        return Err(LabError::Data(format!("{} vehicles are not in the manifest: {}", others.len(), some_of(&others))));
     }
     Ok(())
 }

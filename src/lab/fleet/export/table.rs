@@ -95,7 +95,7 @@ impl<R> TableFile<R> {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
                     if !values.push((column.get)(row), column.optional) {
                         let (file, name) = (self.path.display(), column.name);
-                        return Err(LabError(format!("{file}: {name} has no value, or one of another type")));
+                        return Err(LabError::Data(format!("{file}: {name} has no value, or one of another type")));
                     }
                 }
                 *rows += 1;
@@ -115,7 +115,9 @@ impl<R> TableFile<R> {
     pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, LabError> {
         let Self { path, columns, rows, writer } = self;
         let file = match writer {
-            TableWriter::Csv { out, .. } => out.into_inner().map_err(|error| LabError(error.error().to_string()))?,
+            TableWriter::Csv { out, .. } => {
+                out.into_inner().map_err(|error| LabError::Data(error.error().to_string()))?
+            }
             TableWriter::Parquet { mut out, mut group, rows } => {
                 let failed = |error: ParquetError| named_error(&path, &error);
                 if rows > 0 {
@@ -148,7 +150,7 @@ pub(super) fn concatenate<R>(
     for part in parts {
         let failed = |error: &dyn std::fmt::Display| {
             let help = "remove its folder, and replay the vehicle again";
-            LabError(format!("{}: cannot be read: {error}; {help}", part.display()))
+            LabError::Data(format!("{}: cannot be read: {error}; {help}", part.display()))
         };
         let file = std::fs::File::open(part).map_err(|error| failed(&error))?;
         let found = ParquetMetaDataReader::new().parse_and_finish(&file).map_err(|error| failed(&error))?;
@@ -197,7 +199,7 @@ fn schema<R>(columns: &[Column<R>]) -> String {
 /// Returns the error with the file's name; an error of the operating system already has it.
 fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
-    LabError(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
+    LabError::Data(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
 }
 
 fn csv_field(field: &FieldValue<'_>) -> String {

@@ -156,7 +156,7 @@ fn every_fault_has_path_found_and_allowed_all_at_once() {
     parameters["Positive electrode"].as_object_mut().unwrap().remove("OCP [V]");
     parameters["Separator"]["Porosity"] = json!(1.5);
     parameters["Electrolyte"]["Diffusivity [m2.s-1]"] = json!({"x": [0, 1], "y": [0]});
-    let error = import_value(&value).unwrap_err().0;
+    let error = import_value(&value).unwrap_err().to_string();
     for line in [
         "own.json: Parameterisation.Cell.Nominal cell capacity [A.h]: -1, must be above 0, at most 100000",
         "own.json: Parameterisation.Negative electrode.OCP [V]: column 5: \"y\", must be x or one of exp",
@@ -193,15 +193,15 @@ fn what_no_model_can_be_made_of_is_refused() {
     ] {
         let mut value = straight();
         value.pointer_mut(path).unwrap()[key] = found;
-        let error = import_value(&value).unwrap_err().0;
+        let error = import_value(&value).unwrap_err().to_string();
         assert!(error.contains(text), "{text}\n{error}");
     }
     let mut value = full();
     value["Parameterisation"]["Electrolyte"]["Diffusivity [m2.s-1]"] = json!(2e-50);
-    let error = import_value(&value).unwrap_err().0;
+    let error = import_value(&value).unwrap_err().to_string();
     assert!(error.contains("at SOC 0 and") && error.contains("ohm, must be 1e-9 to 1000 ohm"), "{error}");
-    assert!(import_value(&json!([])).unwrap_err().0.contains("must be BPX"));
-    assert!(import("{", &BpxSettings::default()).unwrap_err().0.contains("no JSON"));
+    assert!(import_value(&json!([])).unwrap_err().to_string().contains("must be BPX"));
+    assert!(import("{", &BpxSettings::default()).unwrap_err().to_string().contains("no JSON"));
 }
 
 #[test]

@@ -171,7 +171,9 @@ fn what_cannot_be_converted_is_named_and_the_rest_stays() {
 #[test]
 fn other_texts_are_errors_with_their_place() {
     let fault = |text: &str| {
-        import(text, &ObdbSettings { source: "own.json".to_owned(), ..ObdbSettings::default() }).unwrap_err().0
+        import(text, &ObdbSettings { source: "own.json".to_owned(), ..ObdbSettings::default() })
+            .unwrap_err()
+            .to_string()
     };
     for (text, part) in [
         ("", "own.json:1:0"),

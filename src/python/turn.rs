@@ -1,0 +1,90 @@
+//! Turns of the calls of a monitor: one at a time, whatever threads they come from.
+//!
+//! A call that waits for its turn holds no lock of the interpreter, and a signal ends the wait. Two calls fail instead of waiting: one
+//! that a signal handler makes while its own thread is in another, and any after a panic, which left the state half changed.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
+use std::thread::{self, ThreadId};
+use std::time::Duration;
+
+use pyo3::prelude::*;
+
+use crate::error::data;
+use crate::monitor::State;
+
+/// Between two looks at whether it is this call's turn: short beside a call's own overhead in Python, long beside a look.
+const PERIOD: Duration = Duration::from_millis(1);
+
+/// A monitor's state, for one call at a time.
+pub(crate) struct Turns {
+    state: Mutex<State>,
+    /// Thread of the call whose turn it is.
+    holder: Mutex<Option<ThreadId>>,
+}
+
+/// The turn of one call.
+pub(crate) struct Turn<'a> {
+    state: MutexGuard<'a, State>,
+    turns: &'a Turns,
+}
+
+impl Turns {
+    pub(crate) fn new(state: State) -> Self {
+        Self { state: Mutex::new(state), holder: Mutex::new(None) }
+    }
+
+    /// Waits for the turn of this call.
+    ///
+    /// # Errors
+    /// An earlier call has failed inside the library, this thread is in another call, or a signal handler raises an exception.
+    pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<Turn<'_>> {
+        loop {
+            match self.state.try_lock() {
+                Ok(state) => {
+                    self.set_holder(Some(thread::current().id()));
+                    return Ok(Turn { state, turns: self });
+                }
+                Err(TryLockError::Poisoned(_)) => {
+                    return Err(data("an earlier call failed inside packwatch: make a new Monitor"));
+                }
+                Err(TryLockError::WouldBlock) if self.holder() == Some(thread::current().id()) => {
+                    return Err(data("the Monitor is at work in the call that this one interrupts"));
+                }
+                Err(TryLockError::WouldBlock) => {
+                    py.check_signals()?;
+                    py.detach(|| thread::sleep(PERIOD));
+                }
+            }
+        }
+    }
+
+    fn holder(&self) -> Option<ThreadId> {
+        *self.holder.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn set_holder(&self, thread: Option<ThreadId>) {
+        *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = thread;
+    }
+}
+
+impl Deref for Turn<'_> {
+    type Target = State;
+
+    fn deref(&self) -> &State {
+        &self.state
+    }
+}
+
+impl DerefMut for Turn<'_> {
+    fn deref_mut(&mut self) -> &mut State {
+        &mut self.state
+    }
+}
+
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        // Before the state is free: the next holder sets its own.
+        self.turns.set_holder(None);
+    }
+}
