@@ -258,11 +258,11 @@ mod tests {
     fn a_fault_names_file_line_column_found_and_allowed_and_the_next_row_is_read() {
         let mut table = table(TEXT, Quotes::Enclose);
         let missing = table.header().required(&["ah", "capacity_ah"]).expect_err("missing");
-        assert_eq!(missing.0, "t.csv:1: no column ah or capacity_ah, found time,soc,name");
+        assert_eq!(missing.to_string(), "t.csv:1: no column ah or capacity_ah, found time,soc,name");
         let mut faults = Vec::new();
         while let Some(row) = table.next_row().expect("reads") {
             faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.to_string()));
-            faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").0));
+            faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").to_string()));
         }
         assert_eq!(
             faults,

@@ -2,7 +2,7 @@
 //!
 //! In: the daemon's documents and the [`Queue`]. Out: messages with QoS 1. Each connection starts with nothing in memory, so no value of an
 //! earlier one is repeated: current values are those of the newest document, and a message leaves the queue only after the broker
-//! acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; a connection that lasts longer than that begins anew.
+//! acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a longer connection it starts at 1 s.
 //! A message that the broker refuses ends nothing: one of the queue is tried again after `retry_max_s`, a current value with the next one.
 
 use std::convert::Infallible;
@@ -317,7 +317,7 @@ async fn drive(events: &mut EventLoop) -> String {
     }
 }
 
-/// Publishes messages with QoS 1, in order; returns what became of each.
+/// Publishes messages with QoS 1, in order; returns the outcome of each.
 async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Vec<Result<(), Fault>> {
     let late = || Fault::Lost(format!("no acknowledgement within {ACKNOWLEDGEMENT:?}"));
     let mut notices = Vec::with_capacity(messages.len());
