@@ -39,6 +39,8 @@ pub(super) struct Losses {
     /// From when the current is lost.
     lost_since: Option<Timestamp>,
     is_asleep: bool,
+    /// End of the latest time in which nothing was recorded and no charge moved.
+    paused_until: Option<Timestamp>,
     lost_s: f64,
     /// The first gap whose charge has no bound.
     gap: Option<String>,
@@ -70,8 +72,11 @@ impl Losses {
                 self.lost_since.get_or_insert(event.time.plus_secs(held_s));
             }
             EventKind::SignalGood { channel: Channel::Current, .. } => self.end_loss(event.time),
-            EventKind::BusAsleep { asleep, .. } => self.is_asleep = asleep,
-            EventKind::Gap { seconds } if !self.is_asleep && !self.is_at_rest() => {
+            EventKind::BusAsleep { asleep, .. } => {
+                (self.is_asleep, self.paused_until) = (asleep, Some(event.time));
+            }
+            EventKind::Gap { .. } if self.is_asleep || self.is_at_rest() => self.paused_until = Some(event.time),
+            EventKind::Gap { seconds } => {
                 let length = seconds.map_or_else(|| "an unknown time".to_owned(), |seconds| format!("{seconds:.0} s"));
                 self.gap.get_or_insert_with(|| {
                     format!("the record has a gap of {length} that began while current flowed, or was not known")
@@ -84,6 +89,11 @@ impl Losses {
     /// Whether a pack at rest has this current, A per string.
     pub(super) fn is_rest(&self, current_a: f64) -> bool {
         current_a.abs() <= self.limits.rest_a
+    }
+
+    /// Whether nothing was recorded, and no charge moved, in a part of the time since then.
+    pub(super) fn has_paused_since(&self, from: Timestamp) -> bool {
+        self.paused_until.is_some_and(|until| until > from)
     }
 
     fn is_at_rest(&self) -> bool {

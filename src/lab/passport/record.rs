@@ -65,7 +65,7 @@ impl Energy {
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the latest half-cycle.
+    /// End of the last half-cycle; a clock that was set may have been later before.
     pub(super) moved_until_ns: Option<i64>,
     /// Why charge is missing from the half-cycles.
     pub(super) gap: Option<String>,
@@ -153,8 +153,10 @@ impl Record {
 
     /// Takes outputs of a replay, in their order.
     pub fn take(&mut self, out: &Outputs) {
-        out.estimates.iter().for_each(|estimate| self.take_estimate(estimate));
+        // An event may be a gap, and the estimates say what current flowed before.
+        out.estimates.iter().for_each(|estimate| self.losses.take_estimate(estimate));
         out.events.iter().for_each(|event| self.take_event(event));
+        out.estimates.iter().for_each(|estimate| self.take_power(estimate));
     }
 
     /// Takes an event of a replay.
@@ -176,8 +178,7 @@ impl Record {
     }
 
     /// Takes an estimate of a replay: the energy since the cell's one before.
-    fn take_estimate(&mut self, estimate: &Estimate) {
-        self.losses.take_estimate(estimate);
+    fn take_power(&mut self, estimate: &Estimate) {
         let longest_s = self.limits.voltage_age_s;
         let measured = &estimate.measured;
         let power_w = (measured.voltage_v * measured.current_a).abs();
@@ -190,7 +191,7 @@ impl Record {
             energy.energy_wh += 0.5 * (from.power_w + to.power_w) * step_s / 3600.0;
             energy.counted_s += step_s;
             energy.until = Some(to.time);
-        } else if !(from.is_rest && to.is_rest) {
+        } else if !(from.is_rest && to.is_rest || self.losses.has_paused_since(from.time)) {
             energy.lost_s += step_s.abs();
         }
     }
@@ -295,8 +296,8 @@ mod tests {
         let mut record = Record::of_replay(LIMITS);
         for event in [
             half_cycle(10.0, 0, Mode::Charge, 1.0),
-            half_cycle(20.0, 0, Mode::Discharge, 0.5),
             half_cycle(10.0, 1, Mode::Charge, 1.0),
+            half_cycle(20.0, 0, Mode::Discharge, 0.5),
         ] {
             record.take_event(&event);
         }
@@ -314,7 +315,7 @@ mod tests {
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {
-            record.take_estimate(&estimate(time_s, 3.6, current_a));
+            record.take_power(&estimate(time_s, 3.6, current_a));
         }
         let energy = record.energy.unwrap();
         assert!((energy.energy_wh - 2.0 * 7.2 * 50.0 / 3600.0).abs() < 1e-12, "{energy:?}");
@@ -326,7 +327,7 @@ mod tests {
     fn a_voltage_that_comes_late_at_rest_leaves_the_energy_known() {
         let mut record = Record::of_replay(LIMITS);
         for (time_s, current_a) in [(0.0, 2.0), (50.0, 0.0), (5000.0, 0.0), (5050.0, 2.0)] {
-            record.take_estimate(&estimate(time_s, 3.6, current_a));
+            record.take_power(&estimate(time_s, 3.6, current_a));
         }
         assert_eq!(record.energy.unwrap().gap(), None);
     }
