@@ -528,15 +528,19 @@ fn a_record_with_a_hole_under_load_or_without_its_beginning_has_no_sums() {
 #[test]
 fn a_car_that_sleeps_between_its_trips_loses_nothing() {
     let life = Life::configured("");
-    let args =
-        ["simulate", "ev-day", "-c", &life.path("pack.toml"), "-o", &life.path("day.log"), "--start", "1700000000"];
-    good(&[&args[..], &["--cycles", "1", "--capacity-ah", "1.9", "--period", "1000"]].concat());
-    let whole = passport(&with(&of_logs(&life, &["day.log"]), &["--throughput-before-ah", "0"]));
-    let (charge_ah, energy_kwh) = (
-        whole["CapacityThroughput"]["CapacityThroughputValue"].as_f64().expect("known"),
-        whole["EnergyThroughput"]["EnergyThroughputValue"].as_f64().expect("known"),
-    );
-    assert!(charge_ah > 1.0 && energy_kwh > 0.003, "{charge_ah} Ah, {energy_kwh} kWh");
+    life.simulate("first.log", "1700000000", &["--cycles", "1"]);
+    life.rest("first.log");
+    life.simulate("second.log", "1700040000", &["--cycles", "1"]);
+    let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
+    // With the shorter age the buses fall asleep before the recorder does.
+    for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
+        fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
+        let args = of_logs(&life, &["first.log", "second.log"]);
+        let whole = passport(&with(&args, &["--throughput-before-ah", "0"]));
+        let charge_ah = whole["CapacityThroughput"]["CapacityThroughputValue"].as_f64().expect("known");
+        let energy_kwh = whole["EnergyThroughput"]["EnergyThroughputValue"].as_f64().expect("known");
+        assert!(charge_ah > 5.0 && energy_kwh > 0.015, "{age}: {charge_ah} Ah, {energy_kwh} kWh");
+    }
 }
 
 #[test]

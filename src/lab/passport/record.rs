@@ -153,10 +153,15 @@ impl Record {
 
     /// Takes outputs of a replay, in their order.
     pub fn take(&mut self, out: &Outputs) {
-        // An event may be a gap, and the estimates say what current flowed before.
-        out.estimates.iter().for_each(|estimate| self.losses.take_estimate(estimate));
-        out.events.iter().for_each(|event| self.take_event(event));
-        out.estimates.iter().for_each(|estimate| self.take_power(estimate));
+        // An event may be a gap: the estimates before it say what current flowed, those of its time come after it.
+        let mut estimates = out.estimates.iter().peekable();
+        for event in &out.events {
+            while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {
+                self.take_estimate(estimate);
+            }
+            self.take_event(event);
+        }
+        estimates.for_each(|estimate| self.take_estimate(estimate));
     }
 
     /// Takes an event of a replay.
@@ -178,7 +183,8 @@ impl Record {
     }
 
     /// Takes an estimate of a replay: the energy since the cell's one before.
-    fn take_power(&mut self, estimate: &Estimate) {
+    fn take_estimate(&mut self, estimate: &Estimate) {
+        self.losses.take_estimate(estimate);
         let longest_s = self.limits.voltage_age_s;
         let measured = &estimate.measured;
         let power_w = (measured.voltage_v * measured.current_a).abs();
@@ -315,7 +321,7 @@ mod tests {
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {
-            record.take_power(&estimate(time_s, 3.6, current_a));
+            record.take_estimate(&estimate(time_s, 3.6, current_a));
         }
         let energy = record.energy.unwrap();
         assert!((energy.energy_wh - 2.0 * 7.2 * 50.0 / 3600.0).abs() < 1e-12, "{energy:?}");
@@ -327,9 +333,21 @@ mod tests {
     fn a_voltage_that_comes_late_at_rest_leaves_the_energy_known() {
         let mut record = Record::of_replay(LIMITS);
         for (time_s, current_a) in [(0.0, 2.0), (50.0, 0.0), (5000.0, 0.0), (5050.0, 2.0)] {
-            record.take_power(&estimate(time_s, 3.6, current_a));
+            record.take_estimate(&estimate(time_s, 3.6, current_a));
         }
         assert_eq!(record.energy.unwrap().gap(), None);
+    }
+
+    #[test]
+    fn the_current_before_a_gap_decides_not_the_first_one_after_it() {
+        let gap = Event { time: Timestamp::from_secs(5000.0), kind: EventKind::Gap { seconds: Some(4000.0) } };
+        for (before_a, after_a, is_known) in [(0.0, 2.0, true), (2.0, 0.0, false)] {
+            let mut record = Record::of_replay(LIMITS);
+            record.take(&Outputs { estimates: vec![estimate(900.0, 3.6, before_a)], ..Outputs::default() });
+            let estimates = vec![estimate(5000.0, 3.6, after_a)];
+            record.take(&Outputs { estimates, events: vec![gap], ..Outputs::default() });
+            assert_eq!(record.losses.finish(gap.time, 3600.0).is_none(), is_known, "{before_a} A before");
+        }
     }
 
     #[test]
