@@ -18,9 +18,9 @@ use crate::config::{self, Config, VehicleIdentity};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
-use crate::lab::passport::{self, Condition, Record, Standard, Terms};
+use crate::lab::passport::{self, Condition, ReadingLimits, Record, Standard, Terms};
 use crate::monitor::Monitor;
-use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
+use crate::replay::{self, OutputSink, ReplaySettings, Sinks};
 use crate::store::HistoryReader;
 
 /// Largest manufacturer's part, bytes: a passport has some ten thousand.
@@ -94,7 +94,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let model =
         cell_model(record.snapshot(), Some(&config))?.map_or_else(|| config.monitor.model.clone(), |it| it.model);
-    let condition = Condition::new(&record, &config, &model, &args.terms()).map_err(Failure::new)?;
+    let condition = Condition::new(&record, &config, &model, &args.terms());
+    let condition = condition.map_err(|error| match &args.state {
+        Some(folder) => Failure::new(format!("{}: {error}", folder.display())),
+        None => Failure::new(error),
+    })?;
     let document = passport::passport(args.form, &condition, manufacturer);
     let document = document.map_err(|faults| Failure::new(faults.join("\n")))?;
     if let Some(path) = &args.details {
@@ -151,30 +155,41 @@ fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity),
 
 fn of_replay(args: &Args, config: &Config) -> Result<Record, Failure> {
     let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
-    let sample = &config.monitor.sample;
-    let longest_step_s = sample.current.max_age_s.min(sample.voltage.max_age_s);
-    let record = Rc::new(RefCell::new(Record::of_replay(longest_step_s)));
-    let watched = Rc::clone(&record);
-    let watch: OutputWatch = Box::new(move |_, out| {
-        let mut record = watched.borrow_mut();
-        out.estimates.iter().for_each(|estimate| record.take_estimate(estimate));
-        out.events.iter().for_each(|event| record.take_event(event));
-    });
-    let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
+    let record = Rc::new(RefCell::new(Record::of_replay(reading_limits(config))));
+    let shared = Rc::clone(&record);
+    let take: OutputSink = Box::new(move |out| shared.borrow_mut().take(out));
+    let sinks = Sinks { outputs: Some(take), ..Sinks::default() };
     let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     let settings = ReplaySettings { snapshot: true, ..plain };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
-    let (_, snapshot) = result.map_err(failure)?;
-    // The replay has ended and with it the closure that shared the record.
-    let record = Rc::try_unwrap(record).map_err(|_| Failure::new("the replay still holds its record"))?;
-    let mut record = record.into_inner();
+    let (summary, snapshot) = result.map_err(failure)?;
+    if source.has_moved_stamps() {
+        return Err(Failure::new(
+            "a log begins before the end of the log before it, so its times are not known: the logs are not in their order, or \
+             one of them counts from its own start",
+        ));
+    }
+    let mut record = record.take();
+    let deleted = summary.log.deleted_segments;
+    if deleted > 0 {
+        record.note_gap(format!("the first {deleted} segments of the journal are missing"));
+    }
     if let Some(snapshot) = snapshot {
         record.finish(snapshot);
     }
     Ok(record)
+}
+
+fn reading_limits(config: &Config) -> ReadingLimits {
+    let (sample, transition) = (&config.monitor.sample, &config.monitor.health.transition);
+    ReadingLimits {
+        current_age_s: sample.current.max_age_s,
+        voltage_age_s: sample.voltage.max_age_s,
+        rest_a: (transition.dead_band_a + transition.hysteresis_a) / f64::from(sample.strings),
+    }
 }
 
 /// Writes a document, indented.

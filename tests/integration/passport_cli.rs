@@ -121,6 +121,18 @@ impl Life {
         good(&[&args, more].concat());
     }
 
+    /// Two minutes at rest after the end of a log, which the simulation ends under load.
+    fn rest(&self, log: &str) {
+        let mut text = fs::read_to_string(self.path(log)).expect("a log");
+        let last = text.lines().last().expect("a line").to_owned();
+        let (end_s, data) = (&last[1..last.find('.').expect("a stamp")], &last[last.find('#').expect("a frame") + 1..]);
+        let end_s: u64 = end_s.parse().expect("a number");
+        // Bytes 3 to 5 are the current.
+        let (voltage, temperature) = (&data[..6], &data[12..]);
+        (1..=120).for_each(|s| text += &format!("({}.000000000) vcan0 100#{voltage}000000{temperature}\n", end_s + s));
+        fs::write(self.path(log), text).expect("written");
+    }
+
     fn replay(&self, logs: &[&str]) {
         let logs: Vec<String> = logs.iter().map(|log| self.path(log)).collect();
         let logs: Vec<&str> = logs.iter().map(String::as_str).collect();
@@ -429,15 +441,150 @@ fn a_new_pack_has_no_learned_value_and_a_record_without_dates_no_passport() {
 }
 
 #[test]
-fn a_sum_with_deleted_half_cycles_is_not_known() {
+fn half_cycles_that_the_store_deleted_count_in_the_sums_of_its_state() {
     let life = Life::configured("\n[store]\nkeep_years = 0.1\n");
     life.simulate("old.log", "1700000000", &["--cycles", "2"]);
     // Two months later: the old half-cycles are beyond their age.
     life.simulate("new.log", "1706000000", &["--cycles", "2"]);
+    life.rest("old.log");
     life.replay(&["old.log", "new.log"]);
+    let rows = good(&["history", "--state", &life.path("state"), "--kind", "half-cycle", "--json", "--limit", "0"]);
+    let rows: Value = serde_json::from_str(&rows).expect("JSON");
+    let charge_ah = |row: &Value| row["charge_ah"].as_f64().expect("a number");
+    let kept_ah: f64 = STRINGS * rows["rows"].as_array().expect("rows").iter().map(charge_ah).sum::<f64>();
     let (args, accidents) = (life.of_store(), life.path("accidents.json"));
+    let moved_ah = |document: &Value| document["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
+    let stored_ah = moved_ah(&passport(&with(&args, &["--static", &accidents])));
+    let (config, old, new) = (life.path("pack.toml"), life.path("old.log"), life.path("new.log"));
+    let of_logs = ["-c", &config, &old, &new, "--static", &accidents, "--throughput-before-ah", "0"];
+    let replayed_ah = moved_ah(&passport(&of_logs));
+    // The state is stored to six digits.
+    assert!((stored_ah - replayed_ah).abs() < 1e-4 * replayed_ah, "{stored_ah} and {replayed_ah} Ah");
+    assert!(kept_ah < 0.7 * stored_ah, "{kept_ah} of {stored_ah} Ah are left");
+}
+
+#[test]
+fn half_cycles_that_others_deleted_make_the_sums_unknown() {
+    let life = Life::new();
+    let (args, accidents) = (life.of_store(), life.path("accidents.json"));
+    let database = rusqlite::Connection::open(Path::new(&life.path("state")).join("packwatch.db")).expect("a database");
+    database
+        .execute("DELETE FROM half_cycle WHERE moment = (SELECT min(moment) FROM half_cycle)", [])
+        .expect("deleted");
     let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
-    assert!(said.contains("half-cycles were deleted from the store") && said.contains("--throughput-ah"), "{said}");
+    assert!(said.contains("1 half-cycles are missing from the store") && said.contains("--throughput-ah"), "{said}");
+    // As a daemon does that opens the store: it counts the rows again.
+    database.execute("UPDATE meta SET half_cycles = (SELECT count(*) FROM half_cycle)", []).expect("updated");
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]));
+    assert!(said.contains("1 half-cycles are missing from the store"), "{said}");
+}
+
+/// Arguments of a passport from logs, of a battery recorded since new.
+fn of_logs(life: &Life, logs: &[&str]) -> Vec<String> {
+    let mut args = vec!["-c".to_owned(), life.path("pack.toml")];
+    args.extend(logs.iter().map(|log| life.path(log)));
+    args.extend(["--static".to_owned(), life.path("accidents.json")]);
+    args
+}
+
+#[test]
+fn a_record_without_its_current_has_no_sums() {
+    let life = Life::configured("");
+    let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
+    fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", "max_age_s = 5.0")).expect("written");
+    // Each reading of the current may be used for half of the time until the next.
+    life.simulate("sparse.log", "1700000000", &["--cycles", "2", "--period", "10000"]);
+    let args = of_logs(&life, &["sparse.log"]);
+    let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
+    assert!(said.contains("the current is missing from the record for") && said.contains("--throughput-ah"), "{said}");
+    let given = passport(&with(&args, &["--throughput-ah", "400"]));
+    assert_eq!(given["NumberOfFullCycles"]["NumberOfFullCyclesValue"], 50);
+    assert!(given.get("EnergyThroughput").is_none(), "{given}");
+}
+
+#[test]
+fn a_record_with_a_hole_under_load_or_without_its_beginning_has_no_sums() {
+    let life = Life::configured("");
+    life.simulate("life.log", "1700000000", &["--cycles", "2"]);
+    let text = fs::read_to_string(life.path("life.log")).expect("a log");
+    let stamp = |line: &str| line.split(['(', ')']).nth(1).and_then(|stamp| stamp.parse::<f64>().ok()).unwrap_or(0.0);
+    // Ten minutes of the first hour, in a discharge.
+    let is_kept = |line: &&str| !(1_700_001_200.0..1_700_001_800.0).contains(&stamp(line));
+    let cut: Vec<&str> = text.lines().filter(is_kept).collect();
+    fs::write(life.path("cut.log"), cut.join("\n")).expect("written");
+    fs::write(life.path("journal.000003.zst"), zstd::encode_all(text.as_bytes(), 1).expect("packed")).expect("written");
+    let said = |log: &str| {
+        let args = of_logs(&life, &[log]);
+        refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]))
+    };
+    let gap = said("cut.log");
+    assert!(gap.contains("the record has a gap of ") && gap.contains(" s that began while current flowed"), "{gap}");
+    let beginning = said("journal");
+    assert!(beginning.contains("the first 2 segments of the journal are missing"), "{beginning}");
+    let whole = passport(&with(&of_logs(&life, &["life.log"]), &["--throughput-before-ah", "0"]));
+    assert!(whole.get("EnergyThroughput").is_some(), "{whole}");
+}
+
+#[test]
+fn a_car_that_sleeps_between_its_trips_loses_nothing() {
+    let life = Life::configured("");
+    life.simulate("first.log", "1700000000", &["--cycles", "1"]);
+    life.rest("first.log");
+    life.simulate("second.log", "1700040000", &["--cycles", "1"]);
+    let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
+    // With the shorter age the buses fall asleep before the recorder does.
+    for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
+        fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
+        let args = of_logs(&life, &["first.log", "second.log"]);
+        let whole = passport(&with(&args, &["--throughput-before-ah", "0"]));
+        let charge_ah = whole["CapacityThroughput"]["CapacityThroughputValue"].as_f64().expect("known");
+        let energy_kwh = whole["EnergyThroughput"]["EnergyThroughputValue"].as_f64().expect("known");
+        assert!(charge_ah > 5.0 && energy_kwh > 0.015, "{age}: {charge_ah} Ah, {energy_kwh} kWh");
+    }
+}
+
+#[test]
+fn a_store_of_another_configuration_is_refused_with_both_values() {
+    let life = Life::new();
+    let (args, accidents) = (life.of_store(), life.path("accidents.json"));
+    let pack = fs::read_to_string(life.path("pack.toml")).expect("a file");
+    let model = shipped("config/cells/nasa_b0005.toml");
+    let cells = fs::read_to_string(&model).expect("a file");
+    let said = |text: String| {
+        fs::write(life.path("pack.toml"), text).expect("written");
+        refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--static", &accidents]))
+    };
+    let strings = said(pack.replace("strings = 2", "strings = 4"));
+    assert!(strings.contains("the record is of 2 parallel strings, the configuration has 4"), "{strings}");
+    let larger = cells.replace("rated_capacity_ah = 2.0", "rated_capacity_ah = 3.0");
+    fs::write(life.path("larger.toml"), larger).expect("written");
+    let capacity = said(pack.replace(&format!("{model:?}"), "\"larger.toml\""));
+    assert!(capacity.contains("cells of 2 Ah, the configuration has cells of 3 Ah"), "{capacity}");
+    assert!(capacity.contains("state: "), "the folder is named: {capacity}");
+}
+
+#[test]
+fn a_value_of_a_clock_that_was_not_set_is_not_dated() {
+    let life = Life::configured("");
+    life.simulate("unset.log", "0", &["--cycles", "3"]);
+    life.simulate("set.log", "1700000000", &["--duration", "300"]);
+    life.rest("unset.log");
+    life.replay(&["unset.log", "set.log"]);
+    let (config, state) = (life.path("pack.toml"), life.path("state"));
+    let stored = ["-c", &config, "--state", &state, "--static", &life.path("accidents.json")].map(str::to_owned);
+    for args in [of_logs(&life, &["unset.log", "set.log"]), stored.to_vec()] {
+        let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
+        assert!(said.contains("NumberOfFullCycles: required, but not known: its time is not known"), "{said}");
+        let given = passport(&with(&args, &["--throughput-ah", "400"]));
+        assert!(given.get("RemainingCapacity").is_none() && !given.to_string().contains("\"1970-"), "{given}");
+    }
+    let said = |logs: &[&str]| {
+        let args = of_logs(&life, logs);
+        refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-ah", "400"]))
+    };
+    assert!(said(&["unset.log"]).contains("the record has no dates"));
+    let moved = said(&["set.log", "unset.log"]);
+    assert!(moved.contains("a log begins before the end of the log before it"), "{moved}");
 }
 
 /// What a peer says of a passport; `None`, said on the output, where there is none.

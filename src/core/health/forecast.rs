@@ -296,6 +296,11 @@ impl Forecast {
         Ok(())
     }
 
+    /// Capacity of the new cell, Ah, as it was given at the beginning.
+    pub fn reference_ah(&self) -> f64 {
+        self.reference_ah
+    }
+
     /// Number of readings so far.
     pub fn readings(&self) -> u32 {
         self.readings

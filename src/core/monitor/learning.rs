@@ -66,11 +66,42 @@ pub(super) struct CellHealth {
     /// Resistance relative to new after the last discharge.
     #[serde(default)]
     pub(super) discharge_resistance: Option<ScalarGaussian>,
+    /// `None` in states of earlier programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) throughput: Option<Throughput>,
+}
+
+/// Sums over all half-cycles of a cell.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Throughput {
+    /// Charge moved in both directions, Ah.
+    pub charge_ah: f64,
+    /// Duration of the charges, s.
+    pub charging_s: f64,
+    /// Duration of the discharges, s.
+    pub discharging_s: f64,
+}
+
+impl Throughput {
+    /// Adds a half-cycle.
+    pub fn add(&mut self, mode: Mode, charge_ah: f64, duration_s: f64) {
+        self.charge_ah += charge_ah.max(0.0);
+        match mode {
+            Mode::Charge => self.charging_s += duration_s.max(0.0),
+            _ => self.discharging_s += duration_s.max(0.0),
+        }
+    }
 }
 
 impl Default for CellHealth {
     fn default() -> Self {
-        Self { full_soc: 1.0, tapered: false, usable: None, discharge_resistance: None }
+        Self {
+            full_soc: 1.0,
+            tapered: false,
+            usable: None,
+            discharge_resistance: None,
+            throughput: Some(Throughput::default()),
+        }
     }
 }
 
@@ -218,6 +249,9 @@ impl Learning {
             let (capacity, full_soc) = (update.capacity, health.full_soc);
             health.usable =
                 Some(usable_capacity(bank.model(), usable, (&estimator, bank.config()), capacity, full_soc));
+        }
+        if let Some(throughput) = &mut health.throughput {
+            throughput.add(half_cycle.mode, half_cycle.charge_ah, half_cycle.duration_s);
         }
         let resistance = resistance(bank, index);
         if is_discharge {

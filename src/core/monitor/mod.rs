@@ -67,6 +67,7 @@ pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
 pub use intake::{CommandConfig, ControllerCount};
 pub use j1939::{AlarmCode, J1939Config};
+pub use learning::Throughput;
 pub use modelling::{ModelChange, ModelState, ModelView};
 pub use outputs::{Estimate, MeasuredValues, Outputs, Secured, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};

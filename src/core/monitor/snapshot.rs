@@ -11,7 +11,7 @@ use super::buses::Buses;
 use super::continuation::Continuation;
 use super::estimation::Consumed;
 use super::intake::IntakeState;
-use super::learning::{CellHealth, LearningState};
+use super::learning::{CellHealth, LearningState, Throughput};
 use super::life::CellLife;
 use super::modelling::{ModelView, ModellingState};
 use super::pack_memory::{PackMemory, StoredPack};
@@ -407,6 +407,31 @@ impl Snapshot {
         Some(self.diagnosis.as_ref()?.imbalance(middle))
     }
 
+    /// Half-cycles of all cells and packs since the first start.
+    pub fn half_cycles(&self) -> u64 {
+        self.statistics.learning.half_cycles
+    }
+
+    /// What each cell of the connected pack has moved; `None` = the state is of an earlier program.
+    pub fn throughputs(&self) -> Option<Vec<Throughput>> {
+        self.cells.iter().map(|cell| cell.health.throughput).collect()
+    }
+
+    /// Rated capacity of a cell in the configuration with which its record began, Ah; `None` = the state is of an earlier program.
+    pub fn rated_capacity_ah(&self) -> Option<f64> {
+        self.cells.first()?.forecast.as_ref().map(Forecast::reference_ah)
+    }
+
+    /// Number of cells that are estimated.
+    pub fn cells(&self) -> usize {
+        self.cells.len()
+    }
+
+    /// Parallel strings, and cells in series, of its configuration; `None` = the state is of an earlier program.
+    pub fn wiring(&self) -> Option<(u16, u16)> {
+        self.sampler.wiring()
+    }
+
     /// What is known of the cells' model; `label` is that of the configuration, for a state without a fit. `None` = the state is of a
     /// model file, or the label is not known.
     ///
@@ -496,6 +521,10 @@ impl StoredCell {
         bounds::STORED_SOC.check("the SOC of a full cell", self.health.full_soc)?;
         check_positive("the usable capacity", self.health.usable)?;
         check_positive("the resistance of discharge", self.health.discharge_resistance)?;
+        if let Some(Throughput { charge_ah, charging_s, discharging_s }) = self.health.throughput {
+            InvalidState::unless_natural("the charge moved", charge_ah)?;
+            bounds::TIME_S.check_all("the time of charges and discharges", [charging_s, discharging_s])?;
+        }
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         bounds::CHARGE_AS.check("the charge taken in", charge_as)?;

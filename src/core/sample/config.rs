@@ -66,3 +66,13 @@ pub struct SampleConfig {
     /// Ambient temperature without a sensor, degrees C.
     pub ambient_c: f64,
 }
+
+impl SampleConfig {
+    /// Cells in series.
+    pub const fn series(&self) -> u16 {
+        match self.voltage_source {
+            VoltageSource::Cells => self.cells,
+            VoltageSource::PackTotal { series } => series,
+        }
+    }
+}

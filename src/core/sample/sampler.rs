@@ -45,6 +45,12 @@ pub struct SamplerState {
     counts: ReadingCounts,
     #[serde(default)]
     frozen: FrozenCheck,
+    /// Parallel strings of the configuration; 0 in states of earlier programs, as the next.
+    #[serde(default)]
+    strings: u16,
+    /// Cells in series.
+    #[serde(default)]
+    series: u16,
 }
 
 impl SamplerState {
@@ -56,6 +62,11 @@ impl SamplerState {
         self.charge.check()?;
         self.frozen.check()?;
         self.signals.iter().try_for_each(Signal::check)
+    }
+
+    /// Parallel strings, and cells in series, of the configuration; `None` = the state is of an earlier program.
+    pub fn wiring(&self) -> Option<(u16, u16)> {
+        (self.strings > 0).then_some((self.strings, self.series))
     }
 
     /// Charge up to `time`, As, for the pack: the latest reading holds for at most `max_age_s`.
@@ -464,7 +475,8 @@ impl Sampler {
 
     /// Returns the state for storing.
     pub fn snapshot(&self) -> SamplerState {
-        self.state.clone()
+        let (strings, series) = (self.config.strings, self.config.series());
+        SamplerState { strings, series, ..self.state.clone() }
     }
 
     /// Restores a stored state (rebased by the caller). The downtime is unmeasured like any other hole.

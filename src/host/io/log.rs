@@ -115,6 +115,8 @@ struct ReadState {
     fresh: bool,
     /// Whether the time between the records so far and that one is unknown.
     unknown: bool,
+    /// Whether a file's stamps were moved behind those of the file before.
+    has_moved_stamps: bool,
 }
 
 impl LogSource {
@@ -137,6 +139,7 @@ impl LogSource {
                 latest: None,
                 fresh: true,
                 unknown: false,
+                has_moved_stamps: false,
             },
             read_bytes: Arc::default(),
         }
@@ -155,6 +158,11 @@ impl LogSource {
     /// Counts of what was read so far.
     pub fn counts(&self) -> &LogCounts {
         &self.state.counts
+    }
+
+    /// Whether a file began before the end of the file before, so that its stamps were moved: they are no dates.
+    pub fn has_moved_stamps(&self) -> bool {
+        self.state.has_moved_stamps
     }
 
     /// Bytes taken from the files so far, compressed as they are.
@@ -430,7 +438,7 @@ impl ReadState {
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
                 self.shift_ns = latest.plus_nanos(UNKNOWN_GAP_NS).nanos().saturating_sub(raw.nanos());
-                gap = true;
+                (gap, self.has_moved_stamps) = (true, true);
             }
             self.fast_line.shift(self.shift_ns);
         }

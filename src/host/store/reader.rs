@@ -80,8 +80,12 @@ pub struct HistoryEntry {
 pub struct HistoryExtent {
     /// Number of the pack that is connected, from 1; 0 = none yet.
     pub pack: i64,
+    /// Half-cycles, of any pack, that the store has.
+    pub half_cycles: i64,
     /// Half-cycles, of any pack, that were deleted: thinned out, or too old.
     pub deleted_half_cycles: i64,
+    /// Half-cycles, of any pack, that were written, as the store itself counts them.
+    pub written_half_cycles: i64,
 }
 
 impl HistoryReader {
@@ -131,8 +135,18 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
-        let meta = meta::Meta::read(&self.connection).map_err(|error| self.named(&error))?;
-        Ok(HistoryExtent { pack: meta.pack, deleted_half_cycles: meta.thinned })
+        // One statement, which a daemon that writes cannot come between.
+        let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), thinned, half_cycles + thinned \
+                   FROM meta WHERE id = 1";
+        let extent = self.connection.query_row(sql, [], |row| {
+            Ok(HistoryExtent {
+                pack: row.get(0)?,
+                half_cycles: row.get(1)?,
+                deleted_half_cycles: row.get(2)?,
+                written_half_cycles: row.get(3)?,
+            })
+        });
+        extent.map_err(|error| self.named(&error))
     }
 
     /// Checks the hash chain.

@@ -9,12 +9,14 @@ use super::record::{CellRecord, Learned, Record};
 
 use crate::cell::CellModel;
 use crate::config::Config;
-use crate::monitor::{Downtime, Input, ModelState, Monitor, Outputs};
+use crate::monitor::{Downtime, Input, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
-use crate::sample::VoltageSource;
 
-/// Stamps before this, s since 1970, are no dates: a clock that was not set, a log that counts from its start.
-const FIRST_DATE_S: f64 = 3.0e8;
+/// Stamps before 2001-01-01, s since 1970, are no dates. A clock that was not set begins in 1970, 1980 or 2000; a log that counts from its
+/// start is shorter than 30 years.
+const FIRST_DATE_S: f64 = 978_307_200.0;
+/// Largest difference between two statements about the new battery, fraction: they may be rounded.
+pub(super) const RATED_TOLERANCE: f64 = 0.01;
 /// Where a cell's resistance is stated: half charge, 25 degrees C.
 const RESISTANCE_AT: (f64, f64) = (0.5, 25.0);
 
@@ -67,7 +69,7 @@ impl Condition {
     pub fn new(record: &Record, config: &Config, model: &CellModel, terms: &Terms) -> Result<Self, String> {
         let battery = Battery::new(record, config, model)?;
         let moved = battery.moved_ah(terms);
-        let values = Field::ALL.map(|field| (field, battery.value(field, terms, &moved)));
+        let values = Field::ALL.map(|field| (field, battery.value(field, terms, &moved).and_then(dated)));
         let rated = Rated { capacity_ah: Some(battery.rated_ah()), energy_kwh: terms.certified_kwh };
         Ok(Self { values: values.to_vec(), rated })
     }
@@ -90,6 +92,42 @@ impl Condition {
     }
 }
 
+fn is_date(time: Timestamp) -> bool {
+    time.secs() >= FIRST_DATE_S
+}
+
+/// A value with a real time.
+fn dated(quantity: Quantity) -> Known {
+    if is_date(quantity.time) {
+        return Ok(quantity);
+    }
+    Err("its time is not known: the clock was not set when it was measured".to_owned())
+}
+
+/// Checks that a state was taken with this configuration of the pack. What a state of an earlier program does not say is not checked.
+fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
+    let sample = &config.monitor.sample;
+    let (strings, series) = state.wiring().unzip();
+    let counts = [
+        ("estimated cells", u16::try_from(state.cells()).ok(), sample.cells),
+        ("parallel strings", strings, sample.strings),
+        ("cells in series", series, sample.series()),
+    ];
+    for (name, found, configured) in counts {
+        if let Some(found) = found.filter(|found| *found != configured) {
+            return Err(format!("the record is of {found} {name}, the configuration has {configured}"));
+        }
+    }
+    let configured_ah = config.monitor.model.rated_capacity_ah;
+    let other = |found: &f64| (found - configured_ah).abs() > RATED_TOLERANCE * configured_ah;
+    match state.rated_capacity_ah().filter(other) {
+        Some(found) => Err(format!(
+            "the record is of cells of {found} Ah, the configuration has cells of {configured_ah} Ah (rated capacity)"
+        )),
+        None => Ok(()),
+    }
+}
+
 /// The sources of the values.
 struct Battery<'a> {
     record: &'a Record,
@@ -108,28 +146,26 @@ impl<'a> Battery<'a> {
         let Some((at_ns, snapshot)) = &record.state else {
             return Err("no state: the record has no reading, or its state is damaged".to_owned());
         };
-        if Timestamp::from_nanos(*at_ns).secs() < FIRST_DATE_S {
+        if !is_date(Timestamp::from_nanos(*at_ns)) {
             return Err(
                 "the record has no dates, and a passport's values need their time: the clock was not set, or the log \
                         counts from its own start (--start-times dates a CSV)"
                     .to_owned(),
             );
         }
+        check_origin(snapshot, config)?;
         let time = snapshot.time;
         let mut monitor = Monitor::new(config.monitor.clone());
         let fits = monitor.restore((**snapshot).clone(), Downtime::AsStamped);
         fits.map_err(|error| format!("the state does not fit the configuration: {error}"))?;
         monitor.handle(Input::Tick { time }, &mut Outputs::default());
         let sample = &config.monitor.sample;
-        let series = match sample.voltage_source {
-            VoltageSource::Cells => sample.cells,
-            VoltageSource::PackTotal { series } => series,
-        };
         let offset_ns = at_ns.saturating_sub(time.nanos());
-        let (series, strings) = (f64::from(series), f64::from(sample.strings));
+        let (series, strings) = (f64::from(sample.series()), f64::from(sample.strings));
         Ok(Self { record, config, model, monitor, offset_ns, series, strings })
     }
 
+    /// Determines a value.
     fn value(&self, field: Field, terms: &Terms, moved: &Known) -> Known {
         let rated_ah = self.rated_ah();
         match field {
@@ -188,17 +224,20 @@ impl<'a> Battery<'a> {
     }
 
     fn moved_kwh(&self, terms: &Terms) -> Known {
-        let Some((energy_wh, until_ns)) = self.record.energy else {
+        let Some(energy) = &self.record.energy else {
             return Err("a store keeps no voltages to integrate; a replay of the logs does".to_owned());
         };
+        if let Some(gap) = self.record.gap.as_deref().or(energy.gap()) {
+            return Err(gap.to_owned());
+        }
         if terms.moved_before_ah != Some(0.0) {
             return Err("the record does not begin with the new battery (--throughput-before-ah 0)".to_owned());
         }
         // One estimated cell stands for all where only the pack's total is measured.
         let cells = self.series / f64::from(self.config.monitor.sample.cells);
-        let value = 1e-3 * self.strings * cells * energy_wh;
+        let value = 1e-3 * self.strings * cells * energy.energy_wh;
         let std = Some(self.config.monitor.health.capacity.current_gain_std * value);
-        let time = until_ns.map_or_else(|| self.wall(self.monitor.now()), Timestamp::from_nanos);
+        let time = energy.until.unwrap_or_else(|| self.wall(self.monitor.now()));
         Ok(Quantity { value, std, time })
     }
 

@@ -1,11 +1,11 @@
 //! The passport as JSON: the manufacturer's part with the known values merged in, checked against the form of its standard.
 //!
 //! In: a [`Condition`] and the manufacturer's part. Out: the passport, and the [details](details) that the standards have no members
-//! for. One value has one source: a static part that states a value which was measured is refused. Same inputs, same bytes.
+//! for. A value has one source: a static part that states a measured value is refused. The same inputs give the same bytes.
 
 use serde_json::{Map, Value, json};
 
-use super::condition::{Condition, Rated};
+use super::condition::{Condition, RATED_TOLERANCE, Rated};
 use super::field::{Field, Place, Standard, rounded};
 use super::shape::{Verdict, joined};
 use super::standards;
@@ -13,8 +13,6 @@ use super::standards;
 use crate::config::VehicleIdentity;
 use crate::io::stamp::format_utc;
 
-/// Largest difference between what the static part and the configuration say of the new battery, fraction: they may be rounded.
-const RATED_TOLERANCE: f64 = 0.01;
 /// Version of the details.
 const VERSION: u32 = 1;
 
@@ -96,14 +94,14 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     if object.contains_key(name) {
         let path = joined(group, name);
         return Err(format!(
-            "{path}: stated in the static part, but measured ({value}): one of both, leave it out there"
+            "{path}: stated in the static part, but measured ({value}): leave it out of the static part"
         ));
     }
     object.insert(name.to_owned(), value);
     Ok(())
 }
 
-/// Faults of a static part that is another battery's: only Catena-X states what it was when new.
+/// Faults of a static part of another battery. Only Catena-X states the rated values.
 fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
     let both = [
         ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),
@@ -172,7 +170,7 @@ mod tests {
         assert_eq!(
             refused,
             [
-                "StateOfCharge.StateOfChargeValue: stated in the static part, but measured (12.75): one of both, leave it out there"
+                "StateOfCharge.StateOfChargeValue: stated in the static part, but measured (12.75): leave it out of the static part"
             ]
         );
         let temperatures =

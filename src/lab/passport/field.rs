@@ -42,9 +42,9 @@ pub enum Field {
     RemainingCapacity,
     /// Capacity lost, % of the rated.
     CapacityFade,
-    /// Resistance gained by the cell that gained most, % of the new.
+    /// Resistance increase of the cell with the largest, % of the new cell's.
     CellResistanceIncrease,
-    /// Resistance gained by all cells together, % of the new.
+    /// Resistance increase of all cells together, % of the new cells'.
     PackResistanceIncrease,
     /// Ohmic resistance of the cell with the highest, ohm.
     CellResistance,
@@ -118,10 +118,10 @@ impl Field {
             }
             Self::CapacityFade => ("capacity_fade", "%", "rated less remaining capacity, of the rated"),
             Self::CellResistanceIncrease => {
-                ("cell_resistance_increase", "%", "resistance of the cell that gained most, over new, less 100 %")
+                ("cell_resistance_increase", "%", "resistance increase of the cell with the largest, of the new cell's")
             }
             Self::PackResistanceIncrease => {
-                ("pack_resistance_increase", "%", "mean of all cells' resistances over new, less 100 %")
+                ("pack_resistance_increase", "%", "mean resistance increase of all cells, of the new cells'")
             }
             Self::CellResistance => (
                 "cell_resistance",

@@ -1,23 +1,14 @@
-//! What a store or a replay says of the connected pack: half-cycles added up, the latest learned values, energy, the last state.
+//! Record of the connected pack, from a store or a replay: sums of half-cycles, energy, the latest learned values, the last state.
 //!
 //! Times are nanoseconds since 1970: the wall clock of a store, the log's clock of a replay. Rows of a store and events of a replay have
-//! the same names for the same values, so both give the same sums. Energy needs every voltage: a store has none.
+//! the same names for the same values, so both give the same sums. Energy needs every voltage: a store has none. Where a part of a sum is
+//! missing, [`Record::gap`] has the reason.
 
+use super::losses::{Losses, ReadingLimits, is_too_much};
 use crate::fields::Fields;
-use crate::monitor::{Estimate, Event, EventKind, Snapshot};
-use crate::quantity::Timestamp;
-use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
-
-/// Charge that a cell has moved.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Moved {
-    /// Both directions, Ah.
-    pub(super) charge_ah: f64,
-    /// Duration of the charges, s.
-    pub(super) charging_s: f64,
-    /// Duration of the discharges, s.
-    pub(super) discharging_s: f64,
-}
+use crate::monitor::{Estimate, Event, EventKind, Outputs, Snapshot, Throughput};
+use crate::quantity::{Mode, Timestamp};
+use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Latest values learned of a cell, with standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,32 +25,63 @@ pub(super) struct Learned {
 /// A cell's part of a record.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CellRecord {
-    pub(super) moved: Moved,
+    pub(super) moved: Throughput,
     pub(super) learned: Option<Learned>,
-    /// Of a replay: last power, W, and its time.
-    power: Option<(Timestamp, f64)>,
+    /// Of a replay: the last reading of voltage and current.
+    power: Option<Power>,
+}
+
+/// Power of a cell at one time.
+#[derive(Debug, Clone, Copy)]
+struct Power {
+    time: Timestamp,
+    /// Without its sign, W.
+    power_w: f64,
+    /// Whether the pack rests.
+    is_rest: bool,
+}
+
+/// Energy of a replay: the integral of the power of all cells of one string.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Energy {
+    /// Both directions added, Wh.
+    pub(super) energy_wh: f64,
+    /// Time of its last part.
+    pub(super) until: Option<Timestamp>,
+    /// Time that it covers, s, all cells added.
+    counted_s: f64,
+    /// Time in use without a voltage, s, all cells added.
+    lost_s: f64,
+}
+
+impl Energy {
+    /// Why it is not known; `None` = it is.
+    pub(super) fn gap(&self) -> Option<&'static str> {
+        is_too_much(self.lost_s, self.counted_s).then_some("voltages are missing from the record while current flowed")
+    }
 }
 
 /// Everything that a passport is made from, besides the configuration.
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the latest half-cycle.
+    /// End of the last half-cycle; a clock that was set may have been later before.
     pub(super) moved_until_ns: Option<i64>,
-    /// Why half-cycles are missing.
+    /// Why charge is missing from the half-cycles.
     pub(super) gap: Option<String>,
-    /// Energy moved by all cells of one string, Wh, and the time of the last part; `None` = not known: a store.
-    pub(super) energy: Option<(f64, Option<i64>)>,
-    /// Longest time between two voltages that counts for the energy, s.
-    longest_step_s: f64,
+    /// `None` = not known: a store.
+    pub(super) energy: Option<Energy>,
+    limits: ReadingLimits,
+    /// Of a replay.
+    losses: Losses,
     /// The last state and its time, which its own clock calls `snapshot.time`.
     pub(super) state: Option<(i64, Box<Snapshot>)>,
 }
 
 impl Record {
-    /// A replay's record, without any event yet; voltages further apart than this, s, give no energy.
-    pub fn of_replay(longest_step_s: f64) -> Self {
-        Self { energy: Some((0.0, None)), longest_step_s, ..Self::default() }
+    /// A replay's record, without any event yet.
+    pub fn of_replay(limits: ReadingLimits) -> Self {
+        Self { energy: Some(Energy::default()), limits, losses: Losses::new(limits), ..Self::default() }
     }
 
     /// The connected pack's record in a store.
@@ -73,15 +95,10 @@ impl Record {
                 broken.row
             ));
         }
+        // The state before the rows: a daemon may add some in between.
+        let state = reader.dated_snapshot().map(|(at, state)| (at, Box::new(state)));
         let extent = reader.extent()?;
-        let mut record =
-            Self { state: reader.dated_snapshot().map(|(at, state)| (at, Box::new(state))), ..Self::default() };
-        if extent.deleted_half_cycles > 0 {
-            record.gap = Some(format!(
-                "{} half-cycles were deleted from the store (store.max_half_cycles, store.keep_years)",
-                extent.deleted_half_cycles
-            ));
-        }
+        let mut record = Self { state, ..Self::default() };
         for kind in [HistoryTable::HalfCycle, HistoryTable::Capacity, HistoryTable::Reset] {
             reader.for_each(kind, &HistoryQuery::default(), &mut |entry| {
                 if entry.pack == extent.pack {
@@ -89,7 +106,37 @@ impl Record {
                 }
             })?;
         }
+        record.note_missing_rows(&extent);
         Ok(record)
+    }
+
+    /// Compares the half-cycles of a store with what was counted when they were written. They are not in the hash chain.
+    /// The state's own sums stand for rows that the store deleted, if the state is as old as the rows.
+    fn note_missing_rows(&mut self, extent: &HistoryExtent) {
+        let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
+        let counted = self.snapshot().map_or(0, Snapshot::half_cycles);
+        let counted = i64::try_from(counted).unwrap_or(i64::MAX);
+        let missing = counted.max(written_half_cycles).saturating_sub(half_cycles.saturating_add(deleted));
+        if missing > 0 {
+            self.note_gap(format!(
+                "{missing} half-cycles are missing from the store, which did not delete them itself"
+            ));
+        }
+        if deleted == 0 {
+            return;
+        }
+        let is_whole = counted >= half_cycles.saturating_add(deleted);
+        match self.snapshot().and_then(Snapshot::throughputs).filter(|_| is_whole) {
+            Some(sums) => sums.into_iter().enumerate().for_each(|(index, sum)| self.cell(index).moved = sum),
+            None => self.note_gap(format!(
+                "{deleted} half-cycles were deleted from the store (store.max_half_cycles, store.keep_years)"
+            )),
+        }
+    }
+
+    /// Notes why charge is missing; the first reason counts.
+    pub fn note_gap(&mut self, reason: String) {
+        self.gap.get_or_insert(reason);
     }
 
     fn take_entry(&mut self, entry: &HistoryEntry) {
@@ -104,36 +151,63 @@ impl Record {
         }
     }
 
+    /// Takes outputs of a replay, in their order.
+    pub fn take(&mut self, out: &Outputs) {
+        // An event may be a gap: the estimates before it say what current flowed, those of its time come after it.
+        let mut estimates = out.estimates.iter().peekable();
+        for event in &out.events {
+            while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {
+                self.take_estimate(estimate);
+            }
+            self.take_event(event);
+        }
+        estimates.for_each(|estimate| self.take_estimate(estimate));
+    }
+
     /// Takes an event of a replay.
-    pub fn take_event(&mut self, event: &Event) {
+    fn take_event(&mut self, event: &Event) {
         let at_ns = event.time.nanos();
+        self.losses.take_event(event);
         match event.kind {
             EventKind::HalfCycle { .. } => self.take_half_cycle(at_ns, &Fields::of_event(&event.kind)),
             EventKind::Capacity { .. } => self.take_capacity(at_ns, &Fields::of_event(&event.kind)),
-            EventKind::PackReplaced { .. } => *self = Self::of_replay(self.longest_step_s),
+            EventKind::PackReplaced { .. } => {
+                self.losses.restart(event.time);
+                *self = Self { losses: std::mem::take(&mut self.losses), ..Self::of_replay(self.limits) };
+            }
+            EventKind::PackReturned { .. } => {
+                self.note_gap("the pack was connected before, and what it moved then is not added".to_owned());
+            }
             _ => {}
         }
     }
 
     /// Takes an estimate of a replay: the energy since the cell's one before.
-    pub fn take_estimate(&mut self, estimate: &Estimate) {
-        let longest_s = self.longest_step_s;
-        let power_w = (estimate.measured.voltage_v * estimate.measured.current_a).abs();
-        let power = power_w.is_finite().then_some((estimate.time, power_w));
+    fn take_estimate(&mut self, estimate: &Estimate) {
+        self.losses.take_estimate(estimate);
+        let longest_s = self.limits.voltage_age_s;
+        let measured = &estimate.measured;
+        let power_w = (measured.voltage_v * measured.current_a).abs();
+        let is_rest = self.losses.is_rest(measured.current_a);
+        let power = power_w.is_finite().then_some(Power { time: estimate.time, power_w, is_rest });
         let before = std::mem::replace(&mut self.cell(estimate.cell.index()).power, power);
-        let (Some((from, from_w)), Some((to, to_w)), Some((energy_wh, until))) = (before, power, &mut self.energy)
-        else {
-            return;
-        };
-        let step_s = to.since(from);
+        let (Some(from), Some(to), Some(energy)) = (before, power, &mut self.energy) else { return };
+        let step_s = to.time.since(from.time);
         if (0.0..=longest_s).contains(&step_s) {
-            *energy_wh += 0.5 * (from_w + to_w) * step_s / 3600.0;
-            *until = Some(to.nanos());
+            energy.energy_wh += 0.5 * (from.power_w + to.power_w) * step_s / 3600.0;
+            energy.counted_s += step_s;
+            energy.until = Some(to.time);
+        } else if !(from.is_rest && to.is_rest || self.losses.has_paused_since(from.time)) {
+            energy.lost_s += step_s.abs();
         }
     }
 
     /// Takes the state at the end of a replay.
     pub fn finish(&mut self, state: Snapshot) {
+        let Throughput { charging_s, discharging_s, .. } = self.fullest();
+        if let Some(reason) = self.losses.finish(state.time, charging_s + discharging_s) {
+            self.note_gap(reason);
+        }
         self.state = Some((state.time.nanos(), Box::new(state)));
     }
 
@@ -152,13 +226,9 @@ impl Record {
     fn take_half_cycle(&mut self, at_ns: i64, fields: &Fields) {
         let (Some(cell), Some(charge_ah)) = (fields.whole("cell"), fields.number("charge_ah")) else { return };
         let duration_s = fields.number("duration_s").unwrap_or(0.0);
-        let moved = &mut self.cell(cell as usize).moved;
-        moved.charge_ah += charge_ah.max(0.0);
-        match fields.text("mode") {
-            "charge" => moved.charging_s += duration_s,
-            _ => moved.discharging_s += duration_s,
-        }
-        self.moved_until_ns = self.moved_until_ns.max(Some(at_ns));
+        let mode = if fields.text("mode") == "charge" { Mode::Charge } else { Mode::Discharge };
+        self.cell(cell as usize).moved.add(mode, charge_ah, duration_s);
+        self.moved_until_ns = Some(at_ns);
     }
 
     fn take_capacity(&mut self, at_ns: i64, fields: &Fields) {
@@ -173,12 +243,17 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Charge that the pack of so many strings has moved: that of the cell with most, which no missing row lowers. Ah, and the
-    /// difference of the durations of discharge and charge, h.
+    /// Charge that the pack of so many strings has moved, Ah, and the difference between the durations of discharges and charges, h.
+    /// Of the cell that has moved most: a row that another cell lacks does not lower it.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
-        let most = self.cells.iter().map(|cell| cell.moved).max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah));
-        let most = most.unwrap_or_default();
+        let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
+    }
+
+    /// Sums of the cell that has moved most.
+    fn fullest(&self) -> Throughput {
+        let sums = self.cells.iter().map(|cell| cell.moved);
+        sums.max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah)).unwrap_or_default()
     }
 }
 
@@ -187,6 +262,8 @@ mod tests {
     use super::*;
     use crate::monitor::MeasuredValues;
     use crate::quantity::{CellIndex, Mode};
+
+    const LIMITS: ReadingLimits = ReadingLimits { current_age_s: 60.0, voltage_age_s: 60.0, rest_a: 0.1 };
 
     fn half_cycle(time_s: f64, cell: u16, mode: Mode, charge_ah: f64) -> Event {
         let kind = EventKind::HalfCycle {
@@ -222,11 +299,11 @@ mod tests {
 
     #[test]
     fn half_cycles_of_both_directions_add_up_and_the_fullest_record_counts() {
-        let mut record = Record::of_replay(60.0);
+        let mut record = Record::of_replay(LIMITS);
         for event in [
             half_cycle(10.0, 0, Mode::Charge, 1.0),
-            half_cycle(20.0, 0, Mode::Discharge, 0.5),
             half_cycle(10.0, 1, Mode::Charge, 1.0),
+            half_cycle(20.0, 0, Mode::Discharge, 0.5),
         ] {
             record.take_event(&event);
         }
@@ -239,15 +316,50 @@ mod tests {
 
     #[test]
     fn energy_counts_both_directions_and_no_gap() {
-        let mut record = Record::of_replay(60.0);
+        let mut record = Record::of_replay(LIMITS);
         // 7.2 W for 50 s, and the same in the other direction; two minutes of nothing between them; a voltage without a current.
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {
             record.take_estimate(&estimate(time_s, 3.6, current_a));
         }
-        let (energy_wh, until) = record.energy.unwrap();
-        assert!((energy_wh - 2.0 * 7.2 * 50.0 / 3600.0).abs() < 1e-12, "{energy_wh}");
-        assert_eq!(until, Some(230_000_000_000));
+        let energy = record.energy.unwrap();
+        assert!((energy.energy_wh - 2.0 * 7.2 * 50.0 / 3600.0).abs() < 1e-12, "{energy:?}");
+        assert_eq!(energy.until, Some(Timestamp::from_secs(230.0)));
+        assert!(energy.gap().is_some(), "two minutes under load");
+    }
+
+    #[test]
+    fn a_voltage_that_comes_late_at_rest_leaves_the_energy_known() {
+        let mut record = Record::of_replay(LIMITS);
+        for (time_s, current_a) in [(0.0, 2.0), (50.0, 0.0), (5000.0, 0.0), (5050.0, 2.0)] {
+            record.take_estimate(&estimate(time_s, 3.6, current_a));
+        }
+        assert_eq!(record.energy.unwrap().gap(), None);
+    }
+
+    #[test]
+    fn the_current_before_a_gap_decides_not_the_first_one_after_it() {
+        let gap = Event { time: Timestamp::from_secs(5000.0), kind: EventKind::Gap { seconds: Some(4000.0) } };
+        for (before_a, after_a, is_known) in [(0.0, 2.0, true), (2.0, 0.0, false)] {
+            let mut record = Record::of_replay(LIMITS);
+            record.take(&Outputs { estimates: vec![estimate(900.0, 3.6, before_a)], ..Outputs::default() });
+            let estimates = vec![estimate(5000.0, 3.6, after_a)];
+            record.take(&Outputs { estimates, events: vec![gap], ..Outputs::default() });
+            assert_eq!(record.losses.finish(gap.time, 3600.0).is_none(), is_known, "{before_a} A before");
+        }
+    }
+
+    #[test]
+    fn rows_that_the_store_did_not_delete_itself_are_missed() {
+        let gap = |half_cycles, deleted_half_cycles, written_half_cycles| {
+            let mut record = Record::default();
+            let extent = HistoryExtent { pack: 1, half_cycles, deleted_half_cycles, written_half_cycles };
+            record.note_missing_rows(&extent);
+            record.gap.unwrap_or_default()
+        };
+        assert_eq!(gap(10, 0, 10), "");
+        assert!(gap(7, 0, 10).contains("3 half-cycles are missing"));
+        assert!(gap(7, 3, 10).contains("3 half-cycles were deleted"));
     }
 }

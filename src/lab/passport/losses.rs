@@ -1,0 +1,173 @@
+//! Charge that a replay did not see: times for which the current is not known.
+//!
+//! In: events and estimates of a replay, in order. Out: lost seconds, or the first gap whose charge has no bound. A replay reports
+//! a missing current in these ways:
+//!
+//! | report | charge |
+//! | --- | --- |
+//! | the current's signal turns bad or stale | lost until it is good again, less the time for which a reading may be used |
+//! | the buses fall asleep | none: the core reports it only while no current flows |
+//! | a gap: nothing was recorded | none if the buses slept or the last current was that of a pack at rest; otherwise not known |
+//!
+//! Assumption: a pack that rests when the recording stops rests until it continues. Use that was not recorded at all, from rest to
+//! rest, leaves no trace here.
+
+use crate::monitor::{Estimate, Event, EventKind};
+use crate::quantity::{Channel, Fault, Timestamp};
+
+/// Largest part of the time of charges and discharges for which the current may be lost: far below the deviation of a current
+/// sensor's gain, and enough for single lost frames.
+const MAX_LOST_PART: f64 = 1e-3;
+
+/// How a replay's current and voltages are read.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ReadingLimits {
+    /// For how long a reading of the current may be used, s.
+    pub current_age_s: f64,
+    /// The same of a voltage, s.
+    pub voltage_age_s: f64,
+    /// Current of a pack at rest, A per string.
+    pub rest_a: f64,
+}
+
+/// What was lost so far.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Losses {
+    limits: ReadingLimits,
+    /// Latest known current, A per string.
+    current_a: Option<f64>,
+    /// From when the current is lost.
+    lost_since: Option<Timestamp>,
+    is_asleep: bool,
+    /// End of the latest time in which nothing was recorded and no charge moved.
+    paused_until: Option<Timestamp>,
+    lost_s: f64,
+    /// The first gap whose charge has no bound.
+    gap: Option<String>,
+}
+
+impl Losses {
+    pub(super) fn new(limits: ReadingLimits) -> Self {
+        Self { limits, ..Self::default() }
+    }
+
+    /// Forgets what was lost: another pack is connected. What the signals do goes on.
+    pub(super) fn restart(&mut self, now: Timestamp) {
+        self.lost_since = self.lost_since.map(|since| since.max(now));
+        (self.lost_s, self.gap) = (0.0, None);
+    }
+
+    pub(super) fn take_estimate(&mut self, estimate: &Estimate) {
+        let current_a = estimate.measured.current_a;
+        if current_a.is_finite() {
+            self.current_a = Some(current_a);
+        }
+    }
+
+    pub(super) fn take_event(&mut self, event: &Event) {
+        match event.kind {
+            EventKind::SignalBad { channel: Channel::Current, fault } => {
+                // A stale reading was used until now, the one before a bad reading may be used from now on.
+                let held_s = if fault == Fault::Stale { 0.0 } else { self.limits.current_age_s };
+                self.lost_since.get_or_insert(event.time.plus_secs(held_s));
+            }
+            EventKind::SignalGood { channel: Channel::Current, .. } => self.end_loss(event.time),
+            EventKind::BusAsleep { asleep, .. } => {
+                (self.is_asleep, self.paused_until) = (asleep, Some(event.time));
+            }
+            EventKind::Gap { .. } if self.is_asleep || self.is_at_rest() => self.paused_until = Some(event.time),
+            EventKind::Gap { seconds } => {
+                let length = seconds.map_or_else(|| "an unknown time".to_owned(), |seconds| format!("{seconds:.0} s"));
+                self.gap.get_or_insert_with(|| {
+                    format!("the record has a gap of {length} that began while current flowed, or was not known")
+                });
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether a pack at rest has this current, A per string.
+    pub(super) fn is_rest(&self, current_a: f64) -> bool {
+        current_a.abs() <= self.limits.rest_a
+    }
+
+    /// Whether nothing was recorded, and no charge moved, in a part of the time since then.
+    pub(super) fn has_paused_since(&self, from: Timestamp) -> bool {
+        self.paused_until.is_some_and(|until| until > from)
+    }
+
+    fn is_at_rest(&self) -> bool {
+        self.lost_since.is_none() && self.current_a.is_some_and(|current_a| self.is_rest(current_a))
+    }
+
+    fn end_loss(&mut self, now: Timestamp) {
+        if let Some(since) = self.lost_since.take() {
+            self.lost_s += now.since(since).max(0.0);
+        }
+    }
+
+    /// Why the charge of the record, which ends at `end` and has charges and discharges of `used_s`, is not known; `None` = it is.
+    pub(super) fn finish(&mut self, end: Timestamp, used_s: f64) -> Option<String> {
+        self.end_loss(end);
+        let lost_s = self.lost_s;
+        let is_lost = is_too_much(lost_s, used_s);
+        self.gap.take().or_else(|| is_lost.then(|| format!("the current is missing from the record for {lost_s:.0} s")))
+    }
+}
+
+/// Whether so much of a time, s, is lost that its sum is not known.
+pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
+    lost_s > MAX_LOST_PART * used_s
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMITS: ReadingLimits = ReadingLimits { current_age_s: 2.0, voltage_age_s: 5.0, rest_a: 0.1 };
+    const USED_S: f64 = 3600.0;
+
+    fn finished(current_a: f64, events: &[(f64, EventKind)]) -> Option<String> {
+        let mut losses = Losses::new(LIMITS);
+        losses.current_a = Some(current_a);
+        for &(time_s, kind) in events {
+            losses.take_event(&Event { time: Timestamp::from_secs(time_s), kind });
+        }
+        losses.finish(Timestamp::from_secs(1000.0), USED_S)
+    }
+
+    fn bad(fault: Fault) -> EventKind {
+        EventKind::SignalBad { channel: Channel::Current, fault }
+    }
+
+    const GOOD: EventKind = EventKind::SignalGood { channel: Channel::Current, bad_readings: 1 };
+
+    #[test]
+    fn a_gap_at_rest_or_asleep_moves_no_charge_and_one_under_load_does() {
+        let gap = EventKind::Gap { seconds: Some(600.0) };
+        assert_eq!(finished(0.05, &[(10.0, gap)]), None);
+        let said = finished(5.0, &[(10.0, gap)]).expect("a gap");
+        assert!(said.contains("a gap of 600 s"), "{said}");
+        assert!(finished(5.0, &[(10.0, EventKind::Gap { seconds: None })]).is_some());
+        let asleep = |asleep| EventKind::BusAsleep { asleep, seconds: None };
+        assert_eq!(finished(5.0, &[(9.0, asleep(true)), (10.0, gap), (11.0, asleep(false))]), None);
+    }
+
+    #[test]
+    fn a_lost_current_counts_beyond_the_age_of_its_last_reading() {
+        assert_eq!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (12.5, GOOD)]), None, "half a second of an hour");
+        assert!(finished(5.0, &[(10.0, bad(Fault::OutOfRange)), (16.0, GOOD)]).is_some());
+        assert!(finished(0.0, &[(10.0, bad(Fault::Stale)), (14.0, GOOD)]).is_some(), "the bus lives");
+        assert!(finished(5.0, &[(10.0, bad(Fault::Stale))]).is_some(), "never good again");
+    }
+
+    #[test]
+    fn another_pack_begins_with_nothing_lost() {
+        let mut losses = Losses::new(LIMITS);
+        let at = Timestamp::from_secs;
+        losses.take_event(&Event { time: at(1.0), kind: bad(Fault::Stale) });
+        losses.restart(at(500.0));
+        losses.take_event(&Event { time: at(501.0), kind: GOOD });
+        assert_eq!(losses.finish(at(600.0), USED_S), None);
+    }
+}
