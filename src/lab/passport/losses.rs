@@ -51,7 +51,7 @@ impl Losses {
         Self { limits, ..Self::default() }
     }
 
-    /// Forgets what was lost: another pack is connected. What the signals do goes on.
+    /// Forgets what was lost: another pack is connected. A loss that has not ended counts from now.
     pub(super) fn restart(&mut self, now: Timestamp) {
         self.lost_since = self.lost_since.map(|since| since.max(now));
         (self.lost_s, self.gap) = (0.0, None);
