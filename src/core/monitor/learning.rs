@@ -71,8 +71,9 @@ pub(super) struct CellHealth {
     pub(super) throughput: Option<Throughput>,
 }
 
-/// Sums over all half-cycles of a cell.
+/// Sums over all half-cycles of a cell; stored as a list in the order of its fields, whose code every state shares.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(from = "[f64; 3]", into = "[f64; 3]")]
 pub struct Throughput {
     /// Charge moved in both directions, Ah.
     pub charge_ah: f64,
@@ -80,6 +81,18 @@ pub struct Throughput {
     pub charging_s: f64,
     /// Duration of the discharges, s.
     pub discharging_s: f64,
+}
+
+impl From<[f64; 3]> for Throughput {
+    fn from([charge_ah, charging_s, discharging_s]: [f64; 3]) -> Self {
+        Self { charge_ah, charging_s, discharging_s }
+    }
+}
+
+impl From<Throughput> for [f64; 3] {
+    fn from(sums: Throughput) -> Self {
+        [sums.charge_ah, sums.charging_s, sums.discharging_s]
+    }
 }
 
 impl Throughput {
