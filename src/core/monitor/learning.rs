@@ -96,13 +96,11 @@ impl From<Throughput> for [f64; 3] {
 }
 
 impl Throughput {
-    /// Adds a half-cycle.
+    /// Adds a half-cycle. No time exceeds what a state can hold, whatever jumps the clock makes.
     pub fn add(&mut self, mode: Mode, charge_ah: f64, duration_s: f64) {
         self.charge_ah += charge_ah.max(0.0);
-        match mode {
-            Mode::Charge => self.charging_s += duration_s.max(0.0),
-            _ => self.discharging_s += duration_s.max(0.0),
-        }
+        let time_s = if mode == Mode::Charge { &mut self.charging_s } else { &mut self.discharging_s };
+        *time_s = (*time_s + duration_s.max(0.0)).min(bounds::TIME_S.high);
     }
 }
 

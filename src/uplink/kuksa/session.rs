@@ -57,7 +57,7 @@ pub(crate) async fn run(
                 if changed.is_err() { break }
                 let document = documents.borrow_and_update();
                 session.publish(document.as_deref(), journal);
-                session.check_reading()?;
+                session.receipts.check(Instant::now())?;
             }
             () = wait_until(session.questions.due()) => session.handle_time()?,
             message = session.incoming.message() => match message.map_err(|status| words(&status))? {
@@ -77,8 +77,34 @@ struct Session {
     incoming: Streaming<FromBroker>,
     questions: Questions,
     request_id: u32,
-    /// When the broker was last known to have read something.
-    latest_read: Instant,
+    receipts: Receipts,
+}
+
+/// Since when the broker owes a receipt.
+#[derive(Debug, Default)]
+struct Receipts {
+    owed_since: Option<Instant>,
+}
+
+impl Receipts {
+    fn note_sent(&mut self, now: Instant) {
+        self.owed_since.get_or_insert(now);
+    }
+
+    /// The broker has read: what it has not read yet, the next batch begins to count.
+    fn note_read(&mut self) {
+        self.owed_since = None;
+    }
+
+    /// Ends a connection whose broker keeps it and reads nothing, or gives no receipts. One to which nothing was sent owes none.
+    fn check(&self, now: Instant) -> Result<(), String> {
+        match self.owed_since {
+            Some(since) if now.duration_since(since) > UNREAD_LIMIT => {
+                Err(format!("the broker has confirmed no value for {} s", UNREAD_LIMIT.as_secs()))
+            }
+            _ => Ok(()),
+        }
+    }
 }
 
 impl Session {
@@ -105,7 +131,7 @@ impl Session {
             incoming,
             questions: Questions::default(),
             request_id: 0,
-            latest_read: Instant::now(),
+            receipts: Receipts::default(),
         })
     }
 
@@ -115,15 +141,8 @@ impl Session {
         journal.note_published(&points);
         self.request_id = self.request_id.wrapping_add(1);
         self.questions.note_batch(self.request_id);
+        self.receipts.note_sent(Instant::now());
         self.outbox.publish(PublishValuesRequest { request_id: self.request_id, data_points: points.by_id });
-    }
-
-    /// Ends a connection whose broker keeps it and reads nothing, or gives no receipts.
-    fn check_reading(&self) -> Result<(), String> {
-        if self.latest_read.elapsed() <= UNREAD_LIMIT {
-            return Ok(());
-        }
-        Err(format!("the broker has confirmed no value for {} s", UNREAD_LIMIT.as_secs()))
     }
 
     fn handle(&mut self, message: FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
@@ -131,7 +150,7 @@ impl Session {
         match message.event {
             Some(Event::Asked(question)) => journal.note_unanswered(u64::from(!self.questions.ask(question, now))),
             Some(Event::Provided(_)) => {
-                self.latest_read = now;
+                self.receipts.note_read();
                 self.questions.note_read(self.outbox.acknowledge());
             }
             Some(Event::Rejected(rejected)) => {
@@ -257,4 +276,24 @@ fn token(file: Option<&Path>) -> Result<Option<MetadataValue<Ascii>>, String> {
         .map_err(|_| format!("{at}: the token has characters that a header cannot hold"))?;
     header.set_sensitive(true);
     Ok(Some(header))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_broker_that_confirms_nothing_loses_the_connection_and_an_idle_one_does_not() {
+        let begin = Instant::now();
+        let at = |seconds: u64| begin + Duration::from_secs(seconds);
+        let mut receipts = Receipts::default();
+        // No daemon, nothing to send, for an hour; then a batch.
+        receipts.note_sent(at(3600));
+        assert_eq!(receipts.check(at(3600)), Ok(()));
+        receipts.note_read();
+        assert_eq!(receipts.check(at(7200)), Ok(()));
+        (7200..=7230).for_each(|second| receipts.note_sent(at(second)));
+        assert_eq!(receipts.check(at(7230)), Ok(()));
+        assert_eq!(receipts.check(at(7231)), Err("the broker has confirmed no value for 30 s".to_owned()));
+    }
 }
