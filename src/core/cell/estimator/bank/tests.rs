@@ -163,6 +163,15 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
                     .max((ours.test_ratio - theirs.test_ratio).abs());
             }
         }
+        if time % 2500 == 1249 {
+            // Half-cycles restate the curve's capacity: the curve of an aged cell holds at each temperature and interval after it.
+            for (cell, estimator) in readable.iter_mut().enumerate() {
+                let mean = model.capacity_ah * (0.95 - 0.02 * cell as f64);
+                let curve = ScalarGaussian { mean, ..estimator.memory.curve() };
+                estimator.memory.set_curve(curve);
+                bank.change(cell, |estimator| estimator.memory.set_curve(curve));
+            }
+        }
         if time % 2500 == 2499 {
             bank.learn_slow_branches();
             readable.iter_mut().for_each(|estimator| estimator.learn_slow_branch(config));
