@@ -52,7 +52,7 @@ fn square(x: f64) -> f64 {
 
 /// Evidence about one cell's model.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(from = "StoredModelCheck")]
 pub struct ModelCheck {
     /// The model that is checked ([`model_id`]); 0 in a state stored by a program without a check.
     model: u64,
@@ -63,14 +63,108 @@ pub struct ModelCheck {
     since_as: f64,
     /// Duration of the latest step, s.
     step_s: f64,
-    /// Sums of 1 / R, (SOC - 0.5) / R and (SOC - 0.5)^2 / R.
-    information: [f64; 3],
-    /// Sums of v / R and (SOC - 0.5) v / R.
-    score: [f64; 2],
+    voltages: VoltageSums,
     /// Largest sum of the witnesses over [`LIMIT`] in this window.
     mismatch: f64,
     /// That of the window before, if it was a mismatch.
     before: f64,
+}
+
+/// Sums over the readings of a window, about their mean SOC: sums about a fixed SOC are differences of large numbers while the SOC
+/// hardly changes, and a checkpoint keeps six digits of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct VoltageSums {
+    /// Sum of 1 / R, V^-2.
+    weight: f64,
+    /// Mean SOC, each reading weighed by 1 / R.
+    mean_soc: f64,
+    /// Sum of (SOC - mean)^2 / R, V^-2.
+    spread: f64,
+    /// Sums of v / R and (SOC - mean) v / R, V^-1.
+    score: [f64; 2],
+}
+
+impl VoltageSums {
+    /// Adds an innovation, V, of this variance, V^2.
+    fn add(&mut self, soc: f64, innovation: f64, variance: f64) {
+        let weight = 1.0 / variance;
+        let before = self.mean_soc;
+        self.weight += weight;
+        self.mean_soc += (soc - before) * weight / self.weight;
+        let distance = soc - self.mean_soc;
+        self.spread += weight * (soc - before) * distance;
+        self.score[1] += self.score[0] * (before - self.mean_soc) + distance * weight * innovation;
+        self.score[0] += weight * innovation;
+    }
+
+    /// What a constant and a slope over SOC explain of the innovations: c^2. The products of the module's formula that cancel are
+    /// left out, so no term is negative.
+    fn explained(&self) -> f64 {
+        let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
+        let [prior_constant, prior_slope] = CURVE_STD_V.map(|std| 1.0 / square(std));
+        let from_middle = mean_soc - 0.5;
+        let spread = spread + prior_slope;
+        let explained = square(constant) * spread
+            + square(slope) * weight
+            + square(slope + constant * from_middle) * prior_constant;
+        explained / (weight * spread + prior_constant * (weight * square(from_middle) + spread))
+    }
+
+    fn check(&self) -> Result<(), InvalidState> {
+        let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
+        InvalidState::unless_naturals("a sum of the check of a cell's model", [weight, spread])?;
+        InvalidState::unless_numbers("a sum of the check of a cell's model", [mean_soc, constant, slope])
+    }
+}
+
+/// A stored check; those of earlier versions have sums about SOC 0.5.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StoredModelCheck {
+    model: u64,
+    use_s: f64,
+    since_s: f64,
+    since_as: f64,
+    step_s: f64,
+    #[serde(default)]
+    voltages: VoltageSums,
+    /// Earlier: sums of 1 / R, (SOC - 0.5) / R and (SOC - 0.5)^2 / R.
+    information: Option<[f64; 3]>,
+    /// Earlier: sums of v / R and (SOC - 0.5) v / R.
+    score: Option<[f64; 2]>,
+    mismatch: f64,
+    before: f64,
+}
+
+impl From<StoredModelCheck> for ModelCheck {
+    fn from(stored: StoredModelCheck) -> Self {
+        let StoredModelCheck {
+            model,
+            use_s,
+            since_s,
+            since_as,
+            step_s,
+            voltages,
+            information,
+            score,
+            mismatch,
+            before,
+        } = stored;
+        let voltages = match (information, score) {
+            (Some([weight, mixed, squares]), Some([constant, slope])) if weight > 0.0 => {
+                let from_middle = mixed / weight;
+                VoltageSums {
+                    weight,
+                    mean_soc: 0.5 + from_middle,
+                    spread: (squares - mixed * from_middle).max(0.0),
+                    score: [constant, slope - constant * from_middle],
+                }
+            }
+            _ => voltages,
+        };
+        Self { model, use_s, since_s, since_as, step_s, voltages, mismatch, before }
+    }
 }
 
 /// What the filter says about a cell when evidence is due.
@@ -150,13 +244,7 @@ impl ModelCheck {
             return;
         }
         self.use_s += elapsed_s;
-        let (weight, soc) = (1.0 / variance, soc - 0.5);
-        for (sum, value) in self.information.iter_mut().zip([1.0, soc, soc * soc]) {
-            *sum += weight * value;
-        }
-        for (sum, value) in self.score.iter_mut().zip([1.0, soc]) {
-            *sum += weight * value * update.innovation;
-        }
+        self.voltages.add(soc, update.innovation, variance);
         if self.check().is_err() {
             // Sums that cannot be stored are evidence of nothing.
             *self = Self::new(self.model);
@@ -165,7 +253,7 @@ impl ModelCheck {
             return;
         }
         let resistance = if log_resistance_std > 0.0 { square(log_resistance / log_resistance_std) } else { 0.0 };
-        let curve = self.curve();
+        let curve = self.voltages.explained();
         let sum = resistance.min(CORROBORATED * curve) + curve.min(CORROBORATED * resistance);
         self.mismatch = self.mismatch.max(sum / LIMIT);
         if !self.is_open() {
@@ -173,16 +261,6 @@ impl ModelCheck {
             let use_s = if found > 0.0 { 0.0 } else { WINDOW_S };
             *self = Self { before: found, use_s, ..Self::new(self.model) };
         }
-    }
-
-    /// What a constant and a slope over SOC explain of the innovations: c^2.
-    fn curve(&self) -> f64 {
-        let ([constant, mixed, slope], [by_constant, by_slope]) = (self.information, self.score);
-        let constant = constant + 1.0 / square(CURVE_STD_V[0]);
-        let slope = slope + 1.0 / square(CURVE_STD_V[1]);
-        let explained =
-            square(by_constant) * slope - 2.0 * by_constant * by_slope * mixed + square(by_slope) * constant;
-        explained / (constant * slope - square(mixed))
     }
 
     /// Largest evidence of this window and the one before that the model is another cell's, relative to the limit.
@@ -202,26 +280,10 @@ impl ModelCheck {
     /// # Errors
     /// The first number that is out of range.
     pub fn check(&self) -> Result<(), InvalidState> {
-        let natural = [
-            self.use_s,
-            self.since_s,
-            self.step_s,
-            self.information[0],
-            self.information[2],
-            self.mismatch,
-            self.before,
-        ];
+        let natural = [self.use_s, self.since_s, self.step_s, self.mismatch, self.before];
         InvalidState::unless_naturals("a number of the check of a cell's model", natural)?;
-        let signed = [self.since_as, self.information[1], self.score[0], self.score[1]];
-        InvalidState::unless_numbers("a sum of the check of a cell's model", signed)?;
-        let [constant, mixed, slope] = self.information;
-        // Cauchy-Schwarz, with room for rounding.
-        InvalidState::unless(
-            square(mixed) <= (1.0 + 1e-9) * constant * slope,
-            "a sum of the check of a cell's model",
-            mixed,
-            "within those of its squares",
-        )?;
+        InvalidState::unless_number("the charge since the last check of a cell's model", self.since_as)?;
+        self.voltages.check()?;
         let most_before = if self.is_open() { f64::MAX } else { 0.0 };
         InvalidState::unless(self.before <= most_before, "a mismatch of a check that has ended", self.before, "0")
     }
@@ -229,6 +291,8 @@ impl ModelCheck {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{Matrix2, Vector2};
+
     use super::*;
     use crate::cell::model::tests::small_model;
 
@@ -296,8 +360,65 @@ mod tests {
     fn stored_sums_that_cannot_be_are_refused() {
         let check = after(1800, 1.0, |soc| soc);
         assert_eq!(check.check(), Ok(()));
-        assert!(ModelCheck { information: [1.0, 2.0, 3.0], ..check }.check().is_err());
+        let voltages = VoltageSums { spread: -1.0, ..check.voltages };
+        assert!(ModelCheck { voltages, ..check }.check().is_err());
         assert!(ModelCheck { before: 2.0, ..ModelCheck::ended() }.check().is_err());
+    }
+
+    #[test]
+    fn the_sums_explain_what_the_score_test_does() {
+        let readings: Vec<[f64; 3]> = (0..90)
+            .map(f64::from)
+            .map(|i| [0.8 - 0.004 * i, 0.03 + 0.02 * (0.3 * i).sin(), 1e-4 * (1.0 + i)])
+            .collect();
+        let mut sums = VoltageSums::default();
+        let (mut a, mut g) = (Matrix2::zeros(), Vector2::zeros());
+        for &[soc, innovation, variance] in &readings {
+            sums.add(soc, innovation, variance);
+            let h = Vector2::new(1.0, soc - 0.5);
+            a += h * h.transpose() / variance;
+            g += h * innovation / variance;
+        }
+        let prior = Matrix2::from_diagonal(&Vector2::from(CURVE_STD_V.map(|std| 1.0 / square(std))));
+        let expected = g.dot(&((a + prior).try_inverse().unwrap() * g));
+        assert!((sums.explained() / expected - 1.0).abs() < 1e-9, "{} {expected}", sums.explained());
+    }
+
+    /// A delta of the store keeps 20 bits of a number.
+    #[test]
+    fn rounded_sums_of_a_soc_that_hardly_changes_are_accepted_and_explain_as_much() {
+        let mut sums = VoltageSums::default();
+        for i in 0..360 {
+            sums.add(0.2 + 1e-7 * f64::from(i), 0.002, 1e-7);
+        }
+        let short = |x: f64| f64::from_bits(x.to_bits() & !((1 << 32) - 1));
+        let VoltageSums { weight, mean_soc, spread, score } = sums;
+        let kept = VoltageSums {
+            weight: short(weight),
+            mean_soc: short(mean_soc),
+            spread: short(spread),
+            score: score.map(short),
+        };
+        assert_eq!(kept.check(), Ok(()));
+        assert!((kept.explained() / sums.explained() - 1.0).abs() < 1e-5, "{} {}", kept.explained(), sums.explained());
+    }
+
+    #[test]
+    fn sums_of_earlier_versions_are_taken_over() {
+        let check = after(1800, 0.6, |soc| 0.1 * soc);
+        let mut stored = serde_json::to_value(check).unwrap();
+        let VoltageSums { weight, mean_soc, spread, score: [constant, slope] } = check.voltages;
+        let from_middle = mean_soc - 0.5;
+        let fields = stored.as_object_mut().unwrap();
+        fields.remove("voltages").unwrap();
+        fields.insert(
+            "information".into(),
+            serde_json::json!([weight, weight * from_middle, weight * from_middle * from_middle + spread]),
+        );
+        fields.insert("score".into(), serde_json::json!([constant, slope + constant * from_middle]));
+        let kept: ModelCheck = serde_json::from_value(stored).unwrap();
+        assert!((kept.voltages.explained() / check.voltages.explained() - 1.0).abs() < 1e-9, "{kept:?} {check:?}");
+        assert_eq!(ModelCheck { voltages: check.voltages, ..kept }, check);
     }
 
     #[test]
