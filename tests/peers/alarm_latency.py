@@ -26,10 +26,11 @@ RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
 # A new mode counts after 10 ms (min_duration_s of the configuration); the frame after that decides.
 MODE_S = 0.012
-# A half-cycle flows at little more than nothing, so that it may last a second and still be weak; its pulse makes it weak or strong: with
-# the configuration's swing 0.25 Ah or 2.1 Ah. A pulse that a busy machine makes three times as long still gives less than 1 Ah or what a
-# cell of 2.6 Ah can have; a longer one is not judged.
-IDLE_A, WEAK_A, STRONG_A, PULSE_S, LONGEST_PULSE_S = 0.008, 0.35, 3.0, 0.006, 0.018
+# A half-cycle flows at little more than nothing; its pulse makes it weak or strong: with the configuration's swing 0.25 Ah or 2.1 Ah.
+IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
+# What the frames' stamps say that it gave, Ah. A busy machine makes pulses and pauses longer: what is neither far below the alarm's
+# thresholds nor far above them and possible for a cell of 2.6 Ah is not judged.
+SWING, WEAK_AH, STRONG_AH = 1.2e-5, (0.0, 0.8), (1.4, 4.0)
 # The first half-cycles have no whole one before them.
 WARM_UP = 4
 PEERS = {
@@ -58,6 +59,19 @@ def cell(current_a):
     voltage_v = 3.75 - 0.045 * current_a
     data = round(voltage_v * 1e5).to_bytes(3, "little") + round(current_a * 1e4).to_bytes(3, "little", signed=True)
     return frame(CELL, data + (2500).to_bytes(2, "little"))
+
+
+def current_of(data):
+    return int.from_bytes(data[3:6], "little", signed=True) * 1e-4
+
+
+def last_half_cycle(cells, sign):
+    """What the half-cycle before the latest change of sign gave, Ah, and the stamp of the frame that ended it: the second of the new sign."""
+    end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
+    begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
+    frames = cells[begin : end + 1]
+    given = sum((now_a + next_a) / 2 * (next_ns - now_ns) for (now_ns, now_a), (next_ns, next_a) in zip(frames, frames[1:]))
+    return abs(given) * 1e-9 / 3600 / SWING, cells[end + 1][0]
 
 
 def bits(data, start, length):
@@ -104,31 +118,38 @@ def pause():
 def measure_alarm(count):
     """Strong and weak half-cycles in turn: each one's end clears or raises the alarm."""
     listener, sender = Listener(CELL, ALARM), raw()
-    late_ns, without, strong, sign = [], 0, True, 1
-    # Half-cycles left until one is judged: a pulse too long may change nothing, and then the next one has nothing to change back.
-    wait, stalled = WARM_UP, 0
+    late_ns, without, stalled, strong, sign = [], 0, 0, True, 1
+    # Half-cycles left until one is judged: one that was not as meant may change nothing, and then the next one has nothing to change back.
+    wait, cells = WARM_UP, []
     while len(late_ns) + without < count:
-        stamps = [stamp for stamp, i, _ in listener.read() if i == CELL]
-        if len(stamps) > 1 and stamps[-1] - stamps[-2] > LONGEST_PULSE_S * 1e9:
-            wait, stalled = max(wait, 2), stalled + 1
-            assert stalled < count, f"{stalled} pulses were longer than {LONGEST_PULSE_S} s: this machine is too busy"
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
         # The half-cycle that is complete now is the one before: a weak one before a strong one.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
-        if wait:
+        is_answer = lambda i, d: i == ALARM and (bits(d, *RULE), bits(d, *STATE)) == change  # noqa: E731
+        answered, seen = (None, listener.read()) if wait else listener.stamp_of(is_answer)
+        # Enough for two half-cycles of six frames.
+        cells = cells[-12:] + [(stamp, current_of(data)) for stamp, i, data in seen if i == CELL]
+        low, high = WEAK_AH if strong else STRONG_AH
+        given_ah, asked = last_half_cycle(cells, sign)
+        if not low <= given_ah <= high:
+            wait, stalled = 2, stalled + 1
+            assert stalled < count, f"{stalled} half-cycles had another charge than meant: this machine is too busy"
+        elif wait:
             wait -= 1
+        elif answered is None:
+            without += 1
+            print(f"no answer after {len(late_ns)}: {given_ah:.2f} Ah in {cells}", file=sys.stderr, flush=True)
         else:
-            answered, seen = listener.stamp_of(lambda i, d: i == ALARM and (bits(d, *RULE), bits(d, *STATE)) == change)
-            asked = [stamp for stamp, i, _ in seen if i == CELL][1]
-            if answered is None:
-                without += 1
-            else:
-                late_ns.append(answered - asked)
-        sender.send(cell(sign * (STRONG_A if strong else WEAK_A)))
+            late_ns.append(answered - asked)
+        # Between two frames the daemon joins their currents by a line: a pulse's edges are two frames each.
+        pulse_a = STRONG_A if strong else WEAK_A
+        for current_a in (IDLE_A, pulse_a):
+            sender.send(cell(sign * current_a))
         time.sleep(PULSE_S)
-        sender.send(cell(sign * IDLE_A))
+        for current_a in (pulse_a, IDLE_A):
+            sender.send(cell(sign * current_a))
         pause()
         strong, sign = not strong, -sign
     return {"late_ns": late_ns, "without": without, "stalled": stalled}

@@ -27,6 +27,12 @@ const QUEUEING_SLACK_NS: i64 = 20_000_000;
 /// Half the memory of the least hardware offset, ns. A quartz 100 ppm off bends times by 1 ms over it.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
+/// Readings of the boot clock that lie this close together, ns, need no repetition: two system calls on a slow processor.
+const CLOSE_NS: i64 = 20_000;
+
+/// Most readings of the wall clock for one [`Reading`].
+const MOST_READINGS: usize = 4;
+
 /// Both kernel clocks at one moment, ns since their origins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reading {
@@ -39,7 +45,29 @@ pub struct Reading {
 impl Reading {
     /// Reads both clocks. A kernel without CLOCK_BOOTTIME does not exist since 2.6.39; zero stands for it.
     pub fn now() -> Self {
-        Self { realtime_ns: nanos_of(ClockId::CLOCK_REALTIME), boottime_ns: nanos_of(ClockId::CLOCK_BOOTTIME) }
+        Self::between(nanos_of)
+    }
+
+    /// The reading between two of the boot clock that lie closest together: on a busy processor this thread may wait for
+    /// milliseconds between two calls, and the clocks' difference would be wrong by as much.
+    fn between(clock: impl Fn(ClockId) -> i64) -> Self {
+        let read = || {
+            let before_ns = clock(ClockId::CLOCK_BOOTTIME);
+            let realtime_ns = clock(ClockId::CLOCK_REALTIME);
+            let apart_ns = clock(ClockId::CLOCK_BOOTTIME) - before_ns;
+            (apart_ns, Self { realtime_ns, boottime_ns: before_ns + apart_ns / 2 })
+        };
+        let mut closest = read();
+        for _ in 1..MOST_READINGS {
+            if closest.0 <= CLOSE_NS {
+                break;
+            }
+            let again = read();
+            if again.0 < closest.0 {
+                closest = again;
+            }
+        }
+        closest.1
     }
 
     fn offset_ns(self) -> i64 {
@@ -199,6 +227,8 @@ impl HardwareClock {
 
 #[cfg(test)]
 mod tests {
+    use std::cell::Cell;
+
     use super::*;
 
     const S: i64 = 1_000_000_000;
@@ -233,6 +263,26 @@ mod tests {
                 time.nanos() - OFFSET
             })
             .collect()
+    }
+
+    /// A reading when the thread waits `waits_ns[n]` before its n-th call, each of which takes 1 us.
+    fn reading_with_waits(waits_ns: &[i64]) -> Reading {
+        let (calls, now_ns) = (Cell::new(0), Cell::new(0));
+        Reading::between(|clock| {
+            now_ns.set(now_ns.get() + waits_ns.get(calls.replace(calls.get() + 1)).unwrap_or(&0) + 1000);
+            now_ns.get() + if clock == ClockId::CLOCK_REALTIME { OFFSET } else { 0 }
+        })
+    }
+
+    #[test]
+    fn a_thread_that_waits_between_two_clocks_bends_no_stamp() {
+        let busy = [4 * MS, 3 * MS, 0, 0, 0, 2 * MS, 0, 0, 0];
+        for reading in [reading_with_waits(&[]), reading_with_waits(&busy), reading_with_waits(&[0, MS])] {
+            assert_eq!(reading.offset_ns(), OFFSET, "{reading:?}");
+        }
+        // Always busy: the calls that lie closest together.
+        let reading = reading_with_waits(&[0, MS, MS, 0, 9 * MS, MS, 0, MS, 0, 0, 9 * MS, MS]);
+        assert!((reading.offset_ns() - OFFSET).abs() <= MS / 2, "{reading:?}");
     }
 
     #[test]

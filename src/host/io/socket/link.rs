@@ -227,7 +227,13 @@ impl Link {
                 next = self.outgoing.recv(), if open.pending.is_none() => Err(next),
                 _ = self.report.tick() => {
                     self.note_dropped(open);
-                    self.report_losses(open.mapper.event(Reading::now())).await;
+                    if self.has_losses() {
+                        // An event's time is the least time of later frames: those that wait in the socket come first.
+                        if !self.receive_all(open).await {
+                            return ServiceEnd::Dead;
+                        }
+                        self.report_losses(open.mapper.event(Reading::now())).await;
+                    }
                     continue;
                 }
                 () = sleep_until(look_at), if self.state != LinkState::Up => {
@@ -410,6 +416,10 @@ impl Link {
             LinkState::Missing | LinkState::Unknown => BusEvent::Missing,
         };
         self.notify(time, event).await;
+    }
+
+    fn has_losses(&self) -> bool {
+        self.lost > 0 || self.unsent.load(Ordering::Relaxed) > 0
     }
 
     /// Sends the frames lost since the last report as events.
