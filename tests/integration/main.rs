@@ -62,6 +62,7 @@ mod on_board_model;
 mod other_cell;
 mod output_dbc;
 mod pack_memory;
+mod pack_modules;
 mod paper_scenario;
 #[cfg(feature = "lab")]
 mod passport_cli;

@@ -36,6 +36,7 @@ mod downtime;
 mod filter;
 mod memory;
 mod noise;
+mod pack_bank;
 mod slow_branch;
 mod state;
 mod state_vector;
@@ -43,6 +44,7 @@ mod step;
 
 pub use bank::EstimatorBank;
 pub use cell_estimator::{AdoptedState, CellEstimator};
+pub use pack_bank::{CellModule, PackBank};
 pub use state::CellState;
 pub use step::{CellStep, StepResult};
 

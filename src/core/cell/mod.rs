@@ -27,7 +27,9 @@ pub use config::{
 };
 pub use coverage::Coverage;
 pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
-pub use estimator::{AdoptedState, CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
+pub use estimator::{
+    AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult,
+};
 pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,

@@ -124,6 +124,12 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
+    /// For cells of which nothing is known, in a pack where only some are of one kind: only those are [added](Self::add).
+    pub fn of_cells(cells: usize, compared: &[usize]) -> Self {
+        let cells = if compared.len() < LEAST_CELLS { 0 } else { cells };
+        Self { middle: compared.first().copied().unwrap_or_default(), ..Self::new(cells) }
+    }
+
     /// For cells of which nothing is known.
     pub fn new(cells: usize) -> Self {
         let cell = Watched {

@@ -124,13 +124,14 @@ pub struct Learner {
 
 impl Learner {
     /// A learner for cells that start from this capacity.
-    pub fn new(config: &CapacityConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
+    pub fn new(config: &CapacityConfig, initial: Vec<ScalarGaussian>) -> Self {
+        let cells = initial.len();
         Self {
             totals: vec![CellMark::default(); cells],
-            prior: vec![initial_capacity; cells],
-            capacity: vec![initial_capacity; cells],
             learned: vec![false; cells],
-            drift: vec![DriftFilter::new(config, initial_capacity); cells],
+            drift: initial.iter().map(|&capacity| DriftFilter::new(config, capacity)).collect(),
+            prior: initial.clone(),
+            capacity: initial,
             ..Self::default()
         }
     }
@@ -493,7 +494,7 @@ mod tests {
     fn a_mode_that_begins_in_a_gap_begins_at_the_soc_after_it() {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
-        let mut learner = Learner::new(&config(), 1, ScalarGaussian::from_std(2.0, 0.1));
+        let mut learner = Learner::new(&config(), vec![ScalarGaussian::from_std(2.0, 0.1)]);
         let at = |soc: f64| Some(ScalarGaussian::from_std(soc, 0.01));
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
         assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
@@ -512,7 +513,7 @@ mod tests {
     fn a_half_cycle_is_measured_by_its_own_information() {
         let config = config();
         let mut estimator = CellEstimator::new(&estimator_config());
-        let mut learner = Learner::new(&config, 1, estimator.capacity());
+        let mut learner = Learner::new(&config, vec![estimator.capacity()]);
         let at = |soc| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), ..CellMark::default() };
         let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
         discharge(&mut estimator);
@@ -529,7 +530,7 @@ mod tests {
     fn after_a_restart_of_its_filter_a_capacity_is_in_doubt_and_the_half_cycle_teaches_nothing() {
         let config = config();
         let mut estimator = CellEstimator::new(&estimator_config());
-        let mut learner = Learner::new(&config, 1, estimator.capacity());
+        let mut learner = Learner::new(&config, vec![estimator.capacity()]);
         let at = |soc| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), ..CellMark::default() };
         let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
         let learn = |learner: &mut Learner, estimator: &mut CellEstimator| {
@@ -562,7 +563,7 @@ mod tests {
         let mut estimator_config = estimator_config();
         estimator_config.sensor = sensor;
         let mut estimator = CellEstimator::new(&estimator_config);
-        let mut learner = Learner::new(config, 1, estimator.capacity());
+        let mut learner = Learner::new(config, vec![estimator.capacity()]);
         let mut truth = truth();
         truth.soc = 0.8;
         for k in 0..1000 {

@@ -13,7 +13,7 @@ use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
-use crate::cell::{CellModel, EstimatorConfig, Label};
+use crate::cell::{CellModel, CellModule, EstimatorConfig, Label};
 use crate::findings::BalancingConfig;
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::BusIndex;
@@ -46,6 +46,8 @@ pub struct MonitorConfig {
     pub sample: SampleConfig,
     /// Cell model.
     pub model: CellModel,
+    /// Cells of another kind, with models of their own.
+    pub modules: Vec<CellModule>,
     /// What is on the label of the cells, where their own model is learned; `None` = the model holds.
     pub label: Option<Label>,
     /// Whether the BMS lets fuller cells lose charge after a charge.
@@ -79,6 +81,12 @@ impl MonitorConfig {
     /// Whether every frame of an interface is received: requests are sent there, and only where the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
+    }
+
+    /// Number of cells that are in no module of another kind.
+    pub fn own_cells(&self) -> u32 {
+        let in_modules: usize = self.modules.iter().map(|module| module.cells.len()).sum();
+        u32::from(self.sample.cells).saturating_sub(u32::try_from(in_modules).unwrap_or(u32::MAX))
     }
 
     /// Identifiers to be received on an interface, ascending: also those of our own frames, which another sender may use.
@@ -153,6 +161,11 @@ impl MonitorConfig {
         let reported = |sample: &SampleConfig| (sample.reported_soc.is_some(), sample.reported_soh.is_some());
         let is_nominal = |config: &Self| matches!(config.health.capacity.method, CapacityMethod::Nominal { .. });
         let buses = || (0..=u8::MAX).map(BusIndex).take(self.interfaces);
+        let modules = self.modules.iter().zip(&new.modules);
+        let same_modules = self.modules.len() == new.modules.len()
+            && modules
+                .map(|(old, new)| (&old.cells, &old.model, &new.cells, &new.model))
+                .all(|(cells, model, new_cells, new_model)| cells == new_cells && model == new_model);
         let same = [
             ("[input.cell_voltage] or [input.pack_voltage]", old_sample.voltage_source == new_sample.voltage_source),
             ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
@@ -164,6 +177,7 @@ impl MonitorConfig {
             ("[poll]", self.poll == new.poll && self.supply == new.supply),
             ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
             ("pack.cell_model", self.model == same_model),
+            ("[[pack.module]]", same_modules),
             ("pack.learn_model", self.label.is_some() == new.label.is_some()),
             ("estimator.capacity_state", self.estimator.capacity_state == new.estimator.capacity_state),
             ("capacity.method", is_nominal(self) == is_nominal(new)),
@@ -181,6 +195,7 @@ impl MonitorConfig {
     /// Whether `new` gives the same estimate for a sample.
     pub(super) fn estimates_as(&self, new: &Self) -> bool {
         self.model == new.model
+            && self.modules == new.modules
             && self.estimator == new.estimator
             && self.health.usable == new.health.usable
             && self.sample.ambient_c == new.sample.ambient_c

@@ -22,6 +22,8 @@ use crate::sample::CellSample;
 pub(super) struct Diagnosing {
     pub(super) diagnosis: Diagnosis,
     cells: usize,
+    /// The cells that are compared: those in no module of another kind.
+    compared: Vec<usize>,
     /// The BMS lets fuller cells lose charge.
     is_balanced: bool,
     /// Where bits show which cells are bled.
@@ -29,10 +31,12 @@ pub(super) struct Diagnosing {
 }
 
 impl Diagnosing {
-    pub(super) fn new(config: &MonitorConfig) -> Self {
+    /// `compared`: the cells of the pack's own kind.
+    pub(super) fn new(config: &MonitorConfig, compared: &[usize]) -> Self {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
-        Self { diagnosis: Diagnosis::new(cells), cells, is_balanced, balancing }
+        let compared = compared.to_vec();
+        Self { diagnosis: Diagnosis::of_cells(cells, &compared), cells, compared, is_balanced, balancing }
     }
 
     /// Other settings for the same cells.
@@ -42,7 +46,7 @@ impl Diagnosing {
 
     /// Forgets everything: another pack is connected.
     pub(super) fn forget(&mut self) {
-        self.diagnosis = Diagnosis::new(self.cells);
+        self.diagnosis = Diagnosis::of_cells(self.cells, &self.compared);
     }
 
     /// The state, to be stored; `None` = the pack is too small for a comparison.
@@ -52,7 +56,7 @@ impl Diagnosing {
 
     /// Continues from a checked state. `away`: from when to when the daemon did not run; `None` = it continues without a break.
     pub(super) fn restore(&mut self, stored: Option<Diagnosis>, away: Option<(Timestamp, Timestamp)>) {
-        let Some(stored) = stored else { return };
+        let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;
         if let Some((from, to)) = away {
             self.diagnosis.interrupt();
@@ -97,7 +101,7 @@ impl Diagnosing {
         if !self.diagnosis.is_active() {
             return false;
         }
-        for sample in samples {
+        for sample in samples.iter().filter(|sample| estimation.bank.is_own(sample.cell.index())) {
             let CellSample { cell, time, voltage_v, current_a, temperature_c, .. } = *sample;
             self.diagnosis.add(cell.index(), time, voltage_v, current_a, temperature_c);
         }
@@ -108,7 +112,7 @@ impl Diagnosing {
             self.diagnosis.interrupt();
             return false;
         };
-        let (model, capacity_ah) = (bank.model(), learning.capacity(middle).mean);
+        let (model, capacity_ah) = (bank.own_model(), learning.capacity(middle).mean);
         let temperature_c = bank.temperature_c(middle).unwrap_or(estimation.ambient_c());
         let position = model.grid_position(soc.mean.clamp(0.0, 1.0), temperature_c);
         let ohm = model.r0_ohm(&position) * libm::exp(bank.log_resistance(middle).mean);
@@ -117,7 +121,7 @@ impl Diagnosing {
         let mean = MeanCell { soc: soc.mean, current_a, drop_v, temperature_c, charge_ah };
         let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
         if is_complete {
-            let socs = |cell: usize| bank.filtered_soc(cell).map(|soc| soc.mean);
+            let socs = |cell: usize| bank.filtered_soc(cell).filter(|_| bank.is_own(cell)).map(|soc| soc.mean);
             let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
             reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
@@ -125,7 +129,7 @@ impl Diagnosing {
                 capacity_ah: learning.capacity(index),
                 log_resistance: bank.log_resistance(index).mean,
             };
-            reported.extend(self.diagnosis.note_day(now, temperature_c, (0..self.cells).map(cell)));
+            reported.extend(self.diagnosis.note_day(now, temperature_c, self.compared.iter().copied().map(cell)));
             out.events
                 .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
@@ -144,7 +148,8 @@ impl Stages {
             if is_new && !self.sampling.inputs_valid(cell, now) {
                 continue;
             }
-            let fault = self.diagnosing.diagnosis.has_channel_fault(cell);
+            let is_compared = self.estimation.bank.is_own(cell.index());
+            let fault = self.diagnosing.diagnosis.has_channel_fault(cell).filter(|_| is_compared);
             let fault = Observation::new(fault.map(|is_faulty| if is_faulty { 1.0 } else { 0.0 }));
             let mut publisher = self.publisher(now, out);
             publisher.observe(Rule::ChannelFaulty, Some(cell), Observation { is_new, ..fault });

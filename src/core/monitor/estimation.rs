@@ -10,7 +10,9 @@ use super::batch::CellBatch;
 use super::modelling::{Adoption, Modelling};
 use super::{Estimate, MeasuredValues, MonitorConfig};
 use crate::cell::model_check::model_id;
-use crate::cell::{AdoptedState, CellModel, CellStep, EstimatorBank, EstimatorConfig, ModelCheck, ModelEvidence};
+use crate::cell::{
+    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank,
+};
 use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, Learner};
 use crate::quantity::{CellIndex, Timestamp};
@@ -22,7 +24,9 @@ const DOUBT: f64 = 2.0;
 /// The estimation stage.
 #[derive(Debug)]
 pub(super) struct Estimation {
-    pub(super) bank: EstimatorBank,
+    pub(super) bank: PackBank,
+    /// Cells of other kinds.
+    modules: Vec<CellModule>,
     pub(super) batch: CellBatch,
     /// One per cell.
     progress: Vec<CellProgress>,
@@ -62,13 +66,15 @@ pub(super) struct Consumed {
 impl Estimation {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
+        let bank = PackBank::new(&config.model, &config.estimator, cells, &config.modules);
         Self {
-            bank: EstimatorBank::new(&config.model, &config.estimator, cells),
+            checks: (0..cells).map(|cell| ModelCheck::new(id_of_model(&bank, cell))).collect(),
+            bank,
+            modules: config.modules.clone(),
             batch: CellBatch::new(cells),
             progress: vec![CellProgress::default(); cells],
             trusted: vec![true; cells],
             all_trusted: true,
-            checks: vec![ModelCheck::new(model_id(&config.model, config.estimator.initial.log_resistance_std)); cells],
             any_check_open: true,
             any_mismatched: false,
             is_current_doubtful: false,
@@ -79,34 +85,48 @@ impl Estimation {
 
     /// Other settings for the same cells.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
+        self.modules.clone_from(&config.modules);
         self.use_model(modelling, learner);
-        let model = self.model_id();
-        self.checks.iter_mut().for_each(|check| *check = check.or_new(model));
+        let Self { bank, checks, .. } = self;
+        checks.iter_mut().enumerate().for_each(|(cell, check)| *check = check.or_new(id_of_model(bank, cell)));
         self.note_checks();
         self.ambient_c = config.sample.ambient_c;
     }
 
     /// The model in force for the same cells.
     pub(super) fn use_model(&mut self, modelling: &Modelling, learner: &Learner) {
-        let (model, mut estimator): (CellModel, EstimatorConfig) = modelling.in_force();
-        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
-        self.bank.reconfigure(&model, &estimator);
+        let (model, estimator) = modelling.in_force();
+        self.reconfigure_bank(&model, &estimator, learner);
+    }
+
+    fn reconfigure_bank(&mut self, model: &CellModel, estimator: &EstimatorConfig, learner: &Learner) {
+        let learned = |config: &EstimatorConfig| {
+            let mut config = *config;
+            config.sensor.current_offset_a = learner.current_offset().std_a(config.sensor.current_offset_a);
+            config
+        };
+        let modules: Vec<CellModule> = self
+            .modules
+            .iter()
+            .map(|module| CellModule { estimator: learned(&module.estimator), ..module.clone() })
+            .collect();
+        self.bank.reconfigure(model, &learned(estimator), &modules);
     }
 
     /// Forgets all cells: another pack is connected.
     pub(super) fn forget(&mut self, modelling: &Modelling) {
         let (cells, (model, estimator)) = (self.cells(), modelling.in_force());
-        self.bank = EstimatorBank::new(&model, &estimator, cells);
+        self.bank = PackBank::new(&model, &estimator, cells, &self.modules);
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
-        let model = self.model_id();
-        self.checks.fill(ModelCheck::new(model));
-        self.note_checks();
+        self.begin_checks();
     }
 
-    fn model_id(&self) -> u64 {
-        model_id(self.bank.model(), self.bank.config().initial.log_resistance_std)
+    fn begin_checks(&mut self) {
+        let bank = &self.bank;
+        self.checks.iter_mut().enumerate().for_each(|(cell, check)| *check = ModelCheck::new(id_of_model(bank, cell)));
+        self.note_checks();
     }
 
     /// Temperature where none is measured, degrees C.
@@ -128,9 +148,11 @@ impl Estimation {
     pub(super) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
         for sample in &samples {
-            let step = self.next_step(sample, learner);
-            modelling.note(&step);
-            self.bank.add(sample.cell.index(), &step);
+            let (cell, step) = (sample.cell.index(), self.next_step(sample, learner));
+            if self.bank.is_own(cell) {
+                modelling.note(&step);
+            }
+            self.bank.add(cell, &step);
         }
         self.bank.step();
         self.check_models(&samples);
@@ -140,9 +162,10 @@ impl Estimation {
         samples
     }
 
-    /// Mean SOC of the cells, fraction; without any, half.
+    /// Mean SOC of the cells whose model is learned, fraction; without any, half.
     fn mean_soc(&self) -> f64 {
-        let socs = (0..self.cells()).filter_map(|cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
+        let own = self.bank.own_cells().iter();
+        let socs = own.filter_map(|&cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
         let (count, sum) = socs.fold((0.0, 0.0), |(count, sum), soc| (count + 1.0, sum + soc));
         if count > 0.0 { sum / count } else { 0.5 }
     }
@@ -150,30 +173,27 @@ impl Estimation {
     /// Continues with another model. The cells keep their differences from the mean cell.
     pub(super) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
         let Adoption { model, config: estimator, mean, with_capacity } = adoption;
-        let (cells, bank) = (self.cells(), &mut self.bank);
-        let soc = differences((0..cells).map(|cell| bank.filtered_soc(cell).map(|soc| soc.mean)));
-        let log_resistance = differences((0..cells).map(|cell| Some(bank.log_resistance(cell).mean)));
-        let log_capacity = differences((0..cells).map(|cell| Some(libm::log(learner.capacity(cell).mean))));
-        let mut estimator = *estimator;
-        estimator.sensor.current_offset_a = learner.current_offset().std_a(estimator.sensor.current_offset_a);
-        bank.reconfigure(model, &estimator);
-        for cell in 0..cells {
-            let ratio = libm::exp(log_capacity[cell]);
+        let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
+        let soc = differences(own.iter().map(|&cell| bank.filtered_soc(cell).map(|soc| soc.mean)));
+        let log_resistance = differences(own.iter().map(|&cell| Some(bank.log_resistance(cell).mean)));
+        let log_capacity = differences(own.iter().map(|&cell| Some(libm::log(learner.capacity(cell).mean))));
+        self.reconfigure_bank(model, estimator, learner);
+        let (estimator, bank) = (*self.bank.own_config(), &mut self.bank);
+        for (at, cell) in own.into_iter().enumerate() {
+            let ratio = libm::exp(log_capacity[at]);
             let fitted =
                 ScalarGaussian { mean: mean.capacity.mean * ratio, variance: mean.capacity.variance * ratio * ratio };
             let capacity = with_capacity.then_some(fitted);
             let state = AdoptedState {
-                soc: mean.soc.map(|mean| ScalarGaussian { mean: mean.mean + soc[cell], ..mean }),
+                soc: mean.soc.map(|mean| ScalarGaussian { mean: mean.mean + soc[at], ..mean }),
                 capacity: capacity.unwrap_or(learner.capacity(cell)),
-                log_resistance: log_resistance[cell],
+                log_resistance: log_resistance[at],
                 ..*mean
             };
             bank.change(cell, |cell| cell.adopt(model, &estimator, &state));
             learner.adopt(config, cell, capacity, state.soc, &bank.cell(cell));
         }
-        let model = self.model_id();
-        self.checks.fill(ModelCheck::new(model));
-        self.note_checks();
+        self.begin_checks();
     }
 
     /// Ends the work on stepped samples.
@@ -249,9 +269,9 @@ impl Estimation {
                 update,
                 soc: soc.mean,
                 log_resistance: bank.log_resistance(index).mean,
-                log_resistance_std: bank.config().initial.log_resistance_std,
+                log_resistance_std: bank.config(index).initial.log_resistance_std,
             });
-            checks[index].judge(evidence, bank.model().rated_capacity_ah);
+            checks[index].judge(evidence, bank.model(index).rated_capacity_ah);
             has_judged = true;
         }
         if has_judged {
@@ -274,7 +294,7 @@ impl Estimation {
     /// a current that is not the cell's.
     pub(super) fn contradiction(&self, index: usize) -> f64 {
         let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
-        let limit = self.bank.config().consistency.limit;
+        let limit = self.bank.own_config().consistency.limit;
         let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
         let doubt = if self.is_current_doubtful || !self.bank.is_plausible(index) { DOUBT } else { 0.0 };
         if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
@@ -282,7 +302,7 @@ impl Estimation {
 
     /// Judges a cell's innovations; whether it is trusted, when that has changed.
     pub(super) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
-        let is_trusted = self.contradiction(cell.index()) <= self.bank.config().consistency.limit;
+        let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
             return None;
         }
@@ -293,7 +313,7 @@ impl Estimation {
 
     /// A gap of unknown length: no charge counts over it.
     pub(super) fn handle_unknown_gap(&mut self) {
-        self.bank.change_all(crate::cell::CellEstimator::handle_unknown_gap);
+        self.bank.change_all(|_, cell| cell.handle_unknown_gap());
         self.progress.iter_mut().for_each(|cell| cell.consumed = None);
     }
 
@@ -341,11 +361,10 @@ impl Estimation {
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
         batch: CellBatch,
     ) {
-        let model = self.model_id();
         for (index, (consumed, trusted, check)) in cells.enumerate() {
             self.progress[index].consumed = consumed;
             self.trusted[index] = trusted;
-            self.checks[index] = check.or_new(model);
+            self.checks[index] = check.or_new(id_of_model(&self.bank, index));
         }
         self.note_checks();
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
@@ -360,8 +379,13 @@ fn differences(values: impl Iterator<Item = Option<f64>> + Clone) -> Vec<f64> {
     values.map(|value| value.map_or(0.0, |value| value - mean)).collect()
 }
 
+/// Identifies a cell's model and the spread expected of its resistance.
+fn id_of_model(bank: &PackBank, cell: usize) -> u64 {
+    model_id(bank.model(cell), bank.config(cell).initial.log_resistance_std)
+}
+
 /// Resistance of a cell relative to new.
-pub(super) fn resistance(bank: &EstimatorBank, index: usize) -> ScalarGaussian {
+pub(super) fn resistance(bank: &PackBank, index: usize) -> ScalarGaussian {
     let log_resistance = bank.log_resistance(index);
     let ratio = libm::exp(log_resistance.mean);
     ScalarGaussian::from_std(ratio, ratio * log_resistance.std())

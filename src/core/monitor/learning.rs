@@ -12,7 +12,7 @@ use super::publisher::{Publisher, learned};
 use super::{EventKind, MonitorConfig};
 use crate::alarm::{Observation, Rule};
 use crate::can::encode::HealthFields;
-use crate::cell::{CellEstimator, CellModel, EstimatorBank, LossModes};
+use crate::cell::{CellEstimator, CellModel, LossModes, PackBank};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
@@ -122,8 +122,9 @@ fn is_period(period: &ScalarGaussian) -> bool {
 }
 
 impl LearningState {
-    fn new(config: &HealthConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
-        Self { learner: Learner::new(&config.capacity, cells, initial_capacity), ..Self::default() }
+    fn new(config: &HealthConfig, bank: &PackBank) -> Self {
+        let initial = (0..bank.cells()).map(|cell| CellEstimator::new(bank.config(cell)).capacity());
+        Self { learner: Learner::new(&config.capacity, initial.collect()), ..Self::default() }
     }
 
     /// What is learned, without what is under way and without stamps.
@@ -148,24 +149,22 @@ impl LearningState {
 }
 
 impl Learning {
-    pub(super) fn new(config: &MonitorConfig) -> Self {
-        let cells = usize::from(config.sample.cells);
-        let initial_capacity = CellEstimator::new(&config.estimator).capacity();
+    /// `bank`: the estimators of the cells, new.
+    pub(super) fn new(config: &MonitorConfig, bank: &PackBank) -> Self {
         Self {
             config: config.health,
-            state: LearningState::new(&config.health, cells, initial_capacity),
-            cells: vec![CellHealth::default(); cells],
-            lives: PackLife::new(&config.model, &config.health, cells),
+            state: LearningState::new(&config.health, bank),
+            cells: vec![CellHealth::default(); bank.cells()],
+            lives: PackLife::new(bank, &config.health),
             half_cycles: Vec::new(),
         }
     }
 
     /// Forgets all that was learned; `bank` is that of the new cells.
-    pub(super) fn forget(&mut self, bank: &EstimatorBank) {
-        let initial_capacity = CellEstimator::new(bank.config()).capacity();
-        self.state = LearningState::new(&self.config, self.cells.len(), initial_capacity);
+    pub(super) fn forget(&mut self, bank: &PackBank) {
+        self.state = LearningState::new(&self.config, bank);
         self.cells.fill(CellHealth::default());
-        self.lives = PackLife::new(bank.model(), &self.config, self.cells.len());
+        self.lives = PackLife::new(bank, &self.config);
     }
 
     /// Charge, rest or discharge.
@@ -183,7 +182,7 @@ impl Learning {
     pub(super) fn complete_mode(
         &mut self,
         change: ModeChange,
-        bank: &mut EstimatorBank,
+        bank: &mut PackBank,
         teaches_capacity: bool,
         to: &mut Publisher<'_>,
     ) {
@@ -195,7 +194,7 @@ impl Learning {
             bank.learn_slow_branches();
         }
         let mut half_cycles = std::mem::take(&mut self.half_cycles);
-        let rated_ah = bank.model().rated_capacity_ah;
+        let rated_ah = bank.own_model().rated_capacity_ah;
         self.state.learner.complete(&self.config.transition, rated_ah, change.from, &mut half_cycles);
         let was_life_known = self.lives.of_pack().is_some();
         let since_before_s = self.state.learned_at.map(|before| to.now.since(before));
@@ -219,7 +218,7 @@ impl Learning {
     }
 
     /// Learns the offset of the current sensor from the voltages since the last change of mode, and corrects the cells.
-    fn learn_offset(&mut self, bank: &mut EstimatorBank, now: Timestamp) {
+    fn learn_offset(&mut self, bank: &mut PackBank, now: Timestamp) {
         let configured_a = self.config.capacity.current_offset_std_a;
         let offset = self.state.learner.current_offset_mut();
         if configured_a > 0.0 {
@@ -237,19 +236,19 @@ impl Learning {
         index: usize,
         half_cycle: &HalfCycle,
         since_before_s: Option<f64>,
-        bank: &mut EstimatorBank,
+        bank: &mut PackBank,
         to: &mut Publisher<'_>,
     ) -> bool {
         let Self { config, state: LearningState { learner, .. }, cells, lives, .. } = self;
         let (health, life) = (&mut cells[index], &mut lives.cells[index]);
         if bank.soc(index).is_none() {
-            life.learn(bank.model(), config, half_cycle, since_before_s, None);
+            life.learn(bank.model(index), config, half_cycle, since_before_s, None);
             return false;
         }
         let mut estimator = bank.cell(index);
-        let update = learner.learn(bank.model(), &config.capacity, index, &mut estimator, half_cycle);
+        let update = learner.learn(bank.model(index), &config.capacity, index, &mut estimator, half_cycle);
         bank.put(index, &estimator);
-        life.learn(bank.model(), config, half_cycle, since_before_s, Some(&update));
+        life.learn(bank.model(index), config, half_cycle, since_before_s, Some(&update));
         if half_cycle.mode == Mode::Charge && health.tapered {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
@@ -259,7 +258,7 @@ impl Learning {
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
             let (capacity, full_soc) = (update.capacity, health.full_soc);
             health.usable =
-                Some(usable_capacity(bank.model(), usable, (&estimator, bank.config()), capacity, full_soc));
+                Some(usable_capacity(bank.model(index), usable, (&estimator, bank.config(index)), capacity, full_soc));
         }
         if let Some(throughput) = &mut health.throughput {
             throughput.add(half_cycle.mode, half_cycle.charge_ah, half_cycle.duration_s);
@@ -272,7 +271,10 @@ impl Learning {
         to.event(half_cycle_event(cell, half_cycle));
         to.event(capacity_event(cell, usable, resistance, &update));
         if self.state.learner.has_learned(index) {
-            bank.model().loss_modes(update.capacity).iter().for_each(|losses| to.event(losses_event(cell, losses)));
+            bank.model(index)
+                .loss_modes(update.capacity)
+                .iter()
+                .for_each(|losses| to.event(losses_event(cell, losses)));
             let capacity = Observation { is_new: update.measurement.is_some(), ..learned(update.capacity) };
             to.observe(Rule::CapacityLow, Some(cell), capacity);
         }
@@ -295,9 +297,9 @@ impl Learning {
     }
 
     /// Takes a reset of a cell's filter: its capacity is in doubt, and what the SOC crossed in its jump was not charged.
-    pub(super) fn handle_reset(&mut self, cell: CellIndex, bank: &mut EstimatorBank) {
+    pub(super) fn handle_reset(&mut self, cell: CellIndex, bank: &mut PackBank) {
         self.state.recharge = RechargeTimer::default();
-        let new_std_ah = bank.config().initial.capacity_std_ah;
+        let new_std_ah = bank.config(cell.index()).initial.capacity_std_ah;
         let mut estimator = bank.cell(cell.index());
         self.state.learner.doubt(&self.config.capacity, cell.index(), new_std_ah * new_std_ah, &mut estimator);
         bank.put(cell.index(), &estimator);
@@ -305,7 +307,7 @@ impl Learning {
 
     /// Combines the cells to the pack; `all_fresh`: every cell's voltage is. A charge that has crossed the recharge window
     /// gives the raw recharge period.
-    pub(super) fn combine_pack(&mut self, all_fresh: bool, bank: &EstimatorBank, to: &mut Publisher<'_>) {
+    pub(super) fn combine_pack(&mut self, all_fresh: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         self.state.pack = if all_fresh { self.combined(bank) } else { None };
         let Some(pack) = self.state.pack else { return };
         let (config, mode) = (&self.config.recharge, self.mode());
@@ -318,7 +320,7 @@ impl Learning {
     }
 
     /// The pack by the latest estimates of its cells, however old they are.
-    fn combined(&self, bank: &EstimatorBank) -> Option<PackState> {
+    fn combined(&self, bank: &PackBank) -> Option<PackState> {
         let cells = (0..u16::try_from(self.cells.len()).unwrap_or(u16::MAX)).map(CellIndex);
         pack::combine(cells.filter_map(|cell| {
             let (soc, capacity) = (bank.soc(cell.index())?, self.capacity(cell.index()));
@@ -327,7 +329,7 @@ impl Learning {
     }
 
     /// Ends a charge, from which its cells have learned or not: the recharge period, raw and normalised.
-    fn finish_charge(&mut self, has_learned: bool, bank: &EstimatorBank, to: &mut Publisher<'_>) {
+    fn finish_charge(&mut self, has_learned: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         let config = &self.config.recharge;
         let charged = self.state.recharge.finish(config);
         let is_covered = charged.coverage >= config.min_coverage;
@@ -378,24 +380,25 @@ impl Learning {
             .filter(is_period);
     }
 
-    /// Capacity of the cell with the lowest; `None` until half-cycles have taught something about every cell.
-    pub(super) fn weakest_capacity(&self) -> Option<ScalarGaussian> {
-        let capacities = (0..self.cells.len()).map(|index| self.capacity(index));
-        capacities.min_by(|a, b| a.mean.total_cmp(&b.mean)).filter(|_| self.state.learner.has_learned_all())
+    /// The cell with the lowest capacity, and that; `None` until half-cycles have taught something about every cell.
+    pub(super) fn weakest(&self) -> Option<(usize, ScalarGaussian)> {
+        let capacities = (0..self.cells.len()).map(|index| (index, self.capacity(index)));
+        capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean)).filter(|_| self.state.learner.has_learned_all())
     }
 
     /// Health of the pack: that of its weakest cell, once half-cycles have taught something about every cell.
-    pub(super) fn health_fields(&self, bank: &EstimatorBank) -> HealthFields {
+    pub(super) fn health_fields(&self, bank: &PackBank) -> HealthFields {
         let recharge_period_s = self.state.recharge_period_s;
         if !self.state.learner.has_learned_all() {
             return HealthFields { recharge_period_s, ..HealthFields::default() };
         }
-        let capacity = self.weakest_capacity();
+        let weakest = self.weakest();
+        let capacity = weakest.map(|(_, capacity)| capacity);
         let usable = self.cells.iter().filter_map(|cell| cell.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
         let log_resistance = (0..self.cells.len()).map(|cell| bank.log_resistance(cell).mean).max_by(f64::total_cmp);
         let life = self.lives.of_pack().map(|(_, life)| life);
         let cycles = life.and_then(|life| life.cycles);
-        let losses = capacity.and_then(|capacity| bank.model().loss_modes(capacity));
+        let losses = weakest.and_then(|(cell, capacity)| bank.model(cell).loss_modes(capacity));
         let part = |mode: fn(&LossModes) -> &ScalarGaussian| {
             let lost = losses.as_ref().map(mode);
             [lost.map(|lost| lost.mean), lost.map(ScalarGaussian::std)]
@@ -403,7 +406,7 @@ impl Learning {
         HealthFields {
             capacity_ah: capacity.map(|c| c.mean),
             capacity_std_ah: capacity.map(|c| c.std()),
-            soh: capacity.map(|c| c.mean / bank.model().rated_capacity_ah),
+            soh: weakest.map(|(cell, capacity)| capacity.mean / bank.model(cell).rated_capacity_ah),
             recharge_period_s,
             normalized_recharge_period_s: self.state.normalised_recharge.map(|period| period.mean),
             usable_capacity_ah: usable.map(|u| u.mean),

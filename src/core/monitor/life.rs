@@ -7,7 +7,7 @@
 use super::EventKind;
 use super::publisher::Publisher;
 use crate::alarm::{Observation, Rule};
-use crate::cell::CellModel;
+use crate::cell::{CellModel, PackBank};
 use crate::health::{
     Axis, CapacityReading, CapacityUpdate, Forecast, HalfCycle, HealthConfig, InsufficientData, Remaining,
     RemainingLife, Usage,
@@ -80,8 +80,8 @@ pub(super) struct PackLife {
 }
 
 impl PackLife {
-    pub(super) fn new(model: &CellModel, config: &HealthConfig, cells: usize) -> Self {
-        Self { cells: vec![CellLife::new(model, config); cells] }
+    pub(super) fn new(bank: &PackBank, config: &HealthConfig) -> Self {
+        Self { cells: (0..bank.cells()).map(|cell| CellLife::new(bank.model(cell), config)).collect() }
     }
 
     /// Remaining life of a cell, or why it is not known.

@@ -335,8 +335,7 @@ impl Monitor {
                 // Samples from before the downtime belong before it, and say nothing of the present.
                 stages.step_waiting(taken, was_brief, out);
             }
-            let config = *stages.estimation.bank.config();
-            stages.estimation.bank.change_all(|estimator| estimator.note_downtime(&config, away_s));
+            stages.estimation.bank.change_all(|config, estimator| estimator.note_downtime(config, away_s));
         }
         self.intake.gate_of_commands.begin(time);
         if beginning == Beginning::New {

@@ -230,7 +230,7 @@ impl Modelling {
             label: config.label,
             model: config.model.clone(),
             estimator: config.estimator,
-            notebook: NotebookConfig::new(u32::from(config.sample.cells), rated_ah),
+            notebook: NotebookConfig::new(config.own_cells(), rated_ah),
             state: ModellingState::default(),
             rest_since: None,
             fit_since: None,

@@ -20,7 +20,7 @@ use super::sender::Schedule;
 use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
-use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck};
+use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck, PackBank};
 use crate::filter::ScalarGaussian;
 use crate::findings::{Diagnosis, Imbalance, UnknownImbalance};
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
@@ -206,14 +206,14 @@ impl Monitor {
             )));
         }
         let Stages { sampling, estimation, .. } = &self.stages;
-        let (branches, cells) = (estimation.bank.model().branches.len(), estimation.cells());
+        let (bank, cells) = (&estimation.bank, estimation.cells());
         let fits = snapshot.cells.len() == cells
             && snapshot.learning.learner.fits(cells)
             && sampling.sampler.fits(&snapshot.sampler)
             && snapshot.waiting_fits()
-            && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
+            && snapshot.cells.iter().enumerate().all(|(index, cell)| cell.fits(bank, index));
         if !fits {
-            let found = snapshot.cells.len();
+            let (found, branches) = (snapshot.cells.len(), bank.own_model().branches.len());
             return Err(RestoreError::Unfit(format!(
                 "snapshot is of {found} cells, another number of branches, or samples of no cell, the configuration has \
                  {cells} cells of {branches} branches"
@@ -277,8 +277,8 @@ impl Stages {
         self.sampling.sampler.restore(snapshot.sampler);
         self.sampling.identity = snapshot.identity;
         self.packs = snapshot.packs;
-        let (cells, branches) = (self.estimation.cells(), self.estimation.bank.model().branches.len());
-        self.packs.retain(|pack| pack.fits(cells, branches));
+        let bank = &self.estimation.bank;
+        self.packs.retain(|pack| pack.fits(bank));
         self.sender.schedule = snapshot.schedule;
         if !is_continued {
             self.sender.begin_freshness(now);
@@ -302,11 +302,11 @@ impl Stages {
             modelling.restore(stored);
             estimation.use_model(modelling, &state.learner);
         }
-        let branches = estimation.bank.model().branches.len();
         for (index, cell) in cells.iter().enumerate() {
             learning.cells[index] = cell.health;
-            learning.lives.cells[index] = cell.life(estimation.bank.model(), &learning.config);
-            if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
+            let model = estimation.bank.model(index);
+            learning.lives.cells[index] = cell.life(model, &learning.config);
+            if let Some(estimator) = CellEstimator::restore(&cell.estimator, model.branches.len()) {
                 estimation.bank.put(index, &estimator);
             }
         }
@@ -341,7 +341,7 @@ impl Stages {
         self.diagnosing.restore(pack.diagnosis, Some((now, now)));
         self.diagnosing.diagnosis.forget_charge();
         self.note_faulty_channels();
-        let capacity = self.learning.weakest_capacity();
+        let capacity = self.learning.weakest().map(|(_, capacity)| capacity);
         let kind = EventKind::PackReturned {
             identity: pack.number,
             capacity_ah: capacity.map(|capacity| capacity.mean),
@@ -377,10 +377,10 @@ impl Stages {
 
 impl StoredPack {
     /// Whether it is a pack of so many cells, each of so many branches.
-    fn fits(&self, cells: usize, branches: usize) -> bool {
-        self.cells.len() == cells
-            && self.learning.learner.fits(cells)
-            && self.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some())
+    fn fits(&self, bank: &PackBank) -> bool {
+        self.cells.len() == bank.cells()
+            && self.learning.learner.fits(bank.cells())
+            && self.cells.iter().enumerate().all(|(index, cell)| cell.fits(bank, index))
     }
 }
 
@@ -529,6 +529,11 @@ impl StoredCell {
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         bounds::CHARGE_AS.check("the charge taken in", charge_as)?;
         bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
+    }
+
+    /// Whether the filter has the branches of this cell of the bank.
+    fn fits(&self, bank: &PackBank, index: usize) -> bool {
+        CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {

@@ -40,12 +40,13 @@ pub(super) struct Stages {
 
 impl Stages {
     pub(super) fn new(config: &MonitorConfig) -> Self {
+        let estimation = Estimation::new(config);
         Self {
             sampling: Sampling::new(config),
-            estimation: Estimation::new(config),
             modelling: Modelling::new(config),
-            learning: Learning::new(config),
-            diagnosing: Diagnosing::new(config),
+            learning: Learning::new(config, &estimation.bank),
+            diagnosing: Diagnosing::new(config, estimation.bank.own_cells()),
+            estimation,
             alarming: Alarming::new(config),
             sender: Sender::new(config),
             statistics: Statistics::default(),
@@ -208,7 +209,7 @@ impl Stages {
             out.events.push(Event { time: now, kind: EventKind::FilterReset { cell: sample.cell } });
             self.learning.handle_reset(sample.cell, &mut self.estimation.bank);
         }
-        self.learning.handle_sample(sample, self.estimation.bank.model());
+        self.learning.handle_sample(sample, self.estimation.bank.model(sample.cell.index()));
         if out.want_estimates {
             out.estimates.extend(self.estimate(sample.cell.index()));
         }
@@ -298,7 +299,7 @@ impl Stages {
 
     /// Records what was learned of the old pack, and forgets it.
     fn replace_pack(&mut self, now: Timestamp, out: &mut Outputs) {
-        let capacity = self.learning.weakest_capacity();
+        let capacity = self.learning.weakest().map(|(_, capacity)| capacity);
         let kind = EventKind::PackReplaced {
             capacity_ah: capacity.map(|capacity| capacity.mean),
             capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
@@ -335,7 +336,7 @@ impl Stages {
         self.sender.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
-        self.estimation.bank.change_all(crate::cell::CellEstimator::note_sleep);
+        self.estimation.bank.change_all(|_, cell| cell.note_sleep());
         self.forget_pack_state();
     }
 

@@ -238,7 +238,9 @@ impl Monitor {
     pub fn loss_modes(&self, cell: CellIndex) -> Option<LossModes> {
         let Stages { estimation, learning, .. } = &self.stages;
         let has_learned = learning.state.learner.has_learned(cell.index());
-        has_learned.then(|| learning.capacity(cell.index())).and_then(|it| estimation.bank.model().loss_modes(it))
+        has_learned
+            .then(|| learning.capacity(cell.index()))
+            .and_then(|it| estimation.bank.model(cell.index()).loss_modes(it))
     }
 
     /// Offset of the current sensor, A of the pack: what it reads less the true current, positive = discharge. `None` =

@@ -230,9 +230,11 @@ impl Stages {
     fn disagreement(&self, now: Timestamp) -> Observation {
         let config = self.sampling.sampler.config();
         let soc = self.learning.state.pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
-        let rated_ah = self.estimation.bank.model().rated_capacity_ah;
-        let weakest = if config.reported_soh.is_some() { self.learning.weakest_capacity() } else { None };
-        let soh = weakest.map(|c| ScalarGaussian::from_std(c.mean / rated_ah, c.std() / rated_ah));
+        let weakest = if config.reported_soh.is_some() { self.learning.weakest() } else { None };
+        let soh = weakest.map(|(cell, capacity)| {
+            let rated_ah = self.estimation.bank.model(cell).rated_capacity_ah;
+            ScalarGaussian::from_std(capacity.mean / rated_ah, capacity.std() / rated_ah)
+        });
         let pairs = [
             (config.reported_soc.is_some(), Channel::ReportedSoc, soc),
             (config.reported_soh.is_some(), Channel::ReportedSoh, soh),
@@ -260,7 +262,7 @@ impl Stages {
         is_known_good && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
-            worst <= bank.config().consistency.limit
+            worst <= bank.own_config().consistency.limit
                 && bank.are_all_plausible()
                 && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
         }

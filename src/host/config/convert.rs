@@ -4,6 +4,7 @@ use std::num::NonZeroU32;
 
 use super::alarm::RatedCell;
 use super::keys::{Pack, TemperatureInput};
+use super::modules::{self, Module};
 use super::tables::RawTables;
 use crate::can::CanId;
 use crate::can::decode::InputMap;
@@ -11,7 +12,7 @@ use crate::can::diagnostic::Answer;
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::poll::PollConfig;
-use crate::cell::CellModel;
+use crate::cell::{CellModel, CellModule};
 use crate::findings::BalancingConfig;
 use crate::health::HealthConfig;
 use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig, SupplyConfig};
@@ -35,6 +36,7 @@ pub(super) struct Traffic {
 pub(super) fn monitor(
     raw: &RawTables,
     mut model: CellModel,
+    modules: Vec<Module<'_>>,
     found: &DbcRanges,
     traffic: Traffic,
 ) -> Option<MonitorConfig> {
@@ -44,7 +46,17 @@ pub(super) fn monitor(
     let rated = RatedCell::new(rated_ah, raw.recharge.as_ref()?);
     model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
     let capacity = raw.capacity.as_ref()?.config(rated_ah);
-    let estimator = raw.estimator.as_ref()?.config(pack, &model, &capacity, found.voltage_step_v);
+    let estimator = |model: &CellModel, initial_ah| {
+        Some(raw.estimator.as_ref()?.config(initial_ah, model, &capacity, found.voltage_step_v))
+    };
+    let ranged = modules::with_voltages_of(&model, &modules);
+    let modules = modules.into_iter().map(|Module { keys, cells, mut model }| {
+        model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
+        let estimator = estimator(&model, (keys.initial_capacity_ah, keys.initial_capacity_std_ah))?;
+        Some(CellModule { cells, model, estimator })
+    });
+    let modules = modules.collect::<Option<Vec<_>>>()?;
+    let estimator = estimator(&model, (pack.initial_capacity_ah, pack.initial_capacity_std_ah))?;
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
         interfaces: raw.interfaces.len(),
@@ -63,7 +75,7 @@ pub(super) fn monitor(
         output: traffic.output,
         commands: traffic.commands,
         j1939: traffic.j1939,
-        sample: SampleConfig { voltage_noise_v: estimator.voltage.noise_v, ..sample(raw, pack, &model, found)? },
+        sample: SampleConfig { voltage_noise_v: estimator.voltage.noise_v, ..sample(raw, pack, &ranged, found)? },
         estimator,
         health: HealthConfig {
             transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
@@ -74,6 +86,7 @@ pub(super) fn monitor(
         },
         rules,
         model,
+        modules,
         label: super::label::label(pack).filter(|_| pack.learn_model),
         is_balanced: pack.balancing,
         balancing: raw.balancing.as_ref().map(|keys| BalancingConfig {

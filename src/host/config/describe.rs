@@ -9,6 +9,7 @@ use super::{Config, ConfigFiles, InterfaceConfig, VehicleIdentity, protect};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
+use crate::cell::CellModel;
 use crate::health::{RechargeAlarm, RechargeConfig};
 use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
@@ -169,6 +170,14 @@ fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
             "only the total voltage is known: {series} equal cells are assumed and estimated as one; a weak cell cannot be seen"
         ),
     }];
+    for module in &config.monitor.modules {
+        let cells: Vec<u16> = module.cells.iter().map(|cell| cell.0 + 1).collect();
+        let CellModel { name, rated_capacity_ah, capacity_ah, .. } = &module.model;
+        words.push(format!(
+            "cells {}: another cell, {name}: rated {rated_capacity_ah} Ah, {capacity_ah} Ah when new; not compared with the others",
+            cell_list(&cells)
+        ));
+    }
     if sample.strings > 1 {
         words.push(format!(
             "{} parallel strings: each is assumed to carry an equal share of the current",

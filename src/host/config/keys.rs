@@ -156,6 +156,24 @@ section! {
 }
 
 section! {
+    /// Cells of another kind than the pack's own: a replaced module, or one of another maker. They have a model of their own, which is not learned on board, and are not compared with the pack's own cells.
+    PackModule at "pack.module" {
+        /// Cells of the module.
+        cells: CellRanges, "", Any, Required;
+        /// Cell model file, relative to this file. Without it: `chemistry` and `rated_capacity_ah` give a model.
+        cell_model: Option<String>, "", NotEmpty, Optional;
+        /// Chemistry of a cell without a model file, as for `[pack]`. Without it: `cell_model` is needed.
+        chemistry: Option<Chemistry>, "", Any, Optional;
+        /// Capacity on the label of one cell, which SOH is relative to. Without it: the cell model's.
+        rated_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional;
+        /// Capacity of a cell to start from, before any is learned. Without it: the cell model's `capacity_ah`.
+        initial_capacity_ah: Option<f64>, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Optional;
+        /// Standard deviation of the capacity to start from. Without it: 10 % of that capacity.
+        initial_capacity_std_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+    }
+}
+
+section! {
     /// A CAN interface. The program numbers the interfaces in the order of the file.
     Interface at "interface" {
         /// Kernel name, at most 15 characters.

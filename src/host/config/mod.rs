@@ -17,6 +17,7 @@
 //! | `input_tables`, `plausible` | faulty tables checked as far as they go; what cannot be meant |
 //! | `convert` | the settings of the core |
 //! | `cell_model` | cell model files, by the same mechanism |
+//! | `modules` | modules of other cells |
 //! | `vehicle` | which vehicle and pack |
 //! | `describe`, `reference`, `manual` | the configuration in words |
 //! | `partial` | as much of a faulty configuration as can be read |
@@ -52,6 +53,7 @@ mod keys;
 mod label;
 mod manual;
 mod merged;
+mod modules;
 mod output;
 mod partial;
 mod pattern;
@@ -241,10 +243,13 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let raw = RawTables::read(&document, faults);
     let sourced = read_model(path, &document, &raw, read, faults);
     let (model, model_source) = sourced.map(|SourcedModel { model, source }| (model, source)).unzip();
+    let modules = modules::read(path, &raw, read, faults);
+    let ranged = model.as_ref().map(|model| modules::with_voltages_of(model, &modules));
     cross::check(&raw, model.as_ref(), faults);
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
     plausible::initial_capacity(&raw, model.as_ref(), faults);
+    modules.iter().for_each(|module| plausible::module(module, faults));
     let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
@@ -252,8 +257,8 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     if let Some(databases) = &databases {
         input_tables::signals(&document, &raw, databases, faults);
     }
-    plausible::signals(&raw, &found, model.as_ref(), faults);
-    plausible::ranges(&raw, &found, model.as_ref(), faults);
+    plausible::signals(&raw, &found, ranged.as_ref(), faults);
+    plausible::ranges(&raw, &found, ranged.as_ref(), faults);
     let checks = &mut Checks { raw: &raw, found: &found, faults };
     let mut guards = protect::guards(checks, inputs_whole);
     let laid_out = output::output(checks, path, model.as_ref(), read);
@@ -275,7 +280,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
         commands,
         j1939,
     };
-    let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
+    let monitor = convert::monitor(&raw, model?, modules, &ranges, traffic)?;
     let store = raw.store.as_ref()?.config();
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?.config();

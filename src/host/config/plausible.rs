@@ -5,6 +5,7 @@
 //! unlikely. A `scale` (or `offset`) that is written overrules the unit of the DBC.
 
 use super::document::{Faults, TablePlace};
+use super::modules::Module;
 use super::resolve::{self, ResolvedSignal};
 use super::tables::RawTables;
 use crate::can::dbc::{MuxCondition, Signal};
@@ -449,12 +450,27 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel, faults: &mut F
 /// Notes an initial capacity that no cell of the model can have.
 pub(super) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
-    let Some(initial_ah) = pack.initial_capacity_ah else { return };
+    initial_of(&pack.place, pack.initial_capacity_ah, model, faults);
+}
+
+/// Notes a module's initial capacity that no cell of its model has, and a rated one that is not of a cell like it.
+pub(super) fn module(Module { keys, model, .. }: &Module<'_>, faults: &mut Faults) {
+    initial_of(&keys.place, keys.initial_capacity_ah, model, faults);
+    let ratio = model.rated_capacity_ah / model.capacity_ah;
+    if ratio.max(1.0 / ratio) >= OTHER_CELL {
+        let what =
+            format!("must be that of one cell of {:?}, which has {} Ah", model.name, digits(model.capacity_ah, 3));
+        keys.place.fault(faults, "rated_capacity_ah", &what);
+    }
+}
+
+fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel, faults: &mut Faults) {
+    let Some(initial_ah) = initial_ah else { return };
     if !bounds::INITIAL_CAPACITY.has(initial_ah / model.capacity_ah) {
         let [low, high] =
             [bounds::INITIAL_CAPACITY.low, bounds::INITIAL_CAPACITY.high].map(|by| digits(by * model.capacity_ah, 3));
         let what = format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name);
-        pack.place.fault(faults, "initial_capacity_ah", &what);
+        place.fault(faults, "initial_capacity_ah", &what);
     }
 }
 

@@ -4,9 +4,9 @@ use super::document::{Faults, TablePlace};
 use super::keys::{
     Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
     CurrentInput, CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
-    OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackVoltageInput,
-    Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, SupplyVoltageInput,
-    TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
+    OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackModule,
+    PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store,
+    SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::schema::tables;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
@@ -16,6 +16,7 @@ tables! {
     RawTables, SECTIONS {
         vehicle: one Vehicle,
         pack: one Pack,
+        modules: many PackModule,
         interfaces: many Interface,
         input: one Input,
         diagnostics: many DiagnosticInput with AnswerSignalKeys,

@@ -15,6 +15,7 @@ mod drop_ins;
 mod faults;
 mod j1939;
 mod label;
+mod modules;
 mod plausible;
 mod protect;
 

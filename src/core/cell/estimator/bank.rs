@@ -113,6 +113,11 @@ impl EstimatorBank {
         *self = new;
     }
 
+    /// Number of cells.
+    pub fn cells(&self) -> usize {
+        self.cells.len()
+    }
+
     /// The cell model.
     pub fn model(&self) -> &CellModel {
         &self.model

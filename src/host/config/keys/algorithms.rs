@@ -1,7 +1,7 @@
 //! The tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each gives the parameters
 //! of its algorithm; what a key means where it is not written stands next to the key.
 
-use super::{DEVIATION, MethodKey, Pack, TEMPERATURE_C};
+use super::{DEVIATION, MethodKey, TEMPERATURE_C};
 use crate::cell::{
     CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
     InitialState, ModelSpread, ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
@@ -98,16 +98,17 @@ impl Estimator {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
 
-    /// The parameters these keys stand for; `voltage_step_v` is the resolution of the cells' voltages.
+    /// The parameters these keys stand for; `initial_ah` is the capacity to start from and its deviation, where they are given,
+    /// `voltage_step_v` the resolution of the cells' voltages.
     pub(crate) fn config(
         &self,
-        pack: &Pack,
+        (initial_ah, initial_std_ah): (Option<f64>, Option<f64>),
         model: &CellModel,
         capacity: &CapacityConfig,
         voltage_step_v: f64,
     ) -> EstimatorConfig {
         let rounding_v = self.rounding_v(voltage_step_v);
-        let initial_ah = pack.initial_capacity_ah.unwrap_or(model.capacity_ah);
+        let initial_ah = initial_ah.unwrap_or(model.capacity_ah);
         let spread = model.spread.unwrap_or(ModelSpread::usual(model.branches.len()));
         EstimatorConfig {
             points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
@@ -118,7 +119,7 @@ impl Estimator {
                 soc_std: self.initial_soc_std,
                 branch_std_v: self.initial_branch_std_v,
                 capacity_ah: initial_ah,
-                capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(spread.capacity * initial_ah),
+                capacity_std_ah: initial_std_ah.unwrap_or(spread.capacity * initial_ah),
                 curve: match self.capacity_state {
                     CapacityState::Joint => {
                         ScalarGaussian::from_std(model.capacity_ah, FIRST_LOSS_STD * model.capacity_ah)

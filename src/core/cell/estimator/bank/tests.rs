@@ -5,7 +5,8 @@ use crate::cell::circuit::{self, BranchAt};
 use crate::cell::config::{CapacityState, Discretisation, SigmaPointSettings};
 use crate::cell::estimator::tests::config as without_errors;
 use crate::cell::model::tests::small_model;
-use crate::cell::{AgedOcv, SensorErrors, Table};
+use crate::cell::{AgedOcv, CellModule, PackBank, SensorErrors, Table};
+use crate::quantity::CellIndex;
 
 /// Settings with every constant error.
 fn config() -> EstimatorConfig {
@@ -285,4 +286,46 @@ fn an_estimator_put_into_the_bank_is_returned_unchanged() {
     assert_eq!((bank.cell(4).capacity().mean, bank.cell(7).capacity()), (1.23, other.capacity()));
     bank.put(4, &CellEstimator::new(&config));
     assert_eq!((bank.soc(4), bank.cell(4).capacity().mean), (None, config.initial.capacity_ah));
+}
+
+/// Cells of two kinds, mixed in one pack, give the bits that each kind gives alone.
+#[test]
+fn modules_of_another_cell_are_estimated_as_if_they_were_alone() {
+    let (model, other) = (small_model(), CellModel { capacity_ah: 3.0, ..small_model() });
+    let config = config();
+    let other_config =
+        EstimatorConfig { initial: crate::cell::InitialState { capacity_ah: 3.0, ..config.initial }, ..config };
+    let in_module = [CellIndex(1), CellIndex(4), CellIndex(5)];
+    let module = CellModule { cells: in_module.to_vec(), model: other.clone(), estimator: other_config };
+    let mut mixed = PackBank::new(&model, &config, 8, &[module]);
+    let mut own = EstimatorBank::new(&model, &config, 5);
+    let mut foreign = EstimatorBank::new(&other, &other_config, 3);
+    assert_eq!(mixed.own_cells(), [0, 2, 3, 6, 7]);
+    let mut pack = Pack::new(&model, 8);
+    for time in 0..4000 {
+        for (cell, step) in pack.steps(time) {
+            mixed.add(cell, &step);
+            match in_module.iter().position(|it| it.index() == cell) {
+                Some(at) => foreign.add(at, &step),
+                None => own.add(mixed.own_cells().iter().position(|&it| it == cell).unwrap(), &step),
+            }
+        }
+        mixed.step();
+        own.step();
+        foreign.step();
+    }
+    for (bank, cells) in [(&own, vec![0, 2, 3, 6, 7]), (&foreign, vec![1, 4, 5])] {
+        for (at, cell) in cells.into_iter().enumerate() {
+            assert!(bank.is_started(at));
+            assert_eq!(mixed.cell(cell).snapshot(), bank.cell(at).snapshot(), "cell {cell}");
+            assert_eq!((mixed.soc(cell), mixed.model(cell)), (bank.soc(at), bank.model()));
+        }
+    }
+    let [(a, b), (c, d)] = [own.offset_evidence(), foreign.offset_evidence()];
+    let (information, score) = mixed.offset_evidence();
+    assert!((information - (5.0 * a + 3.0 * c) / 8.0).abs() <= 1e-12 * information, "{information}");
+    assert!((score - (5.0 * b + 3.0 * d) / 8.0).abs() <= 1e-9 * score.abs(), "{score}");
+    let [low, high] =
+        [f64::min, f64::max].map(|pick| (0..8).map(|it| mixed.soc(it).unwrap().mean).reduce(pick).unwrap());
+    assert_eq!(mixed.extremes().map(|(lowest, highest)| (lowest.mean, highest.mean)), Some((low, high)));
 }

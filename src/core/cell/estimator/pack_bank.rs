@@ -1,0 +1,273 @@
+//! The estimators of a pack whose modules may be of different cells: an [`EstimatorBank`] for each kind of cell.
+//!
+//! In: one [`CellStep`] per cell and batch, by the cell's place in the pack. Out: as a bank's. All kinds share the current sensor:
+//! what is learned of its offset is of the whole pack.
+
+use super::bank::EstimatorBank;
+use super::cell_estimator::CellEstimator;
+use super::step::{CellStep, StepResult};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
+use crate::filter::ScalarGaussian;
+use crate::quantity::CellIndex;
+
+/// Cells of a pack that are of another kind than the others: a replaced module.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CellModule {
+    /// The cells, ascending; no cell is in two modules.
+    pub cells: Vec<CellIndex>,
+    /// Their model.
+    pub model: CellModel,
+    /// Estimator settings: those of the pack, with the initial capacity of this model.
+    pub estimator: EstimatorConfig,
+}
+
+/// Where a cell's estimator is.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    bank: usize,
+    cell: usize,
+}
+
+/// The estimators of a pack's cells.
+#[derive(Debug, Clone)]
+pub struct PackBank {
+    /// That of the pack's own cells, then one per module.
+    banks: Vec<EstimatorBank>,
+    /// One per cell of the pack.
+    places: Vec<Place>,
+    /// The pack's own cells, ascending.
+    own: Vec<usize>,
+}
+
+impl PackBank {
+    /// Estimators of `cells` cells before their first measurement; those in no module are of `model`.
+    ///
+    /// # Panics
+    /// When a module has a cell that the pack does not have.
+    pub fn new(model: &CellModel, config: &EstimatorConfig, cells: usize, modules: &[CellModule]) -> Self {
+        let mut places: Vec<Option<Place>> = vec![None; cells];
+        for (bank, module) in (1..).zip(modules) {
+            for (cell, index) in module.cells.iter().enumerate() {
+                places[index.index()] = Some(Place { bank, cell });
+            }
+        }
+        let own: Vec<usize> = (0..cells).filter(|&cell| places[cell].is_none()).collect();
+        for (cell, &index) in own.iter().enumerate() {
+            places[index] = Some(Place { bank: 0, cell });
+        }
+        let of_module = |module: &CellModule| EstimatorBank::new(&module.model, &module.estimator, module.cells.len());
+        let banks = std::iter::once(EstimatorBank::new(model, config, own.len())).chain(modules.iter().map(of_module));
+        Self { banks: banks.collect(), places: places.into_iter().flatten().collect(), own }
+    }
+
+    /// Replaces settings and tables for the same cells and modules; a model must have as many branches as before.
+    pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig, modules: &[CellModule]) {
+        self.banks[0].reconfigure(model, config);
+        for (bank, module) in self.banks[1..].iter_mut().zip(modules) {
+            bank.reconfigure(&module.model, &module.estimator);
+        }
+    }
+
+    #[inline]
+    fn at(&self, cell: usize) -> (&EstimatorBank, usize) {
+        let Place { bank, cell } = self.places[cell];
+        (&self.banks[bank], cell)
+    }
+
+    #[inline]
+    fn at_mut(&mut self, cell: usize) -> (&mut EstimatorBank, usize) {
+        let Place { bank, cell } = self.places[cell];
+        (&mut self.banks[bank], cell)
+    }
+
+    /// Number of cells.
+    pub fn cells(&self) -> usize {
+        self.places.len()
+    }
+
+    /// The cells that are in no module, ascending.
+    pub fn own_cells(&self) -> &[usize] {
+        &self.own
+    }
+
+    /// Whether a cell is in no module.
+    #[inline]
+    pub fn is_own(&self, cell: usize) -> bool {
+        self.places[cell].bank == 0
+    }
+
+    /// The model of the pack's own cells.
+    pub fn own_model(&self) -> &CellModel {
+        self.banks[0].model()
+    }
+
+    /// The settings of the pack's own cells.
+    pub fn own_config(&self) -> &EstimatorConfig {
+        self.banks[0].config()
+    }
+
+    /// A cell's model.
+    pub fn model(&self, cell: usize) -> &CellModel {
+        self.at(cell).0.model()
+    }
+
+    /// A cell's settings.
+    pub fn config(&self, cell: usize) -> &EstimatorConfig {
+        self.at(cell).0.config()
+    }
+
+    /// As [`EstimatorBank::add`].
+    ///
+    /// # Panics
+    /// When there is no such cell.
+    #[inline]
+    pub fn add(&mut self, cell: usize, step: &CellStep) {
+        let (bank, cell) = self.at_mut(cell);
+        bank.add(cell, step);
+    }
+
+    /// As [`EstimatorBank::step`].
+    pub fn step(&mut self) {
+        self.banks.iter_mut().for_each(EstimatorBank::step);
+    }
+
+    /// As [`EstimatorBank::result`].
+    #[inline]
+    pub fn result(&self, cell: usize) -> &StepResult {
+        let (bank, cell) = self.at(cell);
+        bank.result(cell)
+    }
+
+    /// As [`EstimatorBank::is_started`].
+    #[inline]
+    pub fn is_started(&self, cell: usize) -> bool {
+        let (bank, cell) = self.at(cell);
+        bank.is_started(cell)
+    }
+
+    /// As [`EstimatorBank::filtered_soc`].
+    pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
+        let (bank, cell) = self.at(cell);
+        bank.filtered_soc(cell)
+    }
+
+    /// As [`EstimatorBank::soc`].
+    #[inline]
+    pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
+        let (bank, cell) = self.at(cell);
+        bank.soc(cell)
+    }
+
+    /// As [`EstimatorBank::extremes`], of all cells.
+    pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
+        let mut of_banks = self.banks.iter().filter(|bank| bank.cells() > 0).map(EstimatorBank::extremes);
+        let first = of_banks.next()??;
+        of_banks.try_fold(first, |(lowest, highest), of_bank| {
+            let (low, high) = of_bank?;
+            Some((
+                if low.mean < lowest.mean { low } else { lowest },
+                if high.mean > highest.mean { high } else { highest },
+            ))
+        })
+    }
+
+    /// As [`EstimatorBank::log_resistance`].
+    #[inline]
+    pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
+        let (bank, cell) = self.at(cell);
+        bank.log_resistance(cell)
+    }
+
+    /// As [`EstimatorBank::branch_v`].
+    pub fn branch_v(&self, cell: usize) -> [f64; MAX_BRANCHES] {
+        let (bank, cell) = self.at(cell);
+        bank.branch_v(cell)
+    }
+
+    /// As [`EstimatorBank::mean_nis`].
+    #[inline]
+    pub fn mean_nis(&self, cell: usize) -> f64 {
+        let (bank, cell) = self.at(cell);
+        bank.mean_nis(cell)
+    }
+
+    /// As [`EstimatorBank::is_plausible`].
+    #[inline]
+    pub fn is_plausible(&self, cell: usize) -> bool {
+        let (bank, cell) = self.at(cell);
+        bank.is_plausible(cell)
+    }
+
+    /// As [`EstimatorBank::are_all_plausible`].
+    pub fn are_all_plausible(&self) -> bool {
+        self.banks.iter().all(EstimatorBank::are_all_plausible)
+    }
+
+    /// As [`EstimatorBank::worst_nis`].
+    pub fn worst_nis(&self) -> f64 {
+        self.banks.iter().map(EstimatorBank::worst_nis).fold(0.0, f64::max)
+    }
+
+    /// As [`EstimatorBank::temperature_c`].
+    #[inline]
+    pub fn temperature_c(&self, cell: usize) -> Option<f64> {
+        let (bank, cell) = self.at(cell);
+        bank.temperature_c(cell)
+    }
+
+    /// As [`EstimatorBank::is_carried_over`].
+    pub fn is_carried_over(&self, cell: usize) -> bool {
+        let (bank, cell) = self.at(cell);
+        bank.is_carried_over(cell)
+    }
+
+    /// A copy of a cell's estimator.
+    pub fn cell(&self, cell: usize) -> CellEstimator {
+        let (bank, cell) = self.at(cell);
+        bank.cell(cell)
+    }
+
+    /// Replaces a cell's estimator.
+    pub fn put(&mut self, cell: usize, estimator: &CellEstimator) {
+        let (bank, cell) = self.at_mut(cell);
+        bank.put(cell, estimator);
+    }
+
+    /// Changes a cell's estimator.
+    pub fn change<R>(&mut self, cell: usize, change: impl FnOnce(&mut CellEstimator) -> R) -> R {
+        let (bank, cell) = self.at_mut(cell);
+        bank.change(cell, change)
+    }
+
+    /// As [`EstimatorBank::offset_evidence`]: means over all cells.
+    pub fn offset_evidence(&self) -> (f64, f64) {
+        let of_bank = |bank: &EstimatorBank| {
+            let (share, (information, score)) = (bank.cells() as f64 / self.cells() as f64, bank.offset_evidence());
+            (share * information, share * score)
+        };
+        self.banks.iter().map(of_bank).fold((0.0, 0.0), |sum, of_bank| (sum.0 + of_bank.0, sum.1 + of_bank.1))
+    }
+
+    /// As [`EstimatorBank::absorb_current_offset`].
+    pub fn absorb_current_offset(&mut self, deviations: f64, offset_std_a: f64) {
+        self.banks.iter_mut().for_each(|bank| bank.absorb_current_offset(deviations, offset_std_a));
+    }
+
+    /// As [`EstimatorBank::learn_slow_branches`].
+    pub fn learn_slow_branches(&mut self) {
+        self.banks.iter_mut().for_each(EstimatorBank::learn_slow_branches);
+    }
+
+    /// As [`EstimatorBank::set_current_offset_std`].
+    pub fn set_current_offset_std(&mut self, offset_std_a: f64) {
+        self.banks.iter_mut().for_each(|bank| bank.set_current_offset_std(offset_std_a));
+    }
+
+    /// Changes every cell's estimator.
+    pub fn change_all(&mut self, mut change: impl FnMut(&EstimatorConfig, &mut CellEstimator)) {
+        for bank in &mut self.banks {
+            let config = *bank.config();
+            bank.change_all(|cell| change(&config, cell));
+        }
+    }
+}
