@@ -16,7 +16,7 @@ use crate::can::secoc::Authentication;
 use crate::cell::{CellModel, CellModule, EstimatorConfig, Label};
 use crate::findings::BalancingConfig;
 use crate::health::{CapacityMethod, HealthConfig};
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, CellIndex};
 use crate::sample::SampleConfig;
 
 /// Checked settings of all stages.
@@ -81,6 +81,17 @@ impl MonitorConfig {
     /// Whether every frame of an interface is received: requests are sent there, and only where the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
         self.poll.as_ref().is_some_and(|poll| poll.requests.iter().any(|it| it.question.controller.bus == bus))
+    }
+
+    /// The configured model of a cell.
+    pub fn model_of(&self, cell: CellIndex) -> &CellModel {
+        let module = self.modules.iter().find(|module| module.cells.contains(&cell));
+        module.map_or(&self.model, |module| &module.model)
+    }
+
+    /// Whether a cell is in no module of another kind.
+    pub fn is_own(&self, cell: CellIndex) -> bool {
+        !self.modules.iter().any(|module| module.cells.contains(&cell))
     }
 
     /// Number of cells that are in no module of another kind.

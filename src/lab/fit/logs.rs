@@ -30,6 +30,7 @@ use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
 use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
 use crate::io::log::{LogOptions, LogSource};
 use crate::monitor::{Estimate, Input, Monitor, MonitorConfig};
+use crate::quantity::CellIndex;
 use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
 /// A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
@@ -296,12 +297,15 @@ fn colder(temperature_c: f64) -> f64 {
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
+    // The cells of a module of another kind have another curve.
+    let is_own: Vec<bool> =
+        (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
     let watch: OutputWatch = Box::new(move |input, out| {
         let mut mean = watched.borrow_mut();
         if matches!(input, Input::UnknownGap { .. }) {
             mean.end_stretch();
         }
-        out.estimates.iter().for_each(|estimate| mean.take(estimate));
+        out.estimates.iter().filter(|it| is_own[it.cell.index()]).for_each(|estimate| mean.take(estimate));
     });
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());

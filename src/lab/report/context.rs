@@ -4,6 +4,7 @@ use super::reference::Reference;
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
 use crate::findings::{Diagnosis, Imbalance, UnknownImbalance};
+use crate::quantity::CellIndex;
 
 /// Content of a page in addition to the data.
 #[derive(Debug, Default)]
@@ -24,4 +25,12 @@ pub struct PageContext<'a> {
     pub reference: Reference,
     /// Lines of the provenance: name and value.
     pub provenance: Vec<(String, String)>,
+}
+
+impl PageContext<'_> {
+    /// Rated capacity of a cell, Ah; `None` = without a configuration.
+    pub(super) fn rated_ah(&self, cell: usize) -> Option<f64> {
+        let cell = CellIndex(u16::try_from(cell).ok()?);
+        self.config.map(|config| config.monitor.model_of(cell).rated_capacity_ah)
+    }
 }

@@ -91,18 +91,19 @@ fn display(why: InsufficientData) -> String {
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
 pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
-    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let gain_std = context.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> =
         data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
-    let rated_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);
-    let mut cells = vec![Forecast::new(Axis::Cycles, rated_ah); data.cells()];
+    let first_ah = data.learned.first().map_or(1.0, |row| row.capacity_ah.0);
+    let rated_ah = |cell| context.rated_ah(cell).unwrap_or(first_ah);
+    let mut cells: Vec<Forecast> = (0..data.cells()).map(|cell| Forecast::new(Axis::Cycles, rated_ah(cell))).collect();
     let mut before_s: Option<f64> = None;
     for halves in data.halves.chunk_by(|a, b| a.time_s == b.time_s) {
         let now_s = halves[0].time_s;
         let since_before_s = before_s.map(|before_s| now_s - before_s);
         for half in halves {
+            let rated_ah = rated_ah(half.cell);
             let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
             // Use without a reading counts too: a store leaves out capacities without new information.
             let row = learned.get(&key(half.time_s, half.cell));

@@ -305,17 +305,17 @@ fn tiles(
     raised: &[ActiveAlarm<'_>],
 ) -> Vec<Tile> {
     let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
-    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let of_cell =
         |step: &series::CellStep| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
     let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));
     let resistance = last(series::resistance, true);
     let figure = |step: &series::CellStep| format!("{:.3} Ah", step.worst.0);
-    let health = capacity.zip(rated_ah).map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
-    let health_note = match (rated_ah, capacity) {
-        (None, _) => "rated capacity not known without -c".to_owned(),
-        (Some(_), None) => "no capacity learned yet".to_owned(),
-        (Some(rated), Some(step)) => format!("of {rated} Ah rated{}{}", of_cell(&step), assumed(data, step.cell)),
+    let rated = capacity.and_then(|step| Some((step, context.rated_ah(step.cell)?)));
+    let health = rated.map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
+    let health_note = match rated {
+        Some((step, rated)) => format!("of {rated} Ah rated{}{}", of_cell(&step), assumed(data, step.cell)),
+        None if context.config.is_none() => "rated capacity not known without -c".to_owned(),
+        None => "no capacity learned yet".to_owned(),
     };
     let note = |step: Option<series::CellStep>, none: &str| {
         let std = |step: series::CellStep| {
@@ -346,7 +346,8 @@ fn tiles(
     estimates.extend([
         tile(
             "Use so far",
-            series::full_cycles(data, rated_ah).map(|cycles| format!("{cycles:.0} cycles")),
+            series::full_cycles(data, context.config.map(|it| it.monitor.model.rated_capacity_ah))
+                .map(|cycles| format!("{cycles:.0} cycles")),
             "equivalent full cycles in this record",
         ),
         tile("Alarms raised now", Some(raised.len().to_string()), format!("{} entries in all", data.alarms.len())),
