@@ -68,7 +68,7 @@ impl Estimation {
         let cells = usize::from(config.sample.cells);
         let bank = PackBank::new(&config.model, &config.estimator, cells, &config.modules);
         Self {
-            checks: (0..cells).map(|cell| ModelCheck::new(id_of_model(&bank, cell))).collect(),
+            checks: ids_of_models(&bank).into_iter().map(ModelCheck::new).collect(),
             bank,
             modules: config.modules.clone(),
             batch: CellBatch::new(cells),
@@ -87,8 +87,8 @@ impl Estimation {
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
         self.modules.clone_from(&config.modules);
         self.use_model(modelling, learner);
-        let Self { bank, checks, .. } = self;
-        checks.iter_mut().enumerate().for_each(|(cell, check)| *check = check.or_new(id_of_model(bank, cell)));
+        let ids = ids_of_models(&self.bank);
+        self.checks.iter_mut().zip(ids).for_each(|(check, id)| *check = check.or_new(id));
         self.note_checks();
         self.ambient_c = config.sample.ambient_c;
     }
@@ -124,8 +124,7 @@ impl Estimation {
     }
 
     fn begin_checks(&mut self) {
-        let bank = &self.bank;
-        self.checks.iter_mut().enumerate().for_each(|(cell, check)| *check = ModelCheck::new(id_of_model(bank, cell)));
+        self.checks = ids_of_models(&self.bank).into_iter().map(ModelCheck::new).collect();
         self.note_checks();
     }
 
@@ -361,10 +360,11 @@ impl Estimation {
         cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
         batch: CellBatch,
     ) {
+        let ids = ids_of_models(&self.bank);
         for (index, (consumed, trusted, check)) in cells.enumerate() {
             self.progress[index].consumed = consumed;
             self.trusted[index] = trusted;
-            self.checks[index] = check.or_new(id_of_model(&self.bank, index));
+            self.checks[index] = check.or_new(ids[index]);
         }
         self.note_checks();
         self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
@@ -379,9 +379,11 @@ fn differences(values: impl Iterator<Item = Option<f64>> + Clone) -> Vec<f64> {
     values.map(|value| value.map_or(0.0, |value| value - mean)).collect()
 }
 
-/// Identifies a cell's model and the spread expected of its resistance.
-fn id_of_model(bank: &PackBank, cell: usize) -> u64 {
-    model_id(bank.model(cell), bank.config(cell).initial.log_resistance_std)
+/// Per cell, what identifies its model and the spread expected of its resistance.
+fn ids_of_models(bank: &PackBank) -> Vec<u64> {
+    let of_kinds: Vec<u64> =
+        bank.kinds().map(|(model, config)| model_id(model, config.initial.log_resistance_std)).collect();
+    (0..bank.cells()).map(|cell| of_kinds[bank.kind(cell)]).collect()
 }
 
 /// Resistance of a cell relative to new.

@@ -96,6 +96,16 @@ impl PackBank {
         self.places[cell].bank == 0
     }
 
+    /// Model and settings of each kind of cell; the first is the pack's own.
+    pub fn kinds(&self) -> impl Iterator<Item = (&CellModel, &EstimatorConfig)> {
+        self.banks.iter().map(|bank| (bank.model(), bank.config()))
+    }
+
+    /// Which of the [kinds](Self::kinds) a cell is.
+    pub fn kind(&self, cell: usize) -> usize {
+        self.places[cell].bank
+    }
+
     /// The model of the pack's own cells.
     pub fn own_model(&self) -> &CellModel {
         self.banks[0].model()
