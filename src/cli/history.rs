@@ -40,7 +40,7 @@ pub(crate) struct Args {
 enum HistoryCommand {
     /// Write rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over capacities, loss modes, remaining lives, alarms and resets; names the first row that was changed
+    /// Check the hash chain over capacities, loss modes, remaining lives, cell models, alarms and resets; names the first row that was changed
     Verify(VerifyArgs),
 }
 
@@ -82,11 +82,12 @@ struct RowArgs {
 }
 
 /// Kinds of rows by name.
-const KINDS: [NamedValue<HistoryTable>; 6] = [
+const KINDS: [NamedValue<HistoryTable>; 7] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
     ("loss-modes", HistoryTable::LossModes, "Lithium and active material that cells have lost"),
     ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell whose life ends first"),
+    ("model", HistoryTable::Model, "Changes of the cell model that is learned on board"),
     ("alarm", HistoryTable::Alarm, "Alarms"),
     ("reset", HistoryTable::Reset, "Resets, other packs, damages"),
 ];
@@ -164,6 +165,15 @@ fn describe(entry: &HistoryEntry) -> String {
         HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known",
         HistoryTable::RemainingLife => {
             "{cycles:0} cycles ({cycles_low:0} to {cycles_high:0}), {days:0} days ({days_low:0} to {days_high:0})"
+        }
+        HistoryTable::Model => {
+            let back = if value("taken_back").as_i64() == Some(1) { ", the one before holds again" } else { "" };
+            let better = value("chemistry").as_str().map(|name| format!(", {name} fits better")).unwrap_or_default();
+            let words = match value("capacity_ah").is_null() {
+                true => "{state}",
+                false => "{state}, {capacity_ah:3} +/- {capacity_std_ah:3} Ah, residuals {residual_v:4} V",
+            };
+            return filled(words, &value) + &better + back;
         }
         HistoryTable::Alarm => {
             "{rule} {severity} {change}, value {value:4}, threshold {threshold:4}, raised {occurrences:0} times"

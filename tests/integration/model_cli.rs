@@ -234,6 +234,33 @@ fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
     check_report(&place, &document);
 }
 
+#[test]
+fn what_a_vehicle_has_learned_of_its_model_is_in_the_history() {
+    let place = learned();
+    let state = place.name("state");
+    let document = json(&["history", "--state", &state, "--kind", "model", "--json"]);
+    let rows = document["rows"].as_array().unwrap();
+    let last = rows.last().unwrap();
+    let known = json(&["model", "show", "--json", "--state", &state]);
+    let change = known["learned"]["changes"].as_array().unwrap().last().unwrap();
+    for column in ["state", "capacity_ah", "capacity_std_ah", "residual_v"] {
+        assert_eq!(last[column], change[column], "{column}: {last}");
+    }
+    assert_eq!((&last["cell"], &last["chemistry"], &last["taken_back"]), (&Value::Null, &Value::Null, &Value::from(0)));
+    assert!(last["capacity_ah"].as_f64().is_some_and(|ah| (2.3..2.9).contains(&ah)), "{last}");
+    assert!(good(&["history", "--state", &state, "verify"]).contains("none changed"));
+    let table = good(&["history", "--state", &state, "--kind", "model"]);
+    let line = table.lines().last().unwrap();
+    assert!(line.contains("model") && line.contains(" pack ") && line.contains(" Ah, residuals 0.0"), "{line}");
+    let csv = good(&["history", "--state", &state, "export", "--kind", "model"]);
+    let heads = "cell,state,capacity_ah,capacity_std_ah,residual_v,chemistry,taken_back";
+    assert!(csv.lines().next().unwrap().ends_with(heads) && csv.lines().count() == 1 + rows.len(), "{csv}");
+    let one_cell = json(&["history", "--state", &state, "--kind", "model", "--cell", "1", "--json"]);
+    assert_eq!(one_cell["rows"], Value::Array(Vec::new()), "it is the model of all cells");
+    let later = json(&["history", "--state", &state, "--kind", "model", "--since", "4000000000", "--json"]);
+    assert_eq!(later["rows"], Value::Array(Vec::new()));
+}
+
 /// Checks that reports of the log and of the store give the advice of `model show`.
 #[cfg(feature = "lab")]
 fn check_report(place: &Place, document: &Value) {
@@ -246,6 +273,7 @@ fn check_report(place: &Place, document: &Value) {
     assert!(!advice.is_empty());
     for page in [from_log, from_store] {
         assert!(page.contains("How well do I know this battery") && page.contains("from the vehicle's own data"));
+        assert!(page.contains("What was learned of the model") && page.contains(">learning</td>"), "no history");
         for it in advice {
             let (measurement, left) = (it["measurement"].as_str().unwrap(), it["left_points"].as_f64().unwrap());
             assert!(page.contains(&format!("<li>{measurement}: {left:.1} points are then left</li>")), "no {it}");

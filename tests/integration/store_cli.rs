@@ -192,5 +192,5 @@ fn a_history_of_a_newer_program_or_none_at_all_is_said_to_be_so() {
     bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
     fs::write(place.database(), bytes).expect("written");
     let printed = bad(&["history", "--state", &place.state()]);
-    assert!(printed.contains("layout version 99, this program reads 1 to 6"), "{printed}");
+    assert!(printed.contains("layout version 99, this program reads 1 to 7"), "{printed}");
 }

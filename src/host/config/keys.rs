@@ -223,9 +223,9 @@ section! {
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
         /// Half-cycles kept, one per cell each. Beyond this number every second transition of the older half is deleted, as often as needed. The default holds a year of ten half-cycles a day of 50 cells, in some 15 MB.
         max_half_cycles: u32, "", Between(1000.0, 1e8), Default("200000");
-        /// Capacities, loss modes, remaining lives, alarms and resets kept: at most one of each kind per cell and hour, and changes of alarms. Beyond this number rows before the latest half are thinned: of those just before it one of four stays, of those before twice as many one of sixteen, and so on. The first and the last row of every cell and pack stay, the first hundred occurrences of an alarm, and all resets but those of filters, also where these are more than the number. The default holds ten years of a car of 96 cells in some 80 MB.
+        /// Capacities, loss modes, remaining lives, cell models, alarms and resets kept: at most one of each kind per cell and hour, and changes of the cell model and of alarms. Beyond this number rows before the latest half are thinned: of those just before it one of four stays, of those before twice as many one of sixteen, and so on. The first and the last row of every cell and pack stay, the first hundred occurrences of an alarm and changes of the cell model, and all resets but those of filters, also where these are more than the number. The default holds ten years of a car of 96 cells in some 80 MB.
         max_chained_rows: u32, "", Between(10_000.0, 1e8), Default("500000");
-        /// Half-cycles older than this are deleted, a few at each checkpoint; capacities, alarms and resets are kept, whatever their age. The age is that on the computer's clock, and nothing is deleted while no hardware clock or time server confirms that clock. Without it: only `max_half_cycles` bounds them.
+        /// Half-cycles older than this are deleted, a few at each checkpoint; capacities, cell models, alarms and resets are kept, whatever their age. The age is that on the computer's clock, and nothing is deleted while no hardware clock or time server confirms that clock. Without it: only `max_half_cycles` bounds them.
         keep_years: Option<f64>, "years", Between(0.1, 100.0), Optional;
     }
 }

@@ -146,7 +146,7 @@ pub struct StoreConfig {
     pub checkpoint_s: f64,
     /// Half-cycles kept, one row per cell each; beyond, the oldest are thinned.
     pub max_half_cycles: u32,
-    /// Capacities, loss modes, remaining lives, alarms and resets kept; beyond, the oldest are thinned.
+    /// Capacities, loss modes, remaining lives, cell models, alarms and resets kept; beyond, the oldest are thinned.
     pub max_chained_rows: u32,
     /// Half-cycles older than this are deleted, years; `None` = whatever their age, they are kept.
     pub keep_years: Option<f64>,

@@ -22,7 +22,7 @@ use super::rows::HistoryTable;
 use super::schema::MIGRATIONS;
 
 /// Tables whose rows are collected.
-const TABLES: [&str; 8] = ["pack", "moment", "half_cycle", "capacity", "alarm", "reset", "thinned", UNSURE];
+const TABLES: [&str; 9] = ["pack", "moment", "half_cycle", "capacity", "model", "alarm", "reset", "thinned", UNSURE];
 /// Rows of one of the two tables of equal columns, until their hash has shown which.
 const UNSURE: &str = "unsure";
 /// Those tables.
@@ -136,7 +136,8 @@ impl<'a> TableTarget<'a> {
 
 /// Moves the rows of [`UNSURE`] to the table that their hash shows; returns the number of those that no hash shows.
 fn resolve_unsure(connection: &Connection) -> rusqlite::Result<usize> {
-    let links = ["capacity", "alarm", "reset", UNSURE].map(|table| format!("SELECT hash FROM {table} WHERE seq = ?1"));
+    let links = ["capacity", "model", "alarm", "reset", UNSURE];
+    let links = links.map(|table| format!("SELECT hash FROM {table} WHERE seq = ?1"));
     let thinned = "SELECT hash FROM thinned WHERE last = ?1".to_owned();
     let links: Vec<String> = links.into_iter().chain([thinned]).collect();
     let mut before = connection.prepare(&links.join(" UNION ALL "))?;

@@ -9,7 +9,8 @@
 //! * The hash of a row decides whether it is kept: it must end in enough zero bits. Every cell loses the same part, and nothing has to be
 //!   remembered.
 //! * A row is deleted only between two others of its cell and pack in its table: no trend loses its ends. Of an alarm the first
-//!   [`OCCURRENCES_KEPT`] occurrences are kept, of resets all but those of filters: so many more than N rows there may be.
+//!   [`OCCURRENCES_KEPT`] occurrences are kept, as many changes of the cell model, of resets all but those of filters: so many more than
+//!   N rows there may be.
 //! * The chain stays verifiable: of every run of deleted rows the table `thinned` has the last row's hash, from which the next row's
 //!   follows.
 //!
@@ -33,7 +34,7 @@ const STEP_ALONE: i64 = 4;
 const HASTE: i64 = 8;
 /// Rows of a table among which a neighbour is looked for: several for each cell of the largest pack.
 const NEIGHBOUR_ROWS: u32 = 20_000;
-/// Occurrences of an alarm that are kept.
+/// Occurrences of an alarm, and changes of the cell model, that are kept.
 const OCCURRENCES_KEPT: u32 = 100;
 /// Least number of rows at the end of the chain that are never deleted: half of the least `store.max_chained_rows`.
 pub(super) const LEAST_WHOLE: i64 = 5_000;
@@ -125,6 +126,12 @@ struct OldRow {
 fn redundant_sql(table: HistoryTable) -> String {
     match table {
         HistoryTable::Alarm => format!("r.occurrences > {OCCURRENCES_KEPT}"),
+        // False until there are so many.
+        HistoryTable::Model => {
+            format!(
+                "r.seq > coalesce((SELECT seq FROM model ORDER BY seq LIMIT 1 OFFSET {OCCURRENCES_KEPT} - 1), r.seq)"
+            )
+        }
         HistoryTable::Reset => "r.reason = 'filter_reset'".to_owned(),
         _ => "1".to_owned(),
     }

@@ -107,7 +107,7 @@ pub(super) struct Database {
 /// Rows in the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Counts {
-    /// Capacities, loss modes, remaining lives, alarms and resets that were written.
+    /// Capacities, loss modes, remaining lives, cell models, alarms and resets that were written.
     pub chained: i64,
     /// Half-cycles.
     pub half_cycles: i64,

@@ -186,6 +186,7 @@ fn is_learned(kind: &EventKind) -> bool {
         | EventKind::LossModes { .. }
         | EventKind::RemainingLife { .. }
         | EventKind::RechargePeriod { .. }
+        | EventKind::Model { .. }
         | EventKind::AlarmDropped { .. }
         | EventKind::FilterReset { .. }
         | EventKind::PackReplaced { .. }
@@ -197,7 +198,7 @@ fn is_learned(kind: &EventKind) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaining_life};
+    use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
     use super::*;
     use crate::alarm::{Rule, Severity};
 
@@ -222,6 +223,14 @@ mod tests {
         let cells = [capacity(0, Some(2.4), 2.3), loss_modes(0, 0.1), capacity(1, None, 2.3), loss_modes(1, 0.1)];
         assert_eq!(take(&mut history_filter, 0.0, &cells), Some(2));
         assert_eq!(take(&mut history_filter, 0.0, &[capacity(0, None, 2.3), loss_modes(0, 0.1)]), Some(0));
+    }
+
+    #[test]
+    fn every_change_of_the_model_is_written_at_once() {
+        let mut history_filter = HistoryFilter::default();
+        for second in 0..200 {
+            assert_eq!(take(&mut history_filter, f64::from(second), &[model(Some(2.0))]), Some(1), "{second}");
+        }
     }
 
     #[test]

@@ -13,7 +13,7 @@ use crate::quantity::CellIndex;
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum HistoryRow {
-    /// An event of the core: a half-cycle, a capacity, an alarm, a filter reset, another pack.
+    /// An event of the core: a half-cycle, a capacity, another cell model, an alarm, a filter reset, another pack.
     Event(EventKind),
     /// An event of the store itself.
     Own {
@@ -44,6 +44,8 @@ pub enum HistoryTable {
     LossModes,
     /// Remaining life of the cell whose life ends first; chained.
     RemainingLife,
+    /// Changes of the cell model that is learned on board; chained.
+    Model,
     /// Alarms; chained.
     Alarm,
     /// Resets, other packs, damages; chained.
@@ -52,11 +54,11 @@ pub enum HistoryTable {
 
 impl HistoryTable {
     /// All tables, in the order in which they are shown.
-    pub const ALL: [Self; 6] =
-        [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub const ALL: [Self; 7] =
+        [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
     /// The tables whose rows are chained by hash.
-    pub(super) const CHAINED: [Self; 5] =
-        [Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub(super) const CHAINED: [Self; 6] =
+        [Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
 
     /// Whether a database of this layout version has it.
     pub(super) const fn is_in(self, version: i32) -> bool {
@@ -65,6 +67,7 @@ impl HistoryTable {
                 Self::HalfCycle | Self::Capacity | Self::Alarm | Self::Reset => 1,
                 Self::RemainingLife => 2,
                 Self::LossModes => 3,
+                Self::Model => 7,
             }
     }
 
@@ -75,6 +78,7 @@ impl HistoryTable {
             Self::Capacity => "capacity",
             Self::LossModes => "loss_modes",
             Self::RemainingLife => "remaining_life",
+            Self::Model => "model",
             Self::Alarm => "alarm",
             Self::Reset => "reset",
         }
@@ -106,6 +110,9 @@ impl HistoryTable {
             ],
             Self::LossModes => &["cell", "lli", "lli_std", "lam_ne", "lam_ne_std", "lam_pe", "lam_pe_std"],
             Self::RemainingLife => &["cell", "cycles", "cycles_low", "cycles_high", "days", "days_low", "days_high"],
+            Self::Model => {
+                &["cell", "state", "capacity_ah", "capacity_std_ah", "residual_v", "chemistry", "taken_back"]
+            }
             Self::Alarm => &[
                 "cell",
                 "rule",
@@ -141,6 +148,9 @@ impl HistoryRow {
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
             EventKind::LossModes { .. } => (HistoryTable::LossModes, vec![]),
             EventKind::RemainingLife { .. } => (HistoryTable::RemainingLife, vec![]),
+            EventKind::Model { is_taken_back, .. } => {
+                (HistoryTable::Model, vec![("taken_back", Value::Integer(i64::from(*is_taken_back)))])
+            }
             EventKind::Alarm { .. } => (HistoryTable::Alarm, vec![]),
             // No threshold watches it any more: it has ended, without a value that decided.
             EventKind::AlarmDropped { .. } => {

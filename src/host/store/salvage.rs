@@ -35,6 +35,7 @@ pub(super) struct SalvageReport {
     pub(super) capacities: usize,
     pub(super) losses: usize,
     pub(super) lives: usize,
+    pub(super) models: usize,
     pub(super) alarms: usize,
     pub(super) resets: usize,
     pub(super) half_cycles: usize,
@@ -45,12 +46,12 @@ pub(super) struct SalvageReport {
 
 impl fmt::Display for SalvageReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { capacities, losses, lives, alarms, resets, half_cycles, refused, state } = self;
+        let Self { capacities, losses, lives, models, alarms, resets, half_cycles, refused, state } = self;
         let state = if state.is_some() { "with" } else { "without" };
         write!(
             f,
-            "copied: {capacities} capacities, {losses} loss modes, {lives} remaining lives, {alarms} alarms, {resets} \
-             resets, {half_cycles} half-cycles, {state} its state; rejected: {refused}"
+            "copied: {capacities} capacities, {losses} loss modes, {lives} remaining lives, {models} models, \
+             {alarms} alarms, {resets} resets, {half_cycles} half-cycles, {state} its state; rejected: {refused}"
         )
     }
 }
@@ -62,6 +63,7 @@ impl SalvageReport {
             HistoryTable::Capacity => &mut self.capacities,
             HistoryTable::LossModes => &mut self.losses,
             HistoryTable::RemainingLife => &mut self.lives,
+            HistoryTable::Model => &mut self.models,
             HistoryTable::Alarm => &mut self.alarms,
             HistoryTable::Reset => &mut self.resets,
         } += 1;

@@ -5,7 +5,7 @@
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | as long as a row belongs to it |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
-//! | `capacity`, `loss_modes`, `remaining_life`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | the oldest thinned |
+//! | `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | a learned capacity, what a cell has lost, a forecast, a change of the cell model, a change of an alarm, a reset; numbered across the tables and chained by hash | the oldest thinned |
 //! | `thinned` | a run of chained rows that were thinned out, with the hash of the last | always |
 //! | `state`, `state_b` | the core's state, two copies written in turn: slot 0 in full, slot 1 the changes since | the latest two |
 //! | `meta` | one row: the chain's end, counts, the vehicle, the layout's version | |
@@ -19,7 +19,7 @@ use rusqlite::{Connection, OptionalExtension, TransactionBehavior};
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// The statements that lead to each version from the one before; the first starts from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6, VERSION_7];
 
 /// The first version that names the vehicle.
 pub(super) const VERSION_WITH_VEHICLE: i32 = 4;
@@ -166,6 +166,22 @@ const VERSION_6: &str = "
 CREATE TABLE thinned (
     last INTEGER PRIMARY KEY,
     first INTEGER NOT NULL,
+    hash BLOB NOT NULL
+) STRICT;
+";
+
+/// Changes of the cell model that is learned on board. It is the model of all cells: `cell` is NULL.
+const VERSION_7: &str = "
+CREATE TABLE model (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER,
+    state TEXT NOT NULL,
+    capacity_ah REAL,
+    capacity_std_ah REAL,
+    residual_v REAL,
+    chemistry TEXT,
+    taken_back INTEGER NOT NULL,
     hash BLOB NOT NULL
 ) STRICT;
 ";

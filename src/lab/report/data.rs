@@ -74,6 +74,22 @@ pub(super) struct AlarmRecord {
     pub(super) threshold: Option<f64>,
 }
 
+/// A change of the cell model that is learned on board.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ModelRecord {
+    pub(super) time_s: f64,
+    /// The name of a [`ModelState`](crate::monitor::ModelState).
+    pub(super) state: String,
+    /// Mean and standard deviation, Ah; `None` = the label's.
+    pub(super) capacity_ah: Option<(f64, f64)>,
+    /// Root mean square of the residuals, V.
+    pub(super) residual_v: Option<f64>,
+    /// The chemistry that fits better; empty = that of the label fits.
+    pub(super) chemistry: String,
+    /// The model before holds again.
+    pub(super) is_taken_back: bool,
+}
+
 /// Origin and quality of the data.
 #[derive(Debug, Clone)]
 pub struct DataSource {
@@ -93,6 +109,7 @@ pub struct Data {
     pub(super) learned: Vec<CapacityRecord>,
     pub(super) recharges: Vec<RechargeRecord>,
     pub(super) alarms: Vec<AlarmRecord>,
+    pub(super) models: Vec<ModelRecord>,
     /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
@@ -113,6 +130,7 @@ impl Data {
             learned: Vec::new(),
             recharges: Vec::new(),
             alarms: Vec::new(),
+            models: Vec::new(),
             incidents: Vec::new(),
             trace: Trace::default(),
             untrusted: BTreeSet::new(),
@@ -154,6 +172,7 @@ impl Data {
             HistoryTable::HalfCycle => self.take_half_cycle(time_s, &fields),
             HistoryTable::Capacity => self.take_capacity(time_s, &fields),
             HistoryTable::LossModes => self.take_losses(time_s, &fields),
+            HistoryTable::Model => self.take_model(time_s, &fields, fields.flag("taken_back")),
             HistoryTable::Alarm => self.take_alarm(time_s, &fields),
             HistoryTable::Reset => {
                 let of = cell_of(&fields).map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
@@ -174,6 +193,9 @@ impl Data {
             EventKind::HalfCycle { .. } => self.take_half_cycle(time_s, &Fields::of_event(&event.kind)),
             EventKind::Capacity { .. } => self.take_capacity(time_s, &Fields::of_event(&event.kind)),
             EventKind::LossModes { .. } => self.take_losses(time_s, &Fields::of_event(&event.kind)),
+            EventKind::Model { is_taken_back, .. } => {
+                self.take_model(time_s, &Fields::of_event(&event.kind), is_taken_back)
+            }
             EventKind::Alarm { .. } => self.take_alarm(time_s, &Fields::of_event(&event.kind)),
             EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
                 let normalised_s = normalised_s.zip(normalised_std_s);
@@ -225,6 +247,17 @@ impl Data {
         }
     }
 
+    fn take_model(&mut self, time_s: f64, fields: &Fields, is_taken_back: bool) {
+        self.models.push(ModelRecord {
+            time_s,
+            state: fields.text("state").to_owned(),
+            capacity_ah: fields.pair("capacity_ah", "capacity_std_ah"),
+            residual_v: fields.number("residual_v"),
+            chemistry: fields.text("chemistry").to_owned(),
+            is_taken_back,
+        });
+    }
+
     fn take_alarm(&mut self, time_s: f64, fields: &Fields) {
         self.alarms.push(AlarmRecord {
             time_s,
@@ -271,6 +304,7 @@ impl Data {
         self.halves.clear();
         self.learned.clear();
         self.recharges.clear();
+        self.models.clear();
         self.untrusted.clear();
     }
 

@@ -386,17 +386,20 @@ fn findings(context: &PageContext<'_>) -> Markup {
 
 fn knowledge(data: &Data, context: &PageContext<'_>) -> Markup {
     let rows = model::rows(data, context);
-    if rows.is_empty() {
-        return html! {};
-    }
     let advice = model::advice(context);
     html! {
-        (pairs(&rows))
-        h3 { "What would help most" }
-        @match advice.as_deref() {
-            None => { p.none { "unknown: the model states no error; packwatch fit writes a model that does" } }
-            Some([]) => { p.soft { "No single measurement would make the state of charge much more certain." } }
-            Some(advice) => { ol { @for sentence in advice { li { (sentence) } } } }
+        @if !rows.is_empty() {
+            (pairs(&rows))
+            h3 { "What would help most" }
+            @match advice.as_deref() {
+                None => { p.none { "unknown: the model states no error; packwatch fit writes a model that does" } }
+                Some([]) => { p.soft { "No single measurement would make the state of charge much more certain." } }
+                Some(advice) => { ol { @for sentence in advice { li { (sentence) } } } }
+            }
+        }
+        @if !data.models.is_empty() {
+            h3 { "What was learned of the model" }
+            (table(&["When", "State", "Capacity", "Residuals", ""], model::changes(data), data.models.len()))
         }
     }
 }

@@ -1,7 +1,8 @@
 //! How well the cells' model is known: the rows and the advice of the section "How well do I know this battery".
 
 use super::context::PageContext;
-use super::data::Data;
+use super::data::{Data, ModelRecord};
+use super::summary;
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{Coverage, ModelBands, advise};
 use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
@@ -43,6 +44,25 @@ pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, Strin
         points.unwrap_or_else(|| "unknown: the model states no error".to_owned()),
     ));
     rows.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+/// The changes of the model, the latest first: when, state, capacity, residuals, a note.
+pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
+    data.models.iter().rev().map(|change| {
+        let ModelRecord { time_s, state, capacity_ah, residual_v, chemistry, is_taken_back } = change;
+        let note = match (is_taken_back, chemistry.as_str()) {
+            (true, _) => "the one before holds again".to_owned(),
+            (false, "") => String::new(),
+            (false, better) => format!("{better} fits better"),
+        };
+        vec![
+            summary::moment(data, *time_s),
+            state.clone(),
+            capacity_ah.map_or("the label's".to_owned(), |(mean, std)| format!("{mean:.3} \u{b1} {std:.3} Ah")),
+            residual_v.map_or(String::new(), |v| format!("{:.1} mV", 1e3 * v)),
+            note,
+        ]
+    })
 }
 
 /// The measurements that would help most, as sentences; `None` = not known.
@@ -138,6 +158,30 @@ mod tests {
         assert!(value("State").starts_with("label alone"));
         let advice = advice(&context).expect("known");
         assert!(!advice.is_empty() && advice[0].contains("points are then left"), "{advice:?}");
+    }
+
+    #[test]
+    fn changes_of_the_model_are_listed_the_latest_first() {
+        use crate::monitor::{Event, EventKind, ModelState};
+        use crate::quantity::Timestamp;
+        let change = |seconds: f64, state, capacity_ah: Option<f64>, chemistry, is_taken_back| {
+            let (capacity_std_ah, residual_v) = (capacity_ah.map(|_| 0.05), capacity_ah.map(|_| 0.0034));
+            let kind = EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back };
+            Event { time: Timestamp::from_secs(seconds), kind }
+        };
+        let mut data = Data::new(Origin::Replay);
+        let lfp = Some(Chemistry::LfpGraphite);
+        let learning = change(1.8e9, ModelState::Learning, Some(4.7), None, false);
+        let back = change(1.8e9 + 60.0, ModelState::Prior, None, None, true);
+        let unfit = change(1.8e9 + 120.0, ModelState::Unfit, None, lfp, false);
+        [learning, back, unfit].iter().for_each(|event| data.take_event(event));
+        let rows: Vec<String> = changes(&data).map(|row| row.join(" | ")).collect();
+        let expected = [
+            "2027-01-15 08:02:00 UTC | unfit | the label's |  | lfp-graphite fits better",
+            "2027-01-15 08:01:00 UTC | prior | the label's |  | the one before holds again",
+            "2027-01-15 08:00:00 UTC | learning | 4.700 \u{b1} 0.050 Ah | 3.4 mV | ",
+        ];
+        assert_eq!(rows, expected);
     }
 
     #[test]

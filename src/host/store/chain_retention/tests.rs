@@ -4,7 +4,7 @@ use super::super::database::Database;
 use super::super::folder::DATABASE;
 use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::retention::RowLimits;
-use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaining_life};
+use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
 use super::super::rows::{HistoryRow, RowBatch};
 use super::super::salvage::salvage;
 use super::super::stamp::Stamp;
@@ -38,8 +38,8 @@ fn commit(database: &mut Database, hour: u32, kinds: &[EventKind], checkpoints: 
     (0..checkpoints).for_each(|_| database.commit(&[], None).unwrap());
 }
 
-/// Every hour a capacity and the losses of each cell and a remaining life, now and then an alarm and the reset of a filter. Returns the
-/// chain's end after each hour.
+/// Every hour a capacity and the losses of each cell and a remaining life, now and then an alarm, another cell model and the reset of a
+/// filter. Returns the chain's end after each hour.
 fn filled(path: &std::path::Path) -> (Database, Vec<(i64, String)>) {
     let mut database = open(path);
     let mut heads = Vec::new();
@@ -59,6 +59,7 @@ fn hour_of(hour: u32) -> Vec<EventKind> {
     }));
     if hour.is_multiple_of(4) {
         kinds.push(raised(1 + hour / 4));
+        kinds.push(model(Some(2.5 - 1e-4 * f64::from(hour))));
         kinds.push(EventKind::FilterReset { cell: CellIndex(3) });
     }
     if hour == EXCHANGED {
@@ -123,11 +124,15 @@ fn a_long_history_is_bounded_and_still_verified() {
         number(&database, "SELECT count(*) FROM alarm") < i64::from(HOURS / 4),
         "an alarm that comes and goes is thinned"
     );
+    let models = number(&database, "SELECT count(*) FROM model");
+    let early = "SELECT count(*) FROM model r JOIN moment m ON m.id = r.moment WHERE time_ns < 400 * 3600000000000";
+    assert_eq!(number(&database, early), 100, "the first hundred models");
+    assert!((101..i64::from(HOURS / 4)).contains(&models), "{models} models");
     assert_eq!(number(&database, "SELECT count(*) FROM reset WHERE reason = 'pack_replaced'"), 1);
     assert_eq!(number(&database, "SELECT count(*) FROM half_cycle h JOIN moment m ON m.id = h.moment"), 1);
     let unused = "SELECT count(*) FROM moment WHERE id NOT IN (SELECT moment FROM capacity UNION SELECT moment FROM loss_modes \
-                  UNION SELECT moment FROM remaining_life UNION SELECT moment FROM alarm UNION SELECT moment FROM reset \
-                  UNION SELECT moment FROM half_cycle)";
+                  UNION SELECT moment FROM remaining_life UNION SELECT moment FROM model UNION SELECT moment FROM alarm \
+                  UNION SELECT moment FROM reset UNION SELECT moment FROM half_cycle)";
     assert_eq!(number(&database, unused), 0, "moments without a row");
 
     // Ends that were noted: each fits, or is said to be thinned out.
@@ -161,9 +166,14 @@ fn short_runs_of_the_daemon_together_reach_all_tables() {
     let database = open(&path);
     let report = verify(&database);
     assert!(report.broken.is_none() && report.good_rows <= 2 * MAX_ROWS, "{report:?}");
-    for (table, rows) in
-        [("capacity", 2000), ("loss_modes", 2000), ("remaining_life", 500), ("alarm", 280), ("reset", 250)]
-    {
+    for (table, rows) in [
+        ("capacity", 2000),
+        ("loss_modes", 2000),
+        ("remaining_life", 500),
+        ("model", 280),
+        ("alarm", 280),
+        ("reset", 250),
+    ] {
         let left = number(&database, &format!("SELECT count(*) FROM {table}"));
         assert!(left < rows, "{table}: {left}");
     }
@@ -224,11 +234,13 @@ fn a_thinned_history_is_salvaged_whole() {
     let report = verify(&database);
     let losses = number(&database, "SELECT count(*) FROM loss_modes");
     let lives = number(&database, "SELECT count(*) FROM remaining_life");
+    let models = number(&database, "SELECT count(*) FROM model");
     database.close().unwrap();
     let mut database = open(&new);
     let saved = salvage(&path, &place.path().join("pages.db"), &mut database).unwrap();
     assert_eq!((database.counts().chained, saved.refused), (report.good_rows, 0));
     assert_eq!((saved.losses as i64, saved.lives as i64), (losses, lives), "their hashes show the table");
+    assert_eq!(saved.models as i64, models);
     assert_eq!((database.counts().packs, broken(&database)), (2, None));
 }
 

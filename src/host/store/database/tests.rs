@@ -5,7 +5,7 @@ use super::super::packed;
 use super::super::parts::JsonParts;
 use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::rows::HistoryTable;
-use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, remaining_life};
+use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
 use super::super::verify;
 use super::*;
 use crate::alarm::Change;
@@ -238,11 +238,40 @@ fn continues_from_version(version: usize) {
     };
     assert_eq!(kinds(), [HistoryTable::Capacity]);
     let mut database = open(folder.path());
-    let learned = vec![capacity(0, Some(2.0), 1.8), loss_modes(0, 0.08), remaining_life(90.0)];
+    let learned = vec![capacity(0, Some(2.0), 1.8), loss_modes(0, 0.08), remaining_life(90.0), model(Some(2.0))];
     database.commit(&[RowBatch { stamp: stamp(3.0), rows: rows(learned) }], None).unwrap();
     drop(database);
     let [capacity, losses, life] = [HistoryTable::Capacity, HistoryTable::LossModes, HistoryTable::RemainingLife];
-    assert_eq!(kinds(), [capacity, capacity, losses, life]);
+    assert_eq!(kinds(), [capacity, capacity, losses, life, HistoryTable::Model]);
+}
+
+#[test]
+fn a_history_without_models_keeps_every_row_when_it_gets_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    let mut old = Database::open_with(&path, &stamp(1.0), RowLimits::SMALL, &MIGRATIONS[..6]).unwrap();
+    let first = [half_cycle(0), capacity(0, Some(2.0), 1.9), loss_modes(0, 0.08), remaining_life(90.0)];
+    let reset = EventKind::FilterReset { cell: crate::quantity::CellIndex(0) };
+    old.commit(&[batch(2.0, &first), batch(3.0, &[alarm(Change::Raised), reset])], Some(state(&[1.0]))).unwrap();
+    drop(old);
+    let rows = || {
+        let reader = HistoryReader::open(folder.path()).unwrap();
+        (reader.verify().unwrap(), reader.entries(&HistoryQuery::default()).unwrap())
+    };
+    let before = rows();
+    assert_eq!((before.0.broken.as_ref(), before.0.rows, before.1.len()), (None, 5, 6));
+    let mut database = open(folder.path());
+    assert_eq!(schema::version(database.connection()).unwrap(), 7);
+    assert_eq!(rows(), before);
+    assert_eq!(database.state().unwrap().unwrap().unwrap().fault, None);
+    database.commit(&[batch(4.0, &[model(None)])], None).unwrap();
+    drop(database);
+    let (verdict, entries) = rows();
+    assert_eq!((verdict.broken, verdict.rows, &entries[..6]), (None, 6, &before.1[..]));
+    let [added] = &entries[6..] else { panic!() };
+    assert_eq!((added.kind, &added.values[1], added.values[2].is_null()), (HistoryTable::Model, &"prior".into(), true));
+    let older = Database::open_with(&path, &stamp(5.0), RowLimits::SMALL, &MIGRATIONS[..6]).unwrap_err();
+    assert_eq!(older, OpenError::Newer { found: 7, known: 6 });
 }
 
 #[test]

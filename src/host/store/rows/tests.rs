@@ -2,6 +2,8 @@
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
+use crate::cell::Chemistry;
+use crate::monitor::ModelState;
 use crate::quantity::{CellIndex, Mode};
 
 /// A capacity of a cell, measured or not.
@@ -59,6 +61,18 @@ pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     }
 }
 
+/// A model learned on board, with its capacity; without: the label's is back.
+pub(in crate::store) fn model(capacity_ah: Option<f64>) -> EventKind {
+    EventKind::Model {
+        state: capacity_ah.map_or(ModelState::Prior, |_| ModelState::Learning),
+        capacity_ah,
+        capacity_std_ah: capacity_ah.map(|_| 0.05),
+        residual_v: capacity_ah.map(|_| 0.003),
+        chemistry: None,
+        is_taken_back: capacity_ah.is_none(),
+    }
+}
+
 /// An alarm of the pack.
 pub(in crate::store) fn alarm(change: Change) -> EventKind {
     EventKind::Alarm {
@@ -84,6 +98,7 @@ fn every_row_has_a_value_per_column() {
         capacity(3, None, 2.4),
         loss_modes(3, 0.1),
         remaining_life(100.0),
+        model(None),
         alarm(Change::Raised),
         EventKind::AlarmDropped {
             rule: Rule::SocLow,
@@ -99,6 +114,25 @@ fn every_row_has_a_value_per_column() {
         let (table, values) = row.values().unwrap();
         assert_eq!(values.len(), table.columns().len(), "{row:?}");
     }
+}
+
+#[test]
+fn what_is_not_known_of_a_model_is_null() {
+    let text = |word: &str| Value::Text(word.to_owned());
+    let values = |kind: EventKind| HistoryRow::Event(kind).values().unwrap();
+    let (table, learning) = values(model(Some(2.0)));
+    assert_eq!(table, HistoryTable::Model);
+    let [capacity, std, residual] = [2.0, 0.05, 0.003].map(Value::Real);
+    assert_eq!(learning, [Value::Null, text("learning"), capacity, std, residual, Value::Null, Value::Integer(0)]);
+    let [_, state, unknown @ .., taken_back] = &values(model(None)).1[..] else { panic!() };
+    assert_eq!((state, taken_back), (&text("prior"), &Value::Integer(1)));
+    assert!(unknown.len() == 4 && unknown.iter().all(|value| *value == Value::Null), "{unknown:?}");
+    let (state, chemistry) = (ModelState::Unfit, Some(Chemistry::LfpGraphite));
+    let (capacity_ah, is_taken_back) = (Some(f64::NAN), false);
+    let unfit =
+        EventKind::Model { state, capacity_ah, capacity_std_ah: None, residual_v: None, chemistry, is_taken_back };
+    let row = values(unfit).1;
+    assert_eq!((&row[1], &row[2], &row[5]), (&text("unfit"), &Value::Null, &text("lfp-graphite")));
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::super::folder::DATABASE;
 use super::super::retention::RowLimits;
-use super::super::rows::tests::{capacity, half_cycle};
+use super::super::rows::tests::{capacity, half_cycle, loss_modes, model, remaining_life};
 use super::super::rows::{HistoryRow, RowBatch};
 use super::*;
 use crate::monitor::EventKind;
@@ -65,6 +65,31 @@ fn all_rows_of_a_sound_file_are_copied_in_their_order() {
     assert_eq!((database.counts(), saved.refused), (counts, 0));
     let moments: i64 = database.connection().query_row("SELECT count(*) FROM moment", [], |row| row.get(0)).unwrap();
     assert_eq!(moments, 100, "a moment is copied once");
+}
+
+#[test]
+fn models_and_rows_with_as_many_columns_are_not_mixed_up() {
+    let place = tempfile::tempdir().unwrap();
+    let (path, new) = (place.path().join(DATABASE), place.path().join("new.db"));
+    let mut database = open(&path);
+    // A row whose table its hash shows comes after a model, and before one.
+    let kinds = [model(None), loss_modes(0, 0.1), model(Some(2.0)), remaining_life(90.0), capacity(0, None, 1.9)];
+    commit(&mut database, 1.0, &kinds);
+    let rows = |path: &Path| -> Vec<(i64, String, Option<f64>, i64)> {
+        let sql = "SELECT seq, state, residual_v, taken_back FROM model ORDER BY seq";
+        let connection = Connection::open(path).unwrap();
+        let mut statement = connection.prepare(sql).unwrap();
+        let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?)));
+        rows.unwrap().collect::<rusqlite::Result<_>>().unwrap()
+    };
+    database.close().unwrap();
+    let written = rows(&path);
+    assert_eq!(written, [(1, "prior".to_owned(), None, 1), (3, "learning".to_owned(), Some(0.003), 0)]);
+    let mut database = open(&new);
+    let saved = salvage(&path, &place.path().join("pages.db"), &mut database).unwrap();
+    assert_eq!((saved.models, saved.losses, saved.lives, saved.capacities, saved.refused), (2, 1, 1, 1, 0));
+    database.close().unwrap();
+    assert_eq!(rows(&new), written);
 }
 
 /// Peak memory of this process since the last call, kB.
