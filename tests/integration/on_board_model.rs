@@ -4,6 +4,7 @@
 
 use std::path::Path;
 
+use packwatch::alarm::{Change, Rule};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::own_model::task::FitFindings;
@@ -23,10 +24,15 @@ const NIGHT_S: f64 = 30_000.0;
 const FULL_V: f64 = 4.14;
 
 fn configuration(chemistry: &str) -> MonitorConfig {
+    configuration_with(chemistry, "")
+}
+
+/// `more`: further tables of the file.
+fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
     let label = format!("chemistry = \"{chemistry}\"\nrated_capacity_ah = {RATED_AH}");
-    let text = text.replace("cell_model = \"cells/example_nmc_2600.toml\"", &label);
+    let text = text.replace("cell_model = \"cells/example_nmc_2600.toml\"", &label) + more;
     let path = folder.join("label.toml");
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
     config::load_with(&ConfigFiles::alone(&path), &read)
@@ -160,6 +166,29 @@ fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
         let nearest_s = gaps.iter().map(|gap| gap.since(time).abs()).fold(f64::MAX, f64::min);
         assert!(nearest_s < NIGHT_S + 60.0, "a model changed while driving, {nearest_s} s from a night");
     }
+}
+
+#[test]
+fn a_capacity_learned_with_the_model_is_judged_at_once() {
+    let limit_ah = 0.5 * (RATED_AH + TRUE_AH) + 0.1;
+    let rule = format!("\n[[alarm]]\nrule = \"capacity_low\"\nwarning = {limit_ah}\n");
+    let config = configuration_with("nmc811-graphite", &rule);
+    let mut live = Live::new(&config);
+    vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 2).iter().for_each(|frame| live.take(frame));
+    let learned = live.events.iter().find_map(|event| match event.kind {
+        EventKind::Model { capacity_ah: Some(capacity_ah), .. } => Some((event.time, capacity_ah)),
+        _ => None,
+    });
+    let alarm = live.events.iter().find_map(|event| match event.kind {
+        EventKind::Alarm { rule: Rule::CapacityLow, change: Change::Raised, value, .. } => Some((event.time, value?)),
+        _ => None,
+    });
+    let ((learned_at, capacity_ah), (raised_at, value)) = (learned.expect("a model"), alarm.expect("an alarm"));
+    assert!(
+        capacity_ah < limit_ah && raised_at == learned_at,
+        "{capacity_ah} at {learned_at:?}, alarm at {raised_at:?}"
+    );
+    assert!((value - capacity_ah).abs() < 1e-6, "{value} {capacity_ah}");
 }
 
 #[test]

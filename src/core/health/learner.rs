@@ -296,18 +296,18 @@ impl Learner {
     }
 
     /// Continues with another model of the cell, whose estimator has adopted it: the present half-cycle begins again at `soc`, and
-    /// the capacity at `capacity`, Ah, where that is given.
+    /// the capacity at `capacity`, Ah, where that is given, with whether it was learned.
     pub fn adopt(
         &mut self,
         config: &CapacityConfig,
         cell: usize,
-        capacity: Option<ScalarGaussian>,
+        capacity: Option<(ScalarGaussian, bool)>,
         soc: Option<ScalarGaussian>,
         estimator: &CellEstimator,
     ) {
-        if let Some(capacity) = capacity {
+        if let Some((capacity, is_learned)) = capacity {
             self.drift[cell] = DriftFilter::new(config, capacity);
-            (self.capacity[cell], self.learned[cell]) = (capacity, true);
+            (self.capacity[cell], self.learned[cell]) = (capacity, is_learned);
         }
         self.prior[cell] = estimator.capacity();
         self.in_doubt.retain(|&other| other != cell);
@@ -524,6 +524,19 @@ mod tests {
         let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
+    }
+
+    #[test]
+    fn the_capacity_of_a_label_that_is_returned_to_is_not_learned() {
+        let (config, estimator) = (config(), CellEstimator::new(&estimator_config()));
+        let mut learner = Learner::new(&config, vec![estimator.capacity()]);
+        let [fitted, label] = [1.8, 2.0].map(|ah| ScalarGaussian::from_std(ah, 0.1));
+        learner.adopt(&config, 0, Some((fitted, true)), None, &estimator);
+        assert_eq!((learner.capacity(0), learner.has_learned(0)), (fitted, true));
+        learner.adopt(&config, 0, None, None, &estimator);
+        assert_eq!((learner.capacity(0), learner.has_learned(0)), (fitted, true));
+        learner.adopt(&config, 0, Some((label, false)), None, &estimator);
+        assert_eq!((learner.capacity(0), learner.has_learned(0)), (label, false));
     }
 
     #[test]

@@ -171,7 +171,7 @@ impl Estimation {
 
     /// Continues with another model. The cells keep their differences from the mean cell.
     pub(super) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
-        let Adoption { model, config: estimator, mean, with_capacity } = adoption;
+        let Adoption { model, config: estimator, mean, with_capacity, is_learned } = adoption;
         let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
         let soc = differences(own.iter().map(|&cell| bank.filtered_soc(cell).map(|soc| soc.mean)));
         let log_resistance = differences(own.iter().map(|&cell| Some(bank.log_resistance(cell).mean)));
@@ -190,7 +190,7 @@ impl Estimation {
                 ..*mean
             };
             bank.change(cell, |cell| cell.adopt(model, &estimator, &state));
-            learner.adopt(config, cell, capacity, state.soc, &bank.cell(cell));
+            learner.adopt(config, cell, capacity.map(|capacity| (capacity, *is_learned)), state.soc, &bank.cell(cell));
         }
         self.begin_checks();
     }

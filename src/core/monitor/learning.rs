@@ -177,6 +177,11 @@ impl Learning {
         self.state.learner.capacity(index)
     }
 
+    /// The same where it was learned.
+    pub(super) fn learned_capacity(&self, index: usize) -> Option<ScalarGaussian> {
+        self.state.learner.has_learned(index).then(|| self.capacity(index))
+    }
+
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.
     /// `teaches_capacity`: the model is good enough for that.
     pub(super) fn complete_mode(

@@ -177,8 +177,10 @@ pub(super) struct Adoption {
     pub(super) config: EstimatorConfig,
     /// State of the mean cell.
     pub(super) mean: AdoptedState,
-    /// Whether the cells' capacities begin with that of the fit.
+    /// Whether the cells' capacities begin with that of the mean cell.
     pub(super) with_capacity: bool,
+    /// Whether the model was learned; if not it is the label's, and nothing is known of the capacity.
+    pub(super) is_learned: bool,
 }
 
 impl ModellingState {
@@ -382,7 +384,7 @@ impl Modelling {
         self.state.before = self.state.own.replace(own);
         self.outcome = FitOutcome::Adopted;
         let (model, config) = self.in_force();
-        Some(Adoption { model, config, mean, with_capacity: !was_settled })
+        Some(Adoption { model, config, mean, with_capacity: !was_settled, is_learned: true })
     }
 
     /// Returns to the label's model from one that is not settled: the rows contradict it. `None` = it is in force.
@@ -394,7 +396,8 @@ impl Modelling {
         let InitialState { capacity_ah, capacity_std_ah, .. } = self.estimator.initial;
         let capacity = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
         let mean = AdoptedState { soc: None, soc_by_capacity: 0.0, capacity, log_resistance: 0.0, filtered_a: None };
-        Some(Adoption { model: self.model.clone(), config: self.estimator, mean, with_capacity: true })
+        let (model, config) = (self.model.clone(), self.estimator);
+        Some(Adoption { model, config, mean, with_capacity: true, is_learned: false })
     }
 
     /// Whether the latest fit ended with the model before.

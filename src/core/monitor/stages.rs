@@ -9,7 +9,7 @@ use super::estimation::Estimation;
 use super::learning::Learning;
 use super::modelling::Modelling;
 use super::pack_memory::PackMemory;
-use super::publisher::Publisher;
+use super::publisher::{Publisher, learned};
 use super::sampling::Sampling;
 use super::sender::Sender;
 use super::sleep::{BusSleep, Silence};
@@ -20,7 +20,7 @@ use crate::can::encode::{HealthFields, StatusFields};
 use crate::can::poll::CarState;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
-use crate::quantity::{BusIndex, Channel, Mode, Reading, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, Moment};
 
 /// All stages behind the intake.
@@ -251,10 +251,21 @@ impl Stages {
         let before = modelling.view().state;
         if let Some(adoption) = modelling.refit() {
             estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);
+            self.restate_capacities(now, out);
         } else if modelling.has_returned() {
             estimation.use_model(modelling, &learning.state.learner);
         }
         out.events.extend(self.modelling.note_change(now, before));
+    }
+
+    /// Passes the capacities of the cells whose model has changed to their rule.
+    fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
+        for index in self.estimation.bank.own_cells().to_vec() {
+            let capacity = self.learning.learned_capacity(index);
+            let observation = Observation { is_new: true, ..capacity.map_or_else(Observation::default, learned) };
+            let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
+            self.publisher(now, out).restate(Rule::CapacityLow, Some(cell), observation);
+        }
     }
 
     /// Executes a command.

@@ -303,7 +303,7 @@ impl Stages {
         let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
             let (cell, index) = (Some(index), index.index());
-            let capacity = self.learning.state.learner.has_learned(index).then(|| self.learning.capacity(index));
+            let capacity = self.learning.learned_capacity(index);
             let is_estimated = was_brief && self.estimation.bank.soc(index).is_some();
             let mean_nis = is_estimated.then(|| self.estimation.contradiction(index));
             let health = &self.learning.cells[index];

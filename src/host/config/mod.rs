@@ -249,7 +249,9 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     input_tables::interfaces(&document, &raw, faults);
     plausible::rated_capacity(&raw, model.as_ref(), faults);
     plausible::initial_capacity(&raw, model.as_ref(), faults);
-    modules.iter().for_each(|module| plausible::module(module, faults));
+    let own_ah =
+        raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.as_ref().map(|m| m.rated_capacity_ah));
+    modules.iter().for_each(|module| plausible::module(module, own_ah, faults));
     let databases = Databases::load(path, &raw, read, faults);
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();

@@ -35,6 +35,17 @@ fn the_voltages_of_all_cells_are_possible() {
 }
 
 #[test]
+fn cells_of_another_size_are_doubted() {
+    let (config, _) = read_texts(&with_modules(&LFP.replace("2.5", "50")), CELL, DBC).unwrap();
+    let line = PACK.lines().count() + 2;
+    let expected = format!(
+        "pack.toml:{line}: pack.module[1].cells = \"2, 4\", are cells of 25 times the 2 Ah of the pack's own, which carry the same current"
+    );
+    assert!(config.warnings.contains(&expected), "{:?}", config.warnings);
+    assert!(!good(&with_modules(LFP)).warnings.iter().any(|warning| warning.contains("pack's own")));
+}
+
+#[test]
 fn check_says_which_cells_are_of_another_kind() {
     let (_, description) = read_texts(&with_modules(LFP), CELL, DBC).unwrap();
     let words = description.pack.join("\n");
