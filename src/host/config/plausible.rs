@@ -453,8 +453,8 @@ pub(super) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>, fault
     initial_of(&pack.place, pack.initial_capacity_ah, model, faults);
 }
 
-/// Notes a module's initial capacity that no cell of its model has, a rated one that is not of a cell like it, and cells that nobody
-/// connects in series with the pack's own, which have `own_ah`.
+/// Notes a module's initial capacity that no cell of its model has, a rated one that is not of a cell like it, and cells of
+/// another size than the pack's own, which have `own_ah`.
 pub(super) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>, faults: &mut Faults) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
