@@ -69,6 +69,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let settings = settings_for(args, &config)?;
     let monitor = &config.monitor;
+    if !monitor.modules.is_empty() {
+        return Err(Failure::new("[[pack.module]] cannot be simulated: all simulated cells are of one kind"));
+    }
     let wiring = wiring(&monitor.sample);
     let sensors = u16::try_from(wiring.temperature_at.len()).unwrap_or(u16::MAX);
     let sim = Simulation::new(monitor.model.clone(), settings, wiring);

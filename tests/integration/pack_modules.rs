@@ -76,6 +76,45 @@ fn each_kind_of_cell_is_estimated_by_its_own_model() {
 }
 
 #[test]
+fn a_module_that_is_new_in_the_configuration_begins_anew_and_the_other_cells_continue() {
+    let plain = config_texts::load(PACK, DBC).monitor;
+    let mut before = Rig::with(plain.clone());
+    discharge(&mut before, [&plain.model, &plain.model]);
+    before.current_a = Some(0.0);
+    before.seconds(60);
+    let [own, old] = [0, 1].map(|cell| before.monitor.capacity(CellIndex(cell)));
+    assert!(own.std() < 0.25 && old.std() < 0.25, "both learned: {own:?} {old:?}");
+    let snapshot = before.monitor.snapshot();
+    // Other branches than the cell before had, and another capacity.
+    let text = format!("{PACK}{MODULE}initial_capacity_ah = 2.4\ninitial_capacity_std_ah = 0.5\n");
+    let mut rig = Rig::with(config_texts::load(&text, DBC).monitor);
+    assert_ne!(rig.config.model.branches.len(), rig.config.modules[0].model.branches.len());
+    rig.monitor.restore(snapshot, Downtime::Seconds(3600.0)).unwrap();
+    rig.deci = before.deci + 36_000;
+    rig.seconds(1);
+    let [own_after, module] = [0, 1].map(|cell| rig.monitor.capacity(CellIndex(cell)));
+    assert_eq!(own_after, own);
+    assert_eq!((module.mean, module.std()), (2.4, 0.5));
+}
+
+#[test]
+fn half_cycles_teach_a_module_with_a_model_file_and_none_with_a_label() {
+    let file = "[[pack.module]]\ncells = \"2\"\ncell_model = \"cells/example_nmc_2600.toml\"\n";
+    for (module, is_taught) in [(file, true), (MODULE, false)] {
+        let config = config_texts::load(&format!("{PACK}{module}"), DBC).monitor;
+        let models = [config.model.clone(), config.modules[0].model.clone()];
+        let mut rig = Rig::with(config);
+        let before = rig.monitor.capacity(CellIndex(1));
+        discharge(&mut rig, [&models[0], &models[1]]);
+        rig.current_a = Some(0.0);
+        rig.seconds(60);
+        let [own, of_module] = [0, 1].map(|cell| rig.monitor.capacity(CellIndex(cell)));
+        assert!(own.std() < 0.25, "{own:?}");
+        assert_eq!(of_module.std() < 0.9 * before.std(), is_taught, "{module}: {before:?} {of_module:?}");
+    }
+}
+
+#[test]
 fn other_cells_in_a_module_need_a_restart_and_other_capacities_do_not() {
     let config = config_texts::load(&format!("{PACK}{MODULE}"), DBC).monitor;
     let mut rig = Rig::with(config);

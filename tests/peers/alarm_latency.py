@@ -66,12 +66,13 @@ def current_of(data):
 
 
 def last_half_cycle(cells, sign):
-    """What the half-cycle before the latest change of sign gave, Ah, and the stamp of the frame that ended it: the second of the new sign."""
+    """What the half-cycle before the latest change of sign gave, Ah, and the stamp of the frame that ended it: the second of the new sign;
+    None while a busy machine has not delivered that one."""
     end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
     begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
     frames = cells[begin : end + 1]
     given = sum((now_a + next_a) / 2 * (next_ns - now_ns) for (now_ns, now_a), (next_ns, next_a) in zip(frames, frames[1:]))
-    return abs(given) * 1e-9 / 3600 / SWING, cells[end + 1][0]
+    return abs(given) * 1e-9 / 3600 / SWING, cells[end + 1][0] if end + 1 < len(cells) else None
 
 
 def bits(data, start, length):
@@ -127,7 +128,9 @@ def measure_alarm(count):
         sender.send(cell(sign * IDLE_A))
         # The half-cycle that is complete now is the one before: a weak one before a strong one.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
-        is_answer = lambda i, d: i == ALARM and (bits(d, *RULE), bits(d, *STATE)) == change  # noqa: E731
+        def is_answer(i, data, change=change):
+            return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change
+
         answered, seen = (None, listener.read()) if wait else listener.stamp_of(is_answer)
         # Enough for two half-cycles of six frames.
         cells = cells[-12:] + [(stamp, current_of(data)) for stamp, i, data in seen if i == CELL]
@@ -138,7 +141,7 @@ def measure_alarm(count):
             assert stalled < count, f"{stalled} half-cycles had another charge than meant: this machine is too busy"
         elif wait:
             wait -= 1
-        elif answered is None:
+        elif answered is None or asked is None:
             without += 1
             print(f"no answer after {len(late_ns)}: {given_ah:.2f} Ah in {cells}", file=sys.stderr, flush=True)
         else:

@@ -204,6 +204,11 @@ impl ModelCheck {
         if self.model == model || self.model == 0 { self } else { Self::new(model) }
     }
 
+    /// Whether it is of another model than this one.
+    pub fn is_of_other(&self, model: u64) -> bool {
+        self.model != 0 && self.model != model
+    }
+
     /// Whether evidence still counts.
     #[inline]
     pub fn is_open(&self) -> bool {

@@ -76,6 +76,9 @@ pub struct MeanCell {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Watched {
+    /// It is of the pack's own kind; of another cell nothing is known.
+    #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
+    is_compared: bool,
     difference: Difference,
     /// Its means before rows began to contradict them.
     settled: [f64; STATES],
@@ -92,7 +95,27 @@ struct Watched {
     jumped: Option<Timestamp>,
 }
 
+fn yes() -> bool {
+    true
+}
+
 impl Watched {
+    /// A cell of which nothing is known.
+    fn new(is_compared: bool) -> Self {
+        Self {
+            is_compared,
+            difference: Difference::new(),
+            settled: [0.0; STATES],
+            before_jump: [0.0; STATES],
+            sums: CellSums::default(),
+            channel: Channel::default(),
+            bleed: Bleed::default(),
+            temperature: Following::default(),
+            suspected: [None; CELL_KINDS],
+            jumped: None,
+        }
+    }
+
     /// What follows does not hang together with the samples so far.
     fn interrupt(&mut self) {
         self.sums.interrupt();
@@ -124,27 +147,33 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// For cells of which nothing is known, in a pack where only some are of one kind: only those are [added](Self::add).
-    pub fn of_cells(cells: usize, compared: &[usize]) -> Self {
-        let cells = if compared.len() < LEAST_CELLS { 0 } else { cells };
-        Self { middle: compared.first().copied().unwrap_or_default(), ..Self::new(cells) }
+    /// As [`Self::new`], in a pack where only some cells are of one kind: only those may be [added](Self::add).
+    pub fn among(cells: usize, compared: &[usize]) -> Self {
+        let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
+        diagnosis.compare_only(compared);
+        diagnosis
+    }
+
+    /// Compares these cells from now on. What is known of the others, and of those that were not compared before, is forgotten.
+    pub fn compare_only(&mut self, compared: &[usize]) {
+        for (index, cell) in self.cells.iter_mut().enumerate() {
+            let is_compared = compared.contains(&index);
+            if is_compared == cell.is_compared {
+                continue;
+            }
+            *cell = Watched::new(is_compared);
+            self.findings.retain(|found| !found.is_of(CellIndex(index as u16)));
+        }
+        self.lowest = self.lowest.filter(|lowest| compared.contains(lowest));
+        if !compared.contains(&self.middle) {
+            self.middle = compared.first().copied().unwrap_or_default();
+        }
     }
 
     /// For cells of which nothing is known.
     pub fn new(cells: usize) -> Self {
-        let cell = Watched {
-            difference: Difference::new(),
-            settled: [0.0; STATES],
-            before_jump: [0.0; STATES],
-            sums: CellSums::default(),
-            channel: Channel::default(),
-            bleed: Bleed::default(),
-            temperature: Following::default(),
-            suspected: [None; CELL_KINDS],
-            jumped: None,
-        };
         Self {
-            cells: vec![cell; if cells < LEAST_CELLS { 0 } else { cells }],
+            cells: vec![Watched::new(true); if cells < LEAST_CELLS { 0 } else { cells }],
             pack: PackSums::default(),
             last_row: None,
             rest_s: 0.0,
@@ -168,19 +197,19 @@ impl Diagnosis {
         &self.findings
     }
 
-    /// What is known of a cell's difference; `None` = the pack is not compared.
+    /// What is known of a cell's difference; `None` = it is not compared.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
-        self.cells.get(cell.index()).map(|cell| &cell.difference)
+        self.cells.get(cell.index()).filter(|cell| cell.is_compared).map(|cell| &cell.difference)
     }
 
     /// A cell's states less those of the middle of the pack; `None` = the pack is not compared, or has no such cell. A state is
-    /// `None` where nothing is known of it: the leak of a cell that may be bled.
+    /// `None` where nothing is known of it: all of a cell of another kind, the leak of a cell that may be bled.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
-        let own = &self.cells.get(cell.index())?.difference;
+        let Watched { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
             let middle = self.population(state).middle;
-            let ScalarGaussian { mean, variance } = own.state(state);
-            let is_known = state != LEAK || !self.may_be_bled(cell.index());
+            let ScalarGaussian { mean, variance } = difference.state(state);
+            let is_known = *is_compared && (state != LEAK || !self.may_be_bled(cell.index()));
             is_known.then_some(ScalarGaussian { mean: mean - middle, variance })
         }))
     }
@@ -560,4 +589,36 @@ fn inner_half<T>(values: &mut [T], by: impl Fn(&T) -> f64) -> &[T] {
     values.sort_by(|a, b| by(a).total_cmp(&by(b)));
     let cut = values.len() / 4;
     &values[cut..values.len() - cut]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_a_cell_that_is_not_compared_any_more_nothing_is_known() {
+        let mut diagnosis = Diagnosis::new(6);
+        diagnosis.middle = 4;
+        diagnosis.lowest = Some(5);
+        diagnosis.last_row = Some((Timestamp::ZERO, 0.5, 0.0));
+        for cell in [1, 4] {
+            diagnosis.cells[cell].settled[SOC] = 0.3;
+            let cells = Some((CellIndex(cell as u16), CellIndex(cell as u16)));
+            let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
+            let (kind, since) = (FindingKind::VoltageChannel, Timestamp::ZERO);
+            diagnosis.put(Finding { kind, cells, since, reported: since, probability: 1.0, size });
+        }
+        let mut stored: Diagnosis = serde_json::from_str(&serde_json::to_string(&diagnosis).unwrap()).unwrap();
+        stored.compare_only(&[0, 1, 2, 3]);
+        assert_eq!((stored.middle, stored.lowest, stored.findings().len()), (0, None, 1));
+        let faults = [0, 1, 4, 5].map(|cell| stored.has_channel_fault(CellIndex(cell)));
+        assert_eq!(faults, [Some(false), Some(true), None, None]);
+        assert_eq!(stored.sizes([FindingKind::Leak, FindingKind::Contact])[4], [None, None]);
+        assert!(stored.difference(CellIndex(4)).is_none() && stored.difference(CellIndex(1)).is_some());
+        assert_eq!(stored.relative(CellIndex(4)), Some([None; STATES]));
+        let again: Diagnosis = serde_json::from_str(&serde_json::to_string(&stored).unwrap()).unwrap();
+        assert_eq!(again, stored);
+        stored.compare_only(&[0, 1, 2, 3, 4, 5]);
+        assert_eq!((stored.cells[4].settled[SOC], stored.cells[1].settled[SOC]), (0.0, 0.3));
+    }
 }

@@ -117,9 +117,9 @@ pub struct Learner {
     /// Offset of the current sensor.
     #[serde(default)]
     offset: CurrentOffset,
-    /// Half-cycles leave the capacity as it is.
+    /// Per cell: half-cycles leave the capacity as it is.
     #[serde(skip)]
-    is_held: bool,
+    is_held: Vec<bool>,
 }
 
 impl Learner {
@@ -148,6 +148,16 @@ impl Learner {
         self.capacity[cell] = capacity;
         self.prior[cell] = estimator.capacity();
         self.learned[cell] = true;
+    }
+
+    /// Begins with another cell, which has this capacity: what was learned was of the one before.
+    pub fn begin(&mut self, config: &CapacityConfig, cell: usize, capacity: ScalarGaussian) {
+        self.drift[cell] = DriftFilter::new(config, capacity);
+        (self.prior[cell], self.capacity[cell], self.learned[cell]) = (capacity, capacity, false);
+        self.in_doubt.retain(|&other| other != cell);
+        for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
+            mark.cells[cell].soc = None;
+        }
     }
 
     /// What is learned, without the half-cycle under way.
@@ -240,8 +250,8 @@ impl Learner {
     }
 
     /// Whether half-cycles leave the capacity as it is: the model of the cells is not known well enough.
-    pub fn hold(&mut self, is_held: bool) {
-        self.is_held = is_held;
+    pub fn hold(&mut self, is_held: impl Fn(usize) -> bool) {
+        self.is_held = (0..self.capacity.len()).map(is_held).collect();
     }
 
     /// Runs the capacity filter of one cell over its completed half-cycle.
@@ -340,7 +350,8 @@ impl Learner {
         let after = estimator.capacity();
         let is_in_doubt = self.in_doubt.contains(&cell);
         self.in_doubt.retain(|&other| other != cell);
-        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !self.is_held);
+        let is_held = self.is_held.get(cell).copied().unwrap_or(false);
+        let evidence = self.prior[cell].information_until(&after).filter(|_| !is_in_doubt && !is_held);
         let measurement = evidence.map(|z| {
             // With the curve of the capacity that comes out: z = C + s (C_curve - C).
             let weight = 1.0 - after.variance / self.prior[cell].variance;

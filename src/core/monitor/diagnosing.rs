@@ -36,7 +36,7 @@ impl Diagnosing {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
         let compared = compared.to_vec();
-        Self { diagnosis: Diagnosis::of_cells(cells, &compared), cells, compared, is_balanced, balancing }
+        Self { diagnosis: Diagnosis::among(cells, &compared), cells, compared, is_balanced, balancing }
     }
 
     /// Other settings for the same cells.
@@ -46,7 +46,7 @@ impl Diagnosing {
 
     /// Forgets everything: another pack is connected.
     pub(super) fn forget(&mut self) {
-        self.diagnosis = Diagnosis::of_cells(self.cells, &self.compared);
+        self.diagnosis = Diagnosis::among(self.cells, &self.compared);
     }
 
     /// The state, to be stored; `None` = the pack is too small for a comparison.
@@ -58,6 +58,7 @@ impl Diagnosing {
     pub(super) fn restore(&mut self, stored: Option<Diagnosis>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;
+        self.diagnosis.compare_only(&self.compared);
         if let Some((from, to)) = away {
             self.diagnosis.interrupt();
             self.diagnosis.note_unheard(from, to);
@@ -148,8 +149,7 @@ impl Stages {
             if is_new && !self.sampling.inputs_valid(cell, now) {
                 continue;
             }
-            let is_compared = self.estimation.bank.is_own(cell.index());
-            let fault = self.diagnosing.diagnosis.has_channel_fault(cell).filter(|_| is_compared);
+            let fault = self.diagnosing.diagnosis.has_channel_fault(cell);
             let fault = Observation::new(fault.map(|is_faulty| if is_faulty { 1.0 } else { 0.0 }));
             let mut publisher = self.publisher(now, out);
             publisher.observe(Rule::ChannelFaulty, Some(cell), Observation { is_new, ..fault });

@@ -192,7 +192,11 @@ impl Estimation {
             bank.change(cell, |cell| cell.adopt(model, &estimator, &state));
             learner.adopt(config, cell, capacity.map(|capacity| (capacity, *is_learned)), state.soc, &bank.cell(cell));
         }
-        self.begin_checks();
+        let ids = ids_of_models(&self.bank);
+        for &cell in self.bank.own_cells() {
+            self.checks[cell] = ModelCheck::new(ids[cell]);
+        }
+        self.note_checks();
     }
 
     /// Ends the work on stepped samples.
@@ -281,6 +285,12 @@ impl Estimation {
     fn note_checks(&mut self) {
         self.any_check_open = self.checks.iter().any(ModelCheck::is_open);
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
+    }
+
+    /// Whether a stored cell with this check was another one than that of its module.
+    pub(super) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
+        let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
+        !self.bank.is_own(index) && check.is_of_other(id())
     }
 
     /// The check of a cell's model, for the snapshot.

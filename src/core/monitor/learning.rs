@@ -183,7 +183,7 @@ impl Learning {
     }
 
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.
-    /// `teaches_capacity`: the model is good enough for that.
+    /// `teaches_capacity`: the model of the pack's own cells is good enough for that; that of a module is if it is of a file.
     pub(super) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -191,7 +191,8 @@ impl Learning {
         teaches_capacity: bool,
         to: &mut Publisher<'_>,
     ) {
-        self.state.learner.hold(!teaches_capacity);
+        let teaches = |cell| if bank.is_own(cell) { teaches_capacity } else { bank.has_given_model(cell) };
+        self.state.learner.hold(|cell| !teaches(cell));
         to.event(EventKind::Mode { from: change.from, to: change.to });
         // At a loss of the current nothing new is learned: the evidence waits.
         if change.to != Mode::Unknown {

@@ -359,6 +359,8 @@ impl Modelling {
             self.state.taken_back = self.state.taken_back.saturating_add(1);
             self.outcome = FitOutcome::Returned;
         }
+        let is_label_again = is_before_better && self.state.own.is_none();
+        let unless_fitted = |modelling: &Self| is_label_again.then(|| modelling.label_adoption());
         let was_settled = self.state.own.as_ref().is_some_and(OwnModel::is_settled);
         self.state.notebook.mark_read();
         if is_enough {
@@ -366,14 +368,14 @@ impl Modelling {
             self.state.chemistry = chemistry;
         }
         if self.state.chemistry.is_some() || fit.as_ref().is_some_and(|it| it.misfit > HOPELESS_MISFIT) {
-            return self.return_to_label();
+            return self.return_to_label().or_else(|| unless_fitted(self));
         }
-        let fitted = fit?;
+        let Some(fitted) = fit else { return unless_fitted(self) };
         // The flat curve of LFP is hidden by its hysteresis, which no row's error holds.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
-            return None;
+            return unless_fitted(self);
         }
         let (soc, soc_by_capacity) = fitted.soc(self.state.notebook.present()).unzip();
         let soc_by_capacity = soc_by_capacity.unwrap_or(0.0);
@@ -393,11 +395,16 @@ impl Modelling {
         self.state.before = None;
         self.state.taken_back = self.state.taken_back.saturating_add(1);
         self.outcome = FitOutcome::Returned;
+        Some(self.label_adoption())
+    }
+
+    /// The label's model, of whose capacity nothing is known.
+    fn label_adoption(&self) -> Adoption {
         let InitialState { capacity_ah, capacity_std_ah, .. } = self.estimator.initial;
         let capacity = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
         let mean = AdoptedState { soc: None, soc_by_capacity: 0.0, capacity, log_resistance: 0.0, filtered_a: None };
         let (model, config) = (self.model.clone(), self.estimator);
-        Some(Adoption { model, config, mean, with_capacity: true, is_learned: false })
+        Adoption { model, config, mean, with_capacity: true, is_learned: false }
     }
 
     /// Whether the latest fit ended with the model before.

@@ -302,7 +302,13 @@ impl Stages {
             modelling.restore(stored);
             estimation.use_model(modelling, &state.learner);
         }
+        learning.state = state;
         for (index, cell) in cells.iter().enumerate() {
+            if estimation.is_other_cell(index, &cell.model_check) {
+                // A module that was replaced while the program did not run: what is stored was of the cells before.
+                learning.state.learner.begin(&learning.config.capacity, index, estimation.bank.cell(index).capacity());
+                continue;
+            }
             learning.cells[index] = cell.health;
             let model = estimation.bank.model(index);
             learning.lives.cells[index] = cell.life(model, &learning.config);
@@ -311,7 +317,6 @@ impl Stages {
             }
         }
         estimation.restore(cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check)), batch);
-        learning.state = state;
         // Earlier programs combined cells beyond empty and full.
         learning.state.pack = learning.state.pack.filter(|pack| (0.0..=1.0).contains(&pack.soc));
         let configured_a = learning.config.capacity.current_offset_std_a;
@@ -531,9 +536,9 @@ impl StoredCell {
         bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
     }
 
-    /// Whether the filter has the branches of this cell of the bank.
+    /// Whether the filter has the branches of this cell of the bank; a module's may have been replaced.
     fn fits(&self, bank: &PackBank, index: usize) -> bool {
-        CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
+        !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {

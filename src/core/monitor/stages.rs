@@ -249,22 +249,33 @@ impl Stages {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
         let before = modelling.view().state;
-        if let Some(adoption) = modelling.refit() {
-            estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);
-            self.restate_capacities(now, out);
+        let adoption = modelling.refit();
+        if let Some(adoption) = &adoption {
+            estimation.adopt(adoption, &mut learning.state.learner, &learning.config.capacity);
         } else if modelling.has_returned() {
             estimation.use_model(modelling, &learning.state.learner);
         }
         out.events.extend(self.modelling.note_change(now, before));
+        if adoption.is_some_and(|it| it.with_capacity) {
+            self.restate_capacities(now, out);
+        }
     }
 
     /// Passes the capacities of the cells whose model has changed to their rule.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
-            let observation = Observation { is_new: true, ..capacity.map_or_else(Observation::default, learned) };
-            let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
-            self.publisher(now, out).restate(Rule::CapacityLow, Some(cell), observation);
+            let cell = Some(CellIndex(u16::try_from(index).unwrap_or(u16::MAX)));
+            let mut publisher = self.publisher(now, out);
+            match capacity {
+                Some(capacity) => publisher.observe(Rule::CapacityLow, cell, learned(capacity)),
+                None => {
+                    for rule in [Rule::CapacityLow, Rule::UsableCapacityLow] {
+                        publisher.restate(rule, cell, Observation::new(None));
+                    }
+                    self.learning.cells[index].usable = None;
+                }
+            }
         }
     }
 

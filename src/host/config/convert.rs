@@ -53,7 +53,7 @@ pub(super) fn monitor(
     let modules = modules.into_iter().map(|Module { keys, cells, mut model }| {
         model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
         let estimator = estimator(&model, (keys.initial_capacity_ah, keys.initial_capacity_std_ah))?;
-        Some(CellModule { cells, model, estimator })
+        Some(CellModule { cells, model, estimator, is_given: keys.cell_model.is_some() })
     });
     let modules = modules.collect::<Option<Vec<_>>>()?;
     let estimator = estimator(&model, (pack.initial_capacity_ah, pack.initial_capacity_std_ah))?;

@@ -3,7 +3,7 @@
 //! In: a configuration, with a cell model or a label, and logs as the daemon reads them. Out: a [`FitOutcome`] whose tables stay
 //! those of the configured model where the logs show nothing.
 //!
-//! Every log goes through the monitor, so that limits, decoding and faults are those of the daemon. All cells are of one kind:
+//! Every log goes through the monitor, so that limits, decoding and faults are those of the daemon. The pack's own cells are of one kind:
 //! their mean voltage is fitted, as one cell. A hole in the record begins a new stretch, whose SOC is another unknown.
 
 use std::cell::RefCell;

@@ -107,6 +107,12 @@ fn dated(quantity: Quantity) -> Known {
 /// Checks that a state was taken with this configuration of the pack. What a state of an earlier program does not say is not checked.
 fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     let sample = &config.monitor.sample;
+    if let Some(module) = config.monitor.modules.first() {
+        let name = &module.model.name;
+        return Err(format!(
+            "a pack with modules of other cells ({name}) has no passport: its values are of one kind of cell"
+        ));
+    }
     let (strings, series) = state.wiring().unzip();
     let counts = [
         ("estimated cells", u16::try_from(state.cells()).ok(), sample.cells),

@@ -19,6 +19,8 @@ pub struct CellModule {
     pub model: CellModel,
     /// Estimator settings: those of the pack, with the initial capacity of this model.
     pub estimator: EstimatorConfig,
+    /// The model is of a file; if not, of the label.
+    pub is_given: bool,
 }
 
 /// Where a cell's estimator is.
@@ -37,6 +39,8 @@ pub struct PackBank {
     places: Vec<Place>,
     /// The pack's own cells, ascending.
     own: Vec<usize>,
+    /// Per module: its model is of a file.
+    is_given: Vec<bool>,
 }
 
 impl PackBank {
@@ -57,7 +61,12 @@ impl PackBank {
         }
         let of_module = |module: &CellModule| EstimatorBank::new(&module.model, &module.estimator, module.cells.len());
         let banks = std::iter::once(EstimatorBank::new(model, config, own.len())).chain(modules.iter().map(of_module));
-        Self { banks: banks.collect(), places: places.into_iter().flatten().collect(), own }
+        Self {
+            banks: banks.collect(),
+            places: places.into_iter().flatten().collect(),
+            own,
+            is_given: modules.iter().map(|module| module.is_given).collect(),
+        }
     }
 
     /// Replaces settings and tables for the same cells and modules; a model must have as many branches as before.
@@ -104,6 +113,12 @@ impl PackBank {
     /// Which of the [kinds](Self::kinds) a cell is.
     pub fn kind(&self, cell: usize) -> usize {
         self.places[cell].bank
+    }
+
+    /// Whether a cell is in a module whose model is of a file.
+    pub fn has_given_model(&self, cell: usize) -> bool {
+        let of_module = self.kind(cell).checked_sub(1).and_then(|module| self.is_given.get(module));
+        of_module.copied().unwrap_or(false)
     }
 
     /// The model of the pack's own cells.

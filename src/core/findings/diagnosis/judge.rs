@@ -51,7 +51,8 @@ impl Population {
 
 impl Diagnosis {
     pub(super) fn population(&self, state: usize) -> Population {
-        Population::of(self.cells.iter().map(|cell| cell.difference.state(state).mean))
+        let compared = self.cells.iter().filter(|cell| cell.is_compared);
+        Population::of(compared.map(|cell| cell.difference.state(state).mean))
     }
 
     /// Judges all cells. `bled_slope_v`: slope of the open-circuit curve where a BMS bleeds, V; `None` = it does not.
@@ -70,6 +71,10 @@ impl Diagnosis {
         let populations = self.populations();
         let mut foreign: Vec<Option<Finding>> = Vec::with_capacity(self.cells.len());
         for index in 0..self.cells.len() {
+            if !self.cells[index].is_compared {
+                foreign.push(None);
+                continue;
+            }
             let judged = self.judged(index, &populations);
             // The first channel fault, if any, in the order of `judged`: nothing else is known then.
             let fault =
@@ -95,6 +100,7 @@ impl Diagnosis {
 
     fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
         let cell = CellIndex(index as u16);
+        self.cells.get(index).filter(|cell| cell.is_compared)?;
         let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
         let is_found = || self.findings.iter().any(|found| found.kind == kind && found.is_of(cell));
         let since = self.cells[index].suspected[kind as usize - 1];
@@ -103,8 +109,9 @@ impl Diagnosis {
         (judged.is_comparable && is_known && self.has_channel_fault(cell) == Some(false)).then_some(judged.size)
     }
 
-    /// Whether what is read as a cell's voltage is not that; `None` = not compared yet.
+    /// Whether what is read as a cell's voltage is not that; `None` = not compared, or not yet.
     pub fn has_channel_fault(&self, cell: CellIndex) -> Option<bool> {
+        self.cells.get(cell.index()).filter(|cell| cell.is_compared)?;
         let is_found = self.findings.iter().any(|found| found.kind.is_channel_fault() && found.is_of(cell));
         if is_found { Some(true) } else { self.last_row.map(|_| false) }
     }
@@ -117,7 +124,8 @@ impl Diagnosis {
     /// no BMS bleeds: a BMS goes by the readings, whatever their errors. It stays the one until another shows less.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
-        for (index, shown) in self.cells.iter().map(|cell| cell.difference.reading_v(slope_v)).enumerate() {
+        let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
+        for (index, shown) in compared.map(|(index, cell)| (index, cell.difference.reading_v(slope_v))) {
             if lowest.is_none_or(|(_, least)| shown.mean < least.mean) {
                 next = lowest.replace((index, shown)).map(|(_, shown)| shown);
             } else if next.is_none_or(|next| shown.mean < next.mean) {

@@ -229,10 +229,11 @@ impl Link {
                     self.note_dropped(open);
                     if self.has_losses() {
                         // An event's time is the least time of later frames: those that wait in the socket come first.
+                        let noticed = Reading::now();
                         if !self.receive_all(open).await {
                             return ServiceEnd::Dead;
                         }
-                        self.report_losses(open.mapper.event(Reading::now())).await;
+                        self.report_losses(open.mapper.event(noticed)).await;
                     }
                     continue;
                 }

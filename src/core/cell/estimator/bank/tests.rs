@@ -296,7 +296,8 @@ fn modules_of_another_cell_are_estimated_as_if_they_were_alone() {
     let other_config =
         EstimatorConfig { initial: crate::cell::InitialState { capacity_ah: 3.0, ..config.initial }, ..config };
     let in_module = [CellIndex(1), CellIndex(4), CellIndex(5)];
-    let module = CellModule { cells: in_module.to_vec(), model: other.clone(), estimator: other_config };
+    let module =
+        CellModule { cells: in_module.to_vec(), model: other.clone(), estimator: other_config, is_given: true };
     let mut mixed = PackBank::new(&model, &config, 8, &[module]);
     let mut own = EstimatorBank::new(&model, &config, 5);
     let mut foreign = EstimatorBank::new(&other, &other_config, 3);
