@@ -164,7 +164,6 @@ impl PackBank {
     }
 
     /// As [`EstimatorBank::is_started`].
-    #[inline]
     pub fn is_started(&self, cell: usize) -> bool {
         let (bank, cell) = self.at(cell);
         bank.is_started(cell)
@@ -177,7 +176,6 @@ impl PackBank {
     }
 
     /// As [`EstimatorBank::soc`].
-    #[inline]
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
         let (bank, cell) = self.at(cell);
         bank.soc(cell)
@@ -197,7 +195,6 @@ impl PackBank {
     }
 
     /// As [`EstimatorBank::log_resistance`].
-    #[inline]
     pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
         let (bank, cell) = self.at(cell);
         bank.log_resistance(cell)
@@ -210,14 +207,12 @@ impl PackBank {
     }
 
     /// As [`EstimatorBank::mean_nis`].
-    #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (bank, cell) = self.at(cell);
         bank.mean_nis(cell)
     }
 
     /// As [`EstimatorBank::is_plausible`].
-    #[inline]
     pub fn is_plausible(&self, cell: usize) -> bool {
         let (bank, cell) = self.at(cell);
         bank.is_plausible(cell)
@@ -234,7 +229,6 @@ impl PackBank {
     }
 
     /// As [`EstimatorBank::temperature_c`].
-    #[inline]
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         let (bank, cell) = self.at(cell);
         bank.temperature_c(cell)
