@@ -50,7 +50,7 @@ fn square(x: f64) -> f64 {
     x * x
 }
 
-/// Evidence about one cell's model. Sums that earlier programs stored about another SOC are passed over: the window goes on without them.
+/// Evidence about one cell's model. Sums that earlier programs stored about another SOC are passed over: the window continues without them.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ModelCheck {
     /// The model that is checked ([`model_id`]); 0 in a state stored by a program without a check.
