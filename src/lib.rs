@@ -23,7 +23,7 @@
 //! | | [`store`] | learned state and history in SQLite |
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
-//! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
+//! | | [`replay`], [`wiring_check`] | loops that are no service: recorded logs, the doctor |
 //! | | `failure` | why a command ended: text and exit code of every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
@@ -32,7 +32,7 @@
 //!
 //! # The path of a frame
 //! `host/io/socket` receives it, `host/service/live.rs` passes it on, then [`monitor`]: `intake` (protection, flood) → `can/decode`
-//! (a diagnostic answer: `can/isotp`, `can/diagnostic`) → `sampling` → `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay enters
+//! (a diagnostic answer: `can/isotp`, `can/uds`) → `sampling` → `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay enters
 //! at `host/replay.rs` instead; all after it is the same.
 //!
 //! # To change something, open
@@ -49,13 +49,13 @@
 //! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/command_gate.rs`; `host/io/can_key.rs` |
 //! | a second sender of a message; frames with our own identifiers; a frozen current | `core/can/rate.rs`; `core/can/own_frames.rs`; `core/sample/frozen.rs` |
 //! | what a number can be at most, at every door | `core/quantity/bounds.rs` |
-//! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/diagnostic.rs`; `core/can/poll.rs` |
+//! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/uds.rs`; `core/can/poll.rs` |
 //! | when the buses sleep | `core/monitor/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
 //! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/modelling.rs` (when); on another thread: `host/service/live.rs` |
-//! | what a fault of one cell looks like; from when on it is reported | `core/findings/difference.rs`, `core/findings/channels.rs`; `core/findings/finding.rs` |
+//! | what a fault of one cell looks like; from when on it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/finding.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |
@@ -78,7 +78,7 @@
 //! | what an OBDb signal set becomes | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |
 //! | what a BPX file becomes | `lab/import/bpx/curve.rs` (open-circuit voltage), `lab/import/bpx/circuit.rs` (resistances) |
 //! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
-//! | a finding of the doctor | `core/doctor/judge` |
+//! | a finding of the doctor | `core/wiring/judge` |
 //! | how well a cell model is known, what measurement is advised | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
 //! | what a cell model file holds | `host/config/cell_model.rs` (read), `host/config/cell_model/write.rs` (written) |
 //! | a picture of a cell model | `lab/model_pictures.rs` |
@@ -98,8 +98,8 @@
 //! * Inside, current is positive for discharge, SOC is a fraction; wire units end in [`can`].
 //! * A bad reading is data with a fault; an unknown value never looks healthy.
 
-pub use packwatch_core::{alarm, can, cell, doctor, filter, findings, health, monitor, quantity, sample, sim};
-pub use packwatch_host::{config, control, diagnosis, exporter, io, logging, replay, service, status, store};
+pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
+pub use packwatch_host::{config, control, exporter, io, logging, replay, service, status, store, wiring_check};
 #[cfg(feature = "lab")]
 pub use packwatch_lab::{self as lab, ident};
 #[cfg(feature = "lab")]

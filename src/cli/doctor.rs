@@ -13,10 +13,10 @@ use super::output::{print_json, progress_bar, unless_closed};
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 
-use crate::diagnosis::{self, Interrupt, Survey};
-use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
 use crate::replay::ReplayProgress;
+use crate::wiring::{Finding, Report, Severity, Topic};
+use crate::wiring_check::{self, Interrupt, Survey};
 
 /// Longest time to listen, s: a day.
 const MAX_SECONDS: f64 = 86_400.0;
@@ -55,7 +55,7 @@ pub(crate) struct Args {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let mut survey = diagnosis::survey(&args.config)?;
+    let mut survey = wiring_check::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;
@@ -111,7 +111,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
         pack_total: survey.plan.pack.is_total,
     };
     let bar = Bar::new(&args.logs);
-    let result = diagnosis::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
+    let result = wiring_check::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
         bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });
@@ -129,7 +129,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
 fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
     let wanted_s = args.seconds.unwrap_or(DEFAULT_SECONDS);
     let bar = progress_bar((1000.0 * wanted_s) as u64, "listening {bar:32} {msg} (Ctrl-C ends early)");
-    let result = diagnosis::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
+    let result = wiring_check::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
         bar.set_position((1000.0 * progress.seconds) as u64);
         bar.set_message(format!("{:.0} of {wanted_s:.0} s, {} frames", progress.seconds, progress.frames));
     });

@@ -11,7 +11,7 @@
 //! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
 //! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
 //! | modelling | steps of the cells, rests → the cells' own model | `monitor/modelling.rs` | [`cell`]: notebook, own model |
-//! | diagnosing | cell samples, estimates → findings, values of the rules about a cell against its pack | `monitor/diagnosing.rs` | [`findings`]: each cell against its pack |
+//! | diagnosing | cell samples, estimates → findings, values of the rules about a cell against its pack | `monitor/diagnosing.rs` | [`cell_faults`]: each cell against its pack |
 //! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
 //! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
@@ -37,13 +37,13 @@
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
-//! | a kind of finding | `findings/finding.rs` (kind, limit), `findings/diagnosis.rs` (its judgement) |
+//! | a kind of finding | `cell_faults/finding.rs` (kind, limit), `cell_faults/diagnosis.rs` (its judgement) |
 //! | what a cell has lost | `cell/loss_modes.rs` |
 //! | bands of a cell model, which measurement helps most | `cell/model_bands.rs` |
 //! | how far two cell models are apart | `cell/model_comparison.rs` |
 //! | how a model of another cell is found | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
-//! | a finding of the doctor | `doctor/judge/` |
+//! | a finding of the doctor | `wiring/judge/` |
 //! | a scenario of the simulator | `sim/scenario.rs` |
 //!
 //! # Invariants
@@ -54,11 +54,11 @@
 pub mod alarm;
 pub mod can;
 pub mod cell;
-pub mod doctor;
+pub mod cell_faults;
 pub mod filter;
-pub mod findings;
 pub mod health;
 pub mod monitor;
 pub mod quantity;
 pub mod sample;
 pub mod sim;
+pub mod wiring;

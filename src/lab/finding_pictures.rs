@@ -2,11 +2,11 @@
 //!
 //! A bar is a 95 % interval. Red cells are those of a finding that the picture shows.
 
+use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
+use crate::cell_faults::finding;
+use crate::cell_faults::{Diagnosis, Finding, FindingKind};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
 use crate::filter::ScalarGaussian;
-use crate::findings::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
-use crate::findings::finding;
-use crate::findings::{Diagnosis, Finding, FindingKind};
 use crate::quantity::CellIndex;
 
 /// Half of a 95 % interval, standard deviations.

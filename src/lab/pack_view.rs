@@ -3,9 +3,9 @@
 //! Cells are counted from 1. Every "±" is one standard deviation. Ah and kWh are those of one string.
 
 use crate::cell::CellModel;
+use crate::cell_faults::imbalance::{CellSpread, LeftOut, LimitingCell, mean_ocv_v};
+use crate::cell_faults::{Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
-use crate::findings::imbalance::{CellSpread, LeftOut, LimitingCell, mean_ocv_v};
-use crate::findings::{Imbalance, UnknownImbalance};
 use crate::quantity::CellIndex;
 
 /// Most cells that are left out by name: more do not fit into a line.

@@ -1,6 +1,6 @@
 //! The finding that an injected fault asks for.
 
-use packwatch::findings::FindingKind;
+use packwatch::cell_faults::FindingKind;
 use packwatch::sim::FaultKind;
 
 /// The finding of a fault; `None` = packwatch has none for it.

@@ -5,9 +5,9 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use packwatch::can::encode::InputEncoder;
+use packwatch::cell_faults::finding::{CHANNEL_V, OFFSET_PER_H};
+use packwatch::cell_faults::{Finding, FindingKind};
 use packwatch::config;
-use packwatch::findings::finding::{CHANNEL_V, OFFSET_PER_H};
-use packwatch::findings::{Finding, FindingKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};

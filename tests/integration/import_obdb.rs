@@ -9,8 +9,8 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use packwatch::can::CanId;
-use packwatch::can::diagnostic::Answer;
 use packwatch::can::isotp::{Progress, Receiver};
+use packwatch::can::uds::Answer;
 use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 

@@ -4,9 +4,9 @@ use serde::Serialize;
 
 use super::Value;
 use crate::cell::CellModel;
+use crate::cell_faults::imbalance::{CellSpread, LeftOut, LimitReason, LimitingCell};
+use crate::cell_faults::{Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
-use crate::findings::imbalance::{CellSpread, LeftOut, LimitReason, LimitingCell};
-use crate::findings::{Imbalance, UnknownImbalance};
 use crate::io::stamp::format_utc;
 use crate::lab::pack_view::energy_kwh;
 

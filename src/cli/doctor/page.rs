@@ -4,7 +4,7 @@ use std::io::IsTerminal as _;
 use std::path::Path;
 
 use super::super::{Failure, output};
-use crate::doctor::{Change, Finding, Report, Severity};
+use crate::wiring::{Change, Finding, Report, Severity};
 
 /// Width of the text without a terminal.
 const DEFAULT_WIDTH: usize = 100;
@@ -162,7 +162,7 @@ fn wrapped(text: &str, width: usize, indent: usize) -> String {
 #[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 mod tests {
     use super::*;
-    use crate::doctor::Topic;
+    use crate::wiring::Topic;
 
     fn change(proposed: &str) -> Change {
         let place = Some("pack.toml:7".to_owned());

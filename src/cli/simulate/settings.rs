@@ -1,8 +1,8 @@
 //! Changes of a scenario's settings by the command line.
 
+use crate::cell_faults::BalancingConfig;
 use crate::cli::Failure;
 use crate::cli::numbers::{NamedValue, between, finite, one_of, share, within};
-use crate::findings::BalancingConfig;
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 
 /// Scenarios by name.

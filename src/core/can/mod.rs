@@ -6,7 +6,6 @@
 
 pub mod dbc;
 pub mod decode;
-pub mod diagnostic;
 pub mod e2e;
 pub mod encode;
 pub mod flood;
@@ -20,6 +19,7 @@ pub mod poll;
 pub mod rate;
 pub mod secoc;
 pub mod signal;
+pub mod uds;
 pub mod unit;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

@@ -4,13 +4,13 @@
 //! [`PollChange`] each time it falls silent or asks again. One request is outstanding at a time. It is silent while another tester
 //! is at work, while the bus sleeps, while the supply is low or not known, and on standby.
 //!
-//! Only questions of a [`Service`](super::diagnostic::Service) can be sent: there is no way to express a write, a session or a
+//! Only questions of a [`Service`](super::uds::Service) can be sent: there is no way to express a write, a session or a
 //! routine. Pure: no clock, no socket.
 
 use serde::{Deserialize, Serialize};
 
-use super::diagnostic::{Controller, PENDING, Question, Refusal};
 use super::isotp::segment;
+use super::uds::{Controller, PENDING, Question, Refusal};
 use super::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 

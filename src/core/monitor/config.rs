@@ -6,15 +6,15 @@ use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
 use crate::alarm::RuleConfig;
 use crate::can::CanId;
 use crate::can::decode::{Binding, InputMap};
-use crate::can::diagnostic::{self, Answer};
 use crate::can::encode::LayoutMessage;
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::can::j1939::Node;
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
+use crate::can::uds::{self, Answer};
 use crate::cell::{CellModel, CellModule, EstimatorConfig, Label};
-use crate::findings::BalancingConfig;
+use crate::cell_faults::BalancingConfig;
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::{BusIndex, CellIndex};
 use crate::sample::SampleConfig;
@@ -134,7 +134,7 @@ impl MonitorConfig {
     /// Identifiers that are decoded on an interface, ascending.
     pub fn listened_ids(&self, bus: BusIndex) -> Vec<CanId> {
         let mut ids = self.input.ids(bus);
-        ids.extend(diagnostic::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
+        ids.extend(uds::wanted(&self.answers).into_iter().filter(|(other, _)| *other == bus).map(|(_, id)| id));
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
         ids.sort_unstable();
         ids.dedup();

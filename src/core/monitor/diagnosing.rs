@@ -10,10 +10,10 @@ use super::publisher::learned;
 use super::stages::Stages;
 use super::{Event, EventKind, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
+use crate::cell_faults::finding::OFFSET_PER_H;
+use crate::cell_faults::gain::Learned;
+use crate::cell_faults::{BalancingConfig, Diagnosis, FindingKind, MeanCell};
 use crate::filter::ScalarGaussian;
-use crate::findings::finding::OFFSET_PER_H;
-use crate::findings::gain::Learned;
-use crate::findings::{BalancingConfig, Diagnosis, FindingKind, MeanCell};
 use crate::quantity::{CellIndex, Fault, Timestamp};
 use crate::sample::CellSample;
 

@@ -6,7 +6,6 @@ use super::input::{BusEvent, Command, Source};
 use super::modelling::ModelState;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::decode::Channel;
-use crate::can::diagnostic::MessageLoss;
 use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
@@ -14,8 +13,9 @@ use crate::can::j1939::NodeEvent;
 use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
+use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
-use crate::findings::Finding;
+use crate::cell_faults::Finding;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.

@@ -11,13 +11,13 @@ use super::command_gate::CommandGate;
 use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
-use crate::can::diagnostic::{self, Controller, ControllerCounts, LinkProgress, Listener};
 use crate::can::e2e::Status;
 use crate::can::encode::{self, CommandFields, CommandPlan, CommandRefusal};
 use crate::can::flood::{FloodCount, FloodGate, FloodProgress};
 use crate::can::guard::{GuardCounts, GuardProgress, Guards};
 use crate::can::own_frames::{OwnFrames, OwnFramesState};
 use crate::can::rate::{MessageRate, SecondSenders};
+use crate::can::uds::{self, Controller, ControllerCounts, LinkProgress, Listener};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault, Timestamp};
 use crate::sample::Moment;
@@ -115,7 +115,7 @@ pub struct ControllerCount {
 impl Intake {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         let commands = config.commands.iter().map(|commands| (commands.bus, commands.plan.id(), 1));
-        let answers = diagnostic::wanted(&config.answers).into_iter().map(|(bus, id)| (bus, id, 1));
+        let answers = uds::wanted(&config.answers).into_iter().map(|(bus, id)| (bus, id, 1));
         let listener = Listener::new(&config.answers);
         Self {
             gate: FloodGate::new(&config.flood, config.input.messages().chain(commands).chain(answers)),

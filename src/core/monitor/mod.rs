@@ -54,10 +54,10 @@ use stages::Stages;
 
 use crate::alarm::CommandOutcome;
 use crate::can::Frame;
-use crate::can::diagnostic::Heard;
 use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::can::secoc::MacCheck;
+use crate::can::uds::Heard;
 use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp, bounds};
 

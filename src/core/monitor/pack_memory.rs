@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::learning::LearningState;
 use super::modelling::ModellingState;
 use super::snapshot::StoredCell;
-use crate::findings::Diagnosis;
+use crate::cell_faults::Diagnosis;
 use crate::quantity::InvalidState;
 
 /// Packs kept beside the connected one: more than a vehicle exchanges in turn.

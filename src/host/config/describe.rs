@@ -157,7 +157,7 @@ pub(super) fn describe(
         intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
-        polling: super::diagnostic::poll_words(config),
+        polling: super::uds::poll_words(config),
         j1939: super::j1939::words(config),
     }
 }

@@ -45,7 +45,6 @@ mod commands;
 mod convert;
 mod cross;
 mod describe;
-mod diagnostic;
 mod document;
 mod input_tables;
 mod j1939;
@@ -66,11 +65,11 @@ mod setting;
 mod source;
 mod tables;
 mod threshold;
+mod uds;
 mod vehicle;
 
 use cell_model::{ModelSource, SourcedModel};
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
-pub(crate) use diagnostic::answers;
 pub(crate) use document::TablePlace;
 use document::{Document, Faults};
 pub(crate) use keys::SignalSource;
@@ -84,6 +83,7 @@ pub(crate) use resolve::{Databases, NamedSignal, ResolvedSignal, channel_words, 
 pub use source::ConfigFiles;
 use source::Sources;
 pub(crate) use tables::RawTables;
+pub(crate) use uds::answers;
 pub use vehicle::VehicleIdentity;
 
 /// A configuration that cannot be wrong.
@@ -266,7 +266,7 @@ fn read_config(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> 
     let laid_out = output::output(checks, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
     guards.extend(guard.flatten());
-    let poll = diagnostic::poll(&raw, &found, checks.faults);
+    let poll = uds::poll(&raw, &found, checks.faults);
     let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());

@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::convert::{DbcRanges, UNLIMITED};
-use super::diagnostic::{self, AnswerDefinition, AnswerPlace};
 use super::document::{Faults, TablePlace};
 use super::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
 use super::pattern::Pattern;
 use super::schema::did_you_mean;
 use super::tables::RawTables;
+use super::uds::{self, AnswerDefinition, AnswerPlace};
 use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, Message, Signal};
@@ -97,7 +97,7 @@ impl Databases {
             files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
         }
         let files = files.into_iter().collect::<Option<Vec<_>>>()?;
-        let answers = diagnostic::definitions(raw, faults);
+        let answers = uds::definitions(raw, faults);
         let are_all_usable = answers.len() == raw.count::<DiagnosticInput>();
         (are_all_usable && !(files.is_empty() && answers.is_empty())).then_some(Self { files, answers })
     }

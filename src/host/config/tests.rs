@@ -10,7 +10,6 @@ use proptest::prelude::*;
 mod alarms;
 mod balancing;
 mod cell_model;
-mod diagnostic;
 mod drop_ins;
 mod faults;
 mod j1939;
@@ -18,6 +17,7 @@ mod label;
 mod modules;
 mod plausible;
 mod protect;
+mod uds;
 
 use super::*;
 use crate::can::dbc::FrameFormat;

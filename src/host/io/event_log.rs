@@ -8,16 +8,16 @@ pub use words::command as command_words;
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
-use crate::can::diagnostic::MessageLoss;
 use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
+use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
+use crate::cell_faults::Finding;
 use crate::config::VehicleIdentity;
-use crate::findings::Finding;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -348,8 +348,8 @@ fn log_learned(kind: &EventKind) {
 mod tests {
     use super::*;
     use crate::alarm::{AlarmState, Change, Rule, Severity};
+    use crate::cell_faults::FindingKind;
     use crate::filter::ScalarGaussian;
-    use crate::findings::FindingKind;
     use crate::quantity::Mode;
 
     #[test]

@@ -14,12 +14,12 @@ use sha2::{Digest, Sha256};
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Rule, Severity};
-use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::can::uds::ControllerCounts;
 use crate::cell::Chemistry;
+use crate::cell_faults::Finding;
 use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
-use crate::findings::Finding;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{BusStatistics, ModelState, Statistics, Validity};
 use crate::quantity::{Mode, Timestamp};

@@ -19,7 +19,7 @@ use prometheus_client::registry::{Registry, Unit};
 
 use super::document::{CellStatus, PackStatus, StatusDocument};
 use crate::alarm::Severity;
-use crate::can::diagnostic::ControllerCounts;
+use crate::can::uds::ControllerCounts;
 use crate::io::socket::LinkState;
 use crate::monitor::Validity;
 use crate::quantity::Mode;

@@ -1,9 +1,9 @@
 //! Title, configuration, reference and provenance of a page.
 
 use super::reference::Reference;
+use crate::cell_faults::{Diagnosis, Imbalance, UnknownImbalance};
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
-use crate::findings::{Diagnosis, Imbalance, UnknownImbalance};
 use crate::quantity::CellIndex;
 
 /// Content of a page in addition to the data.

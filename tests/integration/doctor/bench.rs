@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex};
 
 use assert_cmd::Command;
-use packwatch::diagnosis::{self, Interrupt};
-use packwatch::doctor::{Doctor, Report};
 use packwatch::io::csv_log::CsvOptions;
+use packwatch::wiring::{Doctor, Report};
+use packwatch::wiring_check::{self, Interrupt};
 
 /// A kind of healthy pack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -232,17 +232,18 @@ impl Broken {
     /// One that has heard nothing yet.
     pub(crate) fn doctor(&self) -> Doctor {
         let folder = tempfile::tempdir().unwrap();
-        Doctor::new(diagnosis::survey(&self.write(folder.path())).unwrap().plan)
+        Doctor::new(wiring_check::survey(&self.write(folder.path())).unwrap().plan)
     }
 
     /// What the doctor says.
     pub(crate) fn report(&self) -> Report {
         let folder = tempfile::tempdir().unwrap();
         let path = self.write(folder.path());
-        let survey = diagnosis::survey(&path).unwrap();
+        let survey = wiring_check::survey(&path).unwrap();
         let logs = [folder.path().join("pack.log")];
         let (report, _) =
-            diagnosis::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {}).unwrap();
+            wiring_check::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {})
+                .unwrap();
         report
     }
 }

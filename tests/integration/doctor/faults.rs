@@ -1,6 +1,6 @@
 //! The faults, one a row.
 
-use packwatch::doctor::Topic;
+use packwatch::wiring::Topic;
 
 use super::bench::Bench::{self, Charge, Day, Pack12, Pack96, Protected, Pulses, Steady, Total, Walk};
 use super::bench::Broken;

@@ -1,6 +1,6 @@
 //! Faults that were once called healthy, in rows of the same form.
 
-use packwatch::doctor::Topic;
+use packwatch::wiring::Topic;
 
 use super::bench::Bench::{Pack12, Pack96, Pulses, Steady, Total, Walk};
 use super::bench::Broken;

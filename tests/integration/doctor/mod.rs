@@ -12,7 +12,7 @@ mod missed;
 use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
 use missed::MISSED;
-use packwatch::doctor::{Report, Severity, Topic};
+use packwatch::wiring::{Report, Severity, Topic};
 
 /// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
 fn first_seed() -> u64 {

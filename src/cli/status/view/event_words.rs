@@ -3,7 +3,7 @@
 
 use serde_json::{Map, Value};
 
-use crate::findings::Finding;
+use crate::cell_faults::Finding;
 use crate::status::document::StatusDocument;
 
 /// Units at the end of a key.

@@ -14,9 +14,9 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use crate::can::decode::{Binding, Channel, InputMap};
-use crate::can::diagnostic::{Answer, AnswerSignal, Controller, Question};
 use crate::can::isotp::segment;
 use crate::can::signal::{SignalPlan, ValueType};
+use crate::can::uds::{Answer, AnswerSignal, Controller, Question};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
 

@@ -5,7 +5,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::can::diagnostic::Service;
+use crate::can::uds::Service;
 
 const BUS: BusIndex = BusIndex(0);
 const REQUEST: CanId = CanId::Standard(0x7E4);

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::can::encode::InputEncoder;
-use crate::findings::BalancingConfig;
+use crate::cell_faults::BalancingConfig;
 
 const BITS: &str = "BO_ 1300 Bleeding: 1 A\n SG_ Bleed1 : 0|1@1+ (1,0) [0|1] \"\" A\n SG_ Bleed2 : 1|1@1+ (1,0) [0|1] \"\" A\n \
                     SG_ Bleed3 : 2|1@1+ (1,0) [0|1] \"\" A\n SG_ Bleed4 : 3|1@1+ (1,0) [0|1] \"\" A\n";

@@ -1,12 +1,12 @@
 //! A sample document for tests: every value is present, except a few that are unknown.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
-use crate::can::diagnostic::ControllerCounts;
 use crate::can::poll::PollSilence;
+use crate::can::uds::ControllerCounts;
+use crate::cell_faults::{Finding, FindingKind};
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::filter::ScalarGaussian;
-use crate::findings::{Finding, FindingKind};
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, ModelState, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};

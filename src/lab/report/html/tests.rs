@@ -3,7 +3,7 @@
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
-use crate::findings::{Diagnosis, UnknownImbalance};
+use crate::cell_faults::{Diagnosis, UnknownImbalance};
 use crate::health::InsufficientData;
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Diagnosis, inner_half};
-use crate::findings::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
+use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
 /// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
@@ -121,7 +121,7 @@ impl Diagnosis {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::findings::difference::SOC;
+    use crate::cell_faults::difference::SOC;
 
     const BALANCING: BalancingConfig = BalancingConfig { bleed_a: 0.06, max_age_s: 10.0, is_only_while_sent: true };
     const HOUR: f64 = 3600.0;

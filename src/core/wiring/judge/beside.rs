@@ -3,9 +3,9 @@
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::words::number;
-use crate::doctor::plan::Kind;
-use crate::doctor::report::{Severity, Topic};
 use crate::quantity::Channel;
+use crate::wiring::plan::Kind;
+use crate::wiring::report::{Severity, Topic};
 
 /// Deviation of the sum of the cells that sensors explain.
 const SUM_TOLERANCE: f64 = 0.03;

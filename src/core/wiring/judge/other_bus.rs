@@ -2,12 +2,12 @@
 
 use super::context::{EXPLAINED, Judge, error, warning};
 use super::words::number;
-use crate::doctor::other_current::OtherCurrent;
-use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::Topic;
-use crate::doctor::response::Slope;
-use crate::doctor::series::Series;
 use crate::quantity::BusIndex;
+use crate::wiring::other_current::OtherCurrent;
+use crate::wiring::plan::{Kind, SignalPlan};
+use crate::wiring::report::Topic;
+use crate::wiring::response::Slope;
+use crate::wiring::series::Series;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };

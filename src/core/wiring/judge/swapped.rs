@@ -4,10 +4,10 @@ use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::unit::unit_of;
 use super::values::is_impossible;
 use super::words::{channel, number};
-use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::Topic;
-use crate::doctor::series::Series;
 use crate::quantity::Channel;
+use crate::wiring::plan::{Kind, SignalPlan};
+use crate::wiring::report::Topic;
+use crate::wiring::series::Series;
 
 /// Temperatures a pack in use may have, degrees C.
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);

@@ -2,9 +2,9 @@
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::words::{count, percent, seconds, toml};
-use crate::doctor::plan::Kind;
-use crate::doctor::report::{Severity, Topic};
-use crate::doctor::series::median;
+use crate::wiring::plan::Kind;
+use crate::wiring::report::{Severity, Topic};
+use crate::wiring::series::median;
 
 /// A period this many times the DBC's is a finding.
 const SLOWER: f64 = 2.0;

@@ -5,10 +5,10 @@ use super::words::{count, number, seconds};
 use crate::can::CanId;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::guard::GuardConfig;
-use crate::doctor::plan::MessagePlan;
-use crate::doctor::report::{Finding, Severity, Topic};
-use crate::doctor::watch::{BusStats, ProtectionStats};
 use crate::quantity::BusIndex;
+use crate::wiring::plan::MessagePlan;
+use crate::wiring::report::{Finding, Severity, Topic};
+use crate::wiring::watch::{BusStats, ProtectionStats};
 
 /// Error classes of linux/can/error.h.
 const CLASS_ACK: u32 = 0x20;

@@ -2,11 +2,11 @@
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::words::{channels, count, milli, number, ranges};
-use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::Topic;
-use crate::doctor::response::Slope;
-use crate::doctor::series::Series;
 use crate::quantity::Channel;
+use crate::wiring::plan::{Kind, SignalPlan};
+use crate::wiring::report::Topic;
+use crate::wiring::response::Slope;
+use crate::wiring::series::Series;
 
 /// Fewest readings to judge a signal by.
 const FEWEST_READINGS: u64 = 20;

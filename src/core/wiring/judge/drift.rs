@@ -2,7 +2,7 @@
 
 use super::context::Judge;
 use crate::cell::CellModel;
-use crate::doctor::response::SteadyRun;
+use crate::wiring::response::SteadyRun;
 
 /// A drift is trusted from this many standard deviations.
 const SURE: f64 = 6.0;

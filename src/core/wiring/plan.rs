@@ -2,9 +2,9 @@
 
 use crate::can::CanId;
 use crate::can::decode::Binding;
-use crate::can::diagnostic::Question;
 use crate::can::guard::GuardConfig;
 use crate::can::signal::SignalLayout;
+use crate::can::uds::Question;
 use crate::cell::CellModel;
 use crate::quantity::{BusIndex, Channel};
 

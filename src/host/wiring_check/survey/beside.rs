@@ -7,8 +7,8 @@ use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::config::{Databases, NamedSignal, RawTables, ResolvedSignal};
-use crate::doctor::SignalPlan;
 use crate::quantity::{BusIndex, Channel};
+use crate::wiring::SignalPlan;
 
 /// Most signals that are followed, on all interfaces together.
 const MAX_SIGNALS: usize = 64;

@@ -1,7 +1,7 @@
 //! Units of a DBC as the judgement needs them.
 
 use crate::can::unit::{Quantity, SignalUnit};
-use crate::doctor::plan::Kind;
+use crate::wiring::plan::Kind;
 
 /// Kind of quantity, factor and offset to the program's unit; `None` for any other unit.
 pub(super) fn unit_of(text: &str) -> Option<(Kind, f64, f64)> {

@@ -1,9 +1,9 @@
 //! Cells that have changed at once: exchanged, replaced with their neighbours, or each by itself.
 
 use super::{Diagnosis, Row, Watched};
+use crate::cell_faults::difference::{Jump, Observation, STATES};
+use crate::cell_faults::finding::{Finding, FindingKind};
 use crate::filter::ScalarGaussian;
-use crate::findings::difference::{Jump, Observation, STATES};
-use crate::findings::finding::{Finding, FindingKind};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// Rows of which the jumps of several cells are one event.

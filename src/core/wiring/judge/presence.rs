@@ -6,10 +6,10 @@ use super::context::{Judge, error, find};
 use super::values;
 use super::words::{channels, number, seconds};
 use crate::can::CanId;
-use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::{Severity, Topic};
-use crate::doctor::series::Series;
 use crate::quantity::{BusIndex, Channel};
+use crate::wiring::plan::{Kind, SignalPlan};
+use crate::wiring::report::{Severity, Topic};
+use crate::wiring::series::Series;
 
 /// Why there is no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

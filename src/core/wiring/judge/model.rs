@@ -4,9 +4,9 @@ use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
 use super::words::{milli, number, percent, seconds, toml};
 use crate::cell::CellModel;
-use crate::doctor::plan::Kind;
-use crate::doctor::report::Topic;
-use crate::doctor::series::Series;
+use crate::wiring::plan::Kind;
+use crate::wiring::report::Topic;
+use crate::wiring::series::Series;
 
 pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
     if let Some(model) = &judge.plan.pack.model {

@@ -13,7 +13,6 @@ use std::time::{Duration, Instant};
 use nix::errno::Errno;
 
 use crate::can::encode::{InputEncoder, InputProtector};
-use crate::doctor::{Doctor, Report};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
@@ -21,6 +20,7 @@ use crate::io::socket::Tap;
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::BusIndex;
+use crate::wiring::{Doctor, Report};
 
 pub use survey::{Survey, survey};
 

@@ -5,9 +5,9 @@ use super::drift::Drift;
 use super::unit::unit_of;
 use super::words::{milli, number, percent, seconds, toml};
 use super::{frozen, model};
-use crate::doctor::plan::SignalPlan;
-use crate::doctor::report::{Finding, Severity, Topic};
-use crate::doctor::response::Slope;
+use crate::wiring::plan::SignalPlan;
+use crate::wiring::report::{Finding, Severity, Topic};
+use crate::wiring::response::Slope;
 
 /// Smallest step of the current that is judged, of the capacity.
 const SMALLEST_STEP: f64 = 0.02;

@@ -1,9 +1,9 @@
 //! What a row has shown of each cell, as findings: from when on one is reported, and when it is withdrawn.
 
 use super::Diagnosis;
+use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
+use crate::cell_faults::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
 use crate::filter::ScalarGaussian;
-use crate::findings::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
-use crate::findings::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// Time within which the cells of a module are found to have more capacity than the others.

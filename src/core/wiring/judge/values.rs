@@ -5,10 +5,10 @@ use super::electrical;
 use super::unit::unit_of;
 use super::words::{channels, number, percent, toml};
 use crate::can::signal::{ByteOrder, ValueType};
-use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::{Severity, Topic};
-use crate::doctor::series::{AlternativeReading, Extent, LAYOUT_FAULTS, Series};
 use crate::quantity::Channel;
+use crate::wiring::plan::{Kind, SignalPlan};
+use crate::wiring::report::{Severity, Topic};
+use crate::wiring::series::{AlternativeReading, Extent, LAYOUT_FAULTS, Series};
 
 /// Factors by which a unit may be wrong.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];

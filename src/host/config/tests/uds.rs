@@ -3,7 +3,7 @@
 #![allow(clippy::panic, reason = "in a test a panic is the message")]
 
 use super::*;
-use crate::can::diagnostic::{Answer, Service};
+use crate::can::uds::{Answer, Service};
 
 /// Cells in two answers, the current in a DBC.
 const ANSWERS: &str = r#"

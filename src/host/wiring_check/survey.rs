@@ -10,15 +10,15 @@ use std::path::Path;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
-use crate::can::diagnostic::Answer;
 use crate::can::encode::SentMessage;
+use crate::can::uds::Answer;
 use crate::cell::CellModel;
 use crate::config::{
     Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource,
     TablePlace, answers, input_map,
 };
-use crate::doctor::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
+use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
 /// Capacity where nothing states one, Ah: a car's cell.
 const USUAL_AH: f64 = 50.0;

@@ -10,13 +10,13 @@ use super::resolve::ResolvedSignal;
 use super::tables::RawTables;
 use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
-use crate::can::diagnostic::{Answer, AnswerSignal, Controller, Question, Service};
 use crate::can::isotp::MAX_MESSAGE;
 use crate::can::poll::{FOREIGN_SILENCE_NS, PollConfig, PollRequest};
 use crate::can::signal::{ByteOrder, LayoutFault, SignalLayout, ValueType};
-use crate::doctor::AnswerSource;
+use crate::can::uds::{Answer, AnswerSignal, Controller, Question, Service};
 use crate::monitor::SupplyConfig;
 use crate::quantity::{BusIndex, Channel};
+use crate::wiring::AnswerSource;
 
 /// One answer as it is configured.
 #[derive(Debug)]

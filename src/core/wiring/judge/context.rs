@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 
 use crate::can::CanId;
 use crate::cell::CellModel;
-use crate::doctor::plan::{Kind, Plan, SignalPlan};
-use crate::doctor::report::{Finding, Report, Severity, Topic};
-use crate::doctor::series::{Series, median};
-use crate::doctor::watch::{BusStats, Doctor};
 use crate::quantity::BusIndex;
+use crate::wiring::plan::{Kind, Plan, SignalPlan};
+use crate::wiring::report::{Finding, Report, Severity, Topic};
+use crate::wiring::series::{Series, median};
+use crate::wiring::watch::{BusStats, Doctor};
 
 /// A pack's current stays below this many times its capacity.
 pub(super) const MAX_C_RATE: f64 = 30.0;
