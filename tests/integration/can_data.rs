@@ -2,22 +2,13 @@
 //! buses use one identifier for different messages.
 
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use crate::support::measured;
 use packwatch::can::dbc::Database;
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::{CanId, Frame};
 use packwatch::quantity::{BusIndex, Channel};
-
-fn folder() -> Option<PathBuf> {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let folder = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from).join("can_ev");
-    if !folder.is_dir() {
-        eprintln!("SKIPPED: {} is not there (set PACKWATCH_DATA)", folder.display());
-        return None;
-    }
-    Some(folder)
-}
 
 /// Frames of the log with the interface's number. Its lines are `(time) canN ID#DATA`, nothing else.
 fn frames(folder: &Path) -> Vec<(BusIndex, Frame)> {
@@ -76,8 +67,9 @@ fn near(found: f64, wanted: f64) -> bool {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn a_kona_s_pack_voltage_and_current_are_read_from_its_powertrain_bus_alone() {
-    let Some(folder) = folder() else { return };
+    let folder = measured::path("can_ev");
     let frames = frames(&folder);
     assert_eq!(frames.len(), 39_546);
     let of_id = |bus| frames.iter().filter(|(on, frame)| on.0 == bus && frame.id() == CanId::Standard(0x595)).count();
@@ -93,9 +85,10 @@ fn a_kona_s_pack_voltage_and_current_are_read_from_its_powertrain_bus_alone() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_same_identifier_on_the_other_bus_would_read_as_hundreds_of_amperes() {
     // Why the interface belongs to a binding: this is what a decoder keyed by the identifier alone would add.
-    let Some(folder) = folder() else { return };
+    let folder = measured::path("can_ev");
     let (currents, _) = read(&pack(&folder, 1), &frames(&folder));
     assert_eq!(currents.len(), 108);
     assert!(near(ends(&currents).1, 355.1));

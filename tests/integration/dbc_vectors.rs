@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use crate::support::measured;
 use crate::support::oracle::{ask, hex, python, values};
 use packwatch::alarm::Rule;
 use packwatch::can::dbc::{Database, Message, MuxCondition};
@@ -132,13 +133,9 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn every_signal_of_the_tesla_dbc_decodes_as_cantools_does() {
-    let data = std::env::var_os("PACKWATCH_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
-    let path = data.join("can_ev/tesla_model3.dbc");
-    if !path.is_file() {
-        eprintln!("SKIPPED: {} is not there", path.display());
-        return;
-    }
+    let path = measured::path("can_ev/tesla_model3.dbc");
     let Some(python) = python() else { return };
     let tally = compare(&python, &path, false);
     let past: BTreeSet<String> = ask(&python, &path, &["short"], &[]).into_iter().collect();

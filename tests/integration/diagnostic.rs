@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use crate::support::measured;
 use assert_cmd::Command;
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::isotp::segment;
@@ -77,12 +78,9 @@ fn every_cell_of_a_leaf_is_estimated_from_its_answers() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_leafs_log_gives_what_its_answers_say() {
-    let Some(data) = std::env::var_os("PACKWATCH_DATA") else {
-        eprintln!("SKIPPED: PACKWATCH_DATA names no folder, the Leaf's log was not read");
-        return;
-    };
-    let log = Path::new(&data).join("can_ev/leaf2019_uds_poll.log.gz");
+    let log = measured::path("can_ev/leaf2019_uds_poll.log.gz");
     let folder = tempfile::tempdir().unwrap();
     // The logger asked for groups 1 and 4 only: no cell is in this log.
     let pack = LEAF.replace(

@@ -9,19 +9,10 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
 use crate::import_obdb::{self, Case};
+use crate::support::measured;
 
 /// Share of the expected signals that must be among the first three.
 const BAR: f64 = 0.8;
-
-fn can_ev() -> Option<PathBuf> {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let folder = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from).join("can_ev");
-    if !folder.is_dir() {
-        eprintln!("SKIPPED: {} is not there (set PACKWATCH_DATA)", folder.display());
-        return None;
-    }
-    Some(folder)
-}
 
 fn config(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name)
@@ -173,8 +164,9 @@ const KONA_ANSWERS: &[(&str, &str)] = &[
 ];
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn signals_of_three_cars_are_among_the_first_three_candidates() {
-    let Some(data) = can_ev() else { return };
+    let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let (kona, tesla) = (data.join("kona_pcan.dbc"), data.join("tesla_model3.dbc"));
     let simulated = |name: &str, dbc: &Path, inputs: &str, cells: u32| {
@@ -214,7 +206,8 @@ fn signals_of_three_cars_are_among_the_first_three_candidates() {
         let log = trials[index].log.clone();
         trials.push(Trial { name: "the same without a DBC", log, options: Vec::new(), expected });
     }
-    if let Some(obd) = import_obdb::folder() {
+    {
+        let obd = import_obdb::folder();
         let log = folder.path().join("answers.log");
         log_of_cases(&obd, "hyundai_kona", "2021", &["0101", "0102", "0103", "0104", "0105"], &log);
         let options = vec!["--obdb".to_owned(), obd.join("hyundai_kona/signalset.json").display().to_string()];
@@ -227,8 +220,9 @@ fn signals_of_three_cars_are_among_the_first_three_candidates() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn a_written_configuration_is_accepted_and_estimates_the_log() {
-    let Some(data) = can_ev() else { return };
+    let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let tesla = data.join("tesla_model3.dbc");
     let log = simulate(folder.path(), "cells", &tesla, &format!("{TESLA_CURRENT}{TESLA_CELLS}"), 96);
@@ -245,8 +239,9 @@ fn a_written_configuration_is_accepted_and_estimates_the_log() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn fields_without_a_dbc_are_written_with_one() {
-    let Some(data) = can_ev() else { return };
+    let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let tesla = data.join("tesla_model3.dbc");
     let log = simulate(folder.path(), "cells", &tesla, &format!("{TESLA_CURRENT}{TESLA_CELLS}"), 96);
@@ -261,8 +256,9 @@ fn fields_without_a_dbc_are_written_with_one() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn what_the_log_does_not_show_is_a_question_and_nothing_is_written() {
-    let Some(data) = can_ev() else { return };
+    let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let (pack, model) = (folder.path().join("pack.toml"), config("cells/example_nmc_2600.toml"));
     let (pack, model) = (pack.to_str().unwrap(), model.to_str().unwrap());

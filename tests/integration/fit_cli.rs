@@ -87,8 +87,9 @@ fn unusable_data_are_refused_with_the_reason() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_papers_pulse_test_is_met_within_ten_millivolts() {
-    let Some(file) = measured::file("nasa_randomized/RW9_pulsed_discharge_1hz.csv.gz") else { return };
+    let file = measured::path("nasa_randomized/RW9_pulsed_discharge_1hz.csv.gz");
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("rw9.toml");
     let output = packwatch().args(["fit", "--json", "--name", "RW9", "-o"]).arg(&model).arg(file).output().unwrap();
@@ -100,8 +101,9 @@ fn the_papers_pulse_test_is_met_within_ten_millivolts() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn an_ageing_cells_first_cycles_give_a_model_of_discharge_and_charge() {
-    let Some(file) = measured::file("nasa_pcoe_aging/B0005.csv.gz") else { return };
+    let file = measured::path("nasa_pcoe_aging/B0005.csv.gz");
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("b0005.toml");
     let limits = ["--voltage-min", "2.7", "--voltage-max", "4.2", "--first-cycles", "10"];

@@ -2,20 +2,10 @@
 //! constant basis, standardised inputs; one fold of five held out. (The paper: RMSE 0.1058 V over five folds.)
 
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use crate::support::measured;
 use packwatch::regress::{Form, GprSettings, Model, TrainingRows, assign, fit, score};
-
-/// The rows, or `None` where they are not.
-fn file() -> Option<PathBuf> {
-    let root = crate::support::measured::root();
-    let file = root.join("nasa_randomized/RW9_random_walk_sampled_0p4pct.csv.gz");
-    if !file.is_file() {
-        println!("SKIPPED: no measured data in {}", root.display());
-        return None;
-    }
-    Some(file)
-}
 
 /// Inputs (time, temperature, current), row after row, and voltages.
 fn rows(file: &Path) -> (Vec<f64>, Vec<f64>) {
@@ -34,8 +24,9 @@ fn rows(file: &Path) -> (Vec<f64>, Vec<f64>) {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_exponential_kernel_beats_the_papers_error_and_its_intervals_hold_what_they_say() {
-    let Some(file) = file() else { return };
+    let file = measured::path("nasa_randomized/RW9_random_walk_sampled_0p4pct.csv.gz");
     let (inputs, targets) = rows(&file);
     assert_eq!(targets.len(), 30_723);
     let fold = assign(targets.len(), 5, 1);

@@ -8,22 +8,17 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use crate::support::measured;
 use packwatch::can::CanId;
 use packwatch::can::isotp::{Progress, Receiver};
 use packwatch::can::uds::Answer;
 use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 
-pub(crate) fn folder() -> Option<PathBuf> {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let data = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from);
-    // Beside the folder of data, or in it.
-    let places = [data.join("obd"), data.join("../more-data/obd")];
-    let found = places.iter().find(|place| place.is_dir()).cloned();
-    if found.is_none() {
-        eprintln!("SKIPPED: {} is not there (set PACKWATCH_DATA)", places[0].display());
-    }
-    found
+/// The signal sets, in the folder of data or in the one next to it.
+pub(crate) fn folder() -> PathBuf {
+    let inside = measured::path("obd");
+    if inside.is_dir() { inside } else { measured::path("../more-data/obd") }
 }
 
 fn import(args: &[&str]) -> String {
@@ -256,8 +251,9 @@ fn compare_car(folder: &Path, car: &str, prefix: &str) -> Comparison {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn every_expected_value_of_three_cars_is_read_through_the_imported_file() {
-    let Some(folder) = folder() else { return };
+    let folder = folder();
     for (car, prefix) in [("hyundai_kona", "KONAEV"), ("hyundai_ioniq5", "IONIQ5"), ("nissan_leaf", "LEAF")] {
         let comparison = compare_car(&folder, car, prefix);
         assert!(comparison.equal > 50, "{car}: {}", comparison.equal);
@@ -271,8 +267,9 @@ fn every_expected_value_of_three_cars_is_read_through_the_imported_file() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_cells_of_a_kona_are_one_pattern_over_five_answers() {
-    let Some(folder) = folder() else { return };
+    let folder = folder();
     let text = import(&[folder.join("hyundai_kona/signalset.json").to_str().unwrap(), "--name", "Kona"]);
     assert!(text.contains("CC BY-SA 4.0") && text.contains("OBDb"));
     let cells: Vec<&str> = text.lines().filter(|line| line.contains("name = \"HVBAT_CMU{n}_VOLT\"")).collect();

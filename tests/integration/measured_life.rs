@@ -7,20 +7,9 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::support::measured;
 use crate::support::window::{By, windowed};
 use serde_json::Value;
-
-/// The measured data, or `None` where it is not.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
-fn data() -> Option<PathBuf> {
-    let root = crate::support::measured::root();
-    let folder = root.join("nasa_pcoe_aging");
-    if folder.join("B0005.csv.gz").is_file() {
-        return Some(folder);
-    }
-    println!("SKIPPED: no measured data in {}", root.display());
-    None
-}
 
 /// One discharge of the table: when it started (s) and its published capacity (Ah).
 struct Discharge {
@@ -123,8 +112,9 @@ fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn the_alarm_comes_at_the_end_of_life_and_not_before() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let lower = "\n[[alarm]]\nrule = \"usable_capacity_low\"\ninfo = 1.2\n";
     let config = configuration(folder.path(), "B0005", &[], lower);
@@ -165,8 +155,9 @@ fn score(events: &[Value], discharges: &[Discharge]) -> Score {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_follows_the_published_one_from_a_start_twenty_percent_wrong() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     for (cell, new_ah, end_of_life) in [("B0005", 1.9216, 125), ("B0006", 2.1059, 109)] {
         let discharges = discharges(&data, cell);
@@ -194,8 +185,9 @@ fn usable_capacity_follows_the_published_one_from_a_start_twenty_percent_wrong()
 const RUNS: [(u64, By); 4] = [(1, By::Duration), (2, By::Duration), (3, By::Charge), (4, By::Charge)];
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_is_learned_from_windows_of_the_swings() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let rows = folder.path().join("windows.csv");
     for cell in ["B0005", "B0006"] {
@@ -225,8 +217,9 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn one_log_twice_is_the_same_bytes() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let config = configuration(folder.path(), "B0005", &[], "");
     let kinds = ["estimates", "events", "frames"];

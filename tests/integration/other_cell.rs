@@ -2,21 +2,11 @@
 //!
 //! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah; each drives with the model of either.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
+use crate::support::measured;
 use serde_json::Value;
-
-/// The measured data, or `None` where it is not.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
-fn data() -> Option<PathBuf> {
-    let root = crate::support::measured::root();
-    if root.join("panasonic_18650pf/25C/HWFTa.csv.gz").is_file() && root.join("lg_18650hg2/25C").is_dir() {
-        return Some(root);
-    }
-    println!("SKIPPED: no measured data in {}", root.display());
-    None
-}
 
 fn run(arguments: &[&str]) {
     let output = Command::new(env!("CARGO_BIN_EXE_packwatch")).args(arguments).output().unwrap();
@@ -51,8 +41,9 @@ fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn a_drive_with_the_model_of_another_cell_is_untrusted_within_half_an_hour_and_with_its_own_never() {
-    let Some(root) = data() else { return };
+    let root = measured::root();
     let folder = tempfile::tempdir().unwrap();
     let (panasonic, lg) = (root.join("panasonic_18650pf"), root.join("lg_18650hg2"));
     let models = ["panasonic.toml", "lg.toml"].map(|name| folder.path().join(name));

@@ -646,8 +646,9 @@ fn peers_find_no_fault_in_a_passport_and_one_in_a_broken_one() {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn a_measured_life_gives_valid_passports_from_a_replay_and_from_its_store() {
-    let Some(log) = crate::support::measured::file("nasa_pcoe_aging/B0005.csv.gz") else { return };
+    let log = crate::support::measured::path("nasa_pcoe_aging/B0005.csv.gz");
     let life = Life::configured("");
     let (config, log) = (shipped("config/measured.toml").display().to_string(), log.display().to_string());
     let starts = log.replace(".csv.gz", "_cycles.csv");

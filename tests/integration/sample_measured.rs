@@ -2,16 +2,10 @@
 //! refused, and each cycle's charge is the one the data set's own table gives.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use packwatch::quantity::{CellIndex, Channel, Reading, SensorIndex, Timestamp};
 use packwatch::sample::{CellSample, Limits, SampleConfig, Sampler, VoltageSource};
-
-fn data_folder() -> Option<PathBuf> {
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let folder = std::env::var_os("PACKWATCH_DATA").map_or(shared, PathBuf::from).join("nasa_pcoe_aging");
-    folder.is_dir().then_some(folder)
-}
 
 fn config() -> SampleConfig {
     let limits = |min, max| Limits { min, max, max_rate_per_s: None, stuck_after_s: None, max_age_s: 60.0 };
@@ -32,11 +26,9 @@ fn config() -> SampleConfig {
 }
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn a_measured_life_loses_only_its_glitches_and_no_charge() {
-    let Some(folder) = data_folder() else {
-        eprintln!("skipped: no measured data (set PACKWATCH_DATA)");
-        return;
-    };
+    let folder = crate::support::measured::path("nasa_pcoe_aging");
     let mut sampler = Sampler::new(config());
     let (mut changes, mut refused) = (Vec::new(), Vec::new());
     let mut charges_ah: BTreeMap<u32, (f64, f64)> = BTreeMap::new();

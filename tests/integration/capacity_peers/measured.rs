@@ -15,18 +15,8 @@ use serde_json::Value;
 use super::least_squares::{Method, Swing};
 use super::swings::{Ends, Reading, Weighed, charge_variance, weigh};
 use super::{PEERS, Score, Source, follow, score};
+use crate::support::measured;
 use crate::support::window::{By, windowed};
-
-/// The measured data, or `None` where it is not.
-fn data() -> Option<PathBuf> {
-    let root = crate::support::measured::root();
-    let folder = root.join("nasa_pcoe_aging");
-    if folder.join("B0005.csv.gz").is_file() {
-        return Some(folder);
-    }
-    println!("SKIPPED: no measured data in {}", root.display());
-    None
-}
 
 /// Start (s) and published capacity (Ah) of each discharge.
 fn discharges(folder: &Path, cell: &str) -> Vec<(f64, f64)> {
@@ -258,8 +248,9 @@ const NEAR_AH: f64 = 0.006;
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_of_whole_lives_is_no_worse_than_by_any_least_squares_on_their_swings() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     heading();
     for cell in ["B0005", "B0006"] {
@@ -281,8 +272,9 @@ const LEVEL: f64 = 1.1;
 
 /// The filter's swings are those at the same ends here: behind a gap, swing and charge of a `half_cycle` can disagree.
 #[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_from_windows_is_level_with_the_best_least_squares_on_them() {
-    let Some(data) = data() else { return };
+    let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let rows = folder.path().join("windows.csv");
     let (mut ours, mut peers) = (Vec::new(), Vec::new());

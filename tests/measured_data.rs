@@ -1,0 +1,17 @@
+//! Build script: sets `cfg(measured_data)` when measured data are present, so that the tests that need them are
+//! ignored (and counted as skipped) when they are not.
+//!
+//! The folder is the one that `PACKWATCH_DATA` names, or `../shared/data` next to the project.
+
+use std::path::{Path, PathBuf};
+
+fn main() {
+    let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let folder = std::env::var_os("PACKWATCH_DATA").map_or(default, PathBuf::from);
+    println!("cargo::rustc-check-cfg=cfg(measured_data)");
+    println!("cargo::rerun-if-env-changed=PACKWATCH_DATA");
+    println!("cargo::rerun-if-changed={}", folder.display());
+    if folder.is_dir() {
+        println!("cargo::rustc-cfg=measured_data");
+    }
+}
