@@ -28,7 +28,7 @@
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
 //! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`: the status for MQTT brokers and a KUKSA databroker; no part of the vehicle's program |
 //! | `src/python` | `python` | the Python module: the library as classes and functions; stubs and Python code in its folder `packwatch` |
-//! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
+//! | `src/cli` | [`cli`] | one file (and folder) per command, named like it, above `common`, which they share; `main.rs` only calls it |
 //!
 //! # The path of a frame
 //! `host/io/socket` receives it, `host/service/live.rs` passes it on, then [`monitor`]: `intake` (protection, flood) → `can/decode`
@@ -45,7 +45,7 @@
 //! | a new event | `core/monitor/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
 //! | which alarm is sent when, how often it is repeated | `core/monitor/alarm_queue.rs`; the promise to receivers: `/docs/src/ecu/contract.md` |
-//! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
+//! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/schema/keys/choices.rs` |
 //! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/command_gate.rs`; `host/io/can_key.rs` |
 //! | a second sender of a message; frames with our own identifiers; a frozen current | `core/can/rate.rs`; `core/can/own_frames.rs`; `core/sample/frozen.rs` |
 //! | what a number can be at most, at every door | `core/quantity/bounds.rs` |
@@ -59,9 +59,9 @@
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |
-//! | a configuration key | its table in `host/config/keys/` (`input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
-//! | how drop-ins are found and merged | `host/config/source.rs`, `host/config/document.rs` |
-//! | what identifies the vehicle | `host/config/vehicle.rs` |
+//! | a configuration key | its table in `host/config/schema/keys/` (`pack`, `input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
+//! | how drop-ins are found and merged | `host/config/document/source.rs`, `host/config/document/merge.rs` |
+//! | what identifies the vehicle | `host/config/result/vehicle.rs` |
 //! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | an entity of MQTT; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
@@ -80,7 +80,7 @@
 //! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
 //! | a finding of the doctor | `core/wiring/judge` |
 //! | how well a cell model is known, what measurement is advised | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
-//! | what a cell model file holds | `host/config/cell_model.rs` (read), `host/config/cell_model/write.rs` (written) |
+//! | what a cell model file holds | `host/config/cell_model/keys.rs`, `read.rs` (read), `host/config/cell_model/write.rs` (written) |
 //! | a picture of a cell model | `lab/model_pictures.rs` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
 //! | a value of a battery passport, its place in a standard; what a standard requires | `lab/passport/field.rs`, `lab/passport/condition.rs`; `lab/passport/standards.rs` |

@@ -2,14 +2,13 @@
 
 use std::fmt::Write as _;
 
-use super::alarm_groups::{AlarmGroup, grouped};
-use super::control_args::ControlArgs;
-use super::output::{print, word};
-use super::{Failure, output};
-use crate::alarm::{Rule, Unit};
+use super::common::alarms::{AlarmGroup, grouped, with_unit};
+use super::common::control::ControlArgs;
+use super::common::output;
+use super::common::output::{print, word};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
-use crate::quantity::CellIndex;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `alarms`.
 #[derive(Debug, clap::Args)]
@@ -93,28 +92,13 @@ fn row(group: &AlarmGroup) -> Vec<String> {
     ]
 }
 
-/// A cell's number, from 1, or `pack`.
-pub(super) fn cell(cell: Option<CellIndex>) -> String {
-    cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
-}
-
-/// A value of a rule with its unit; fractions as percent.
-pub(super) fn with_unit(rule: Rule, value: f64) -> String {
-    let unit = rule.spec().unit;
-    match unit {
-        Unit::Fraction => format!("{:.1} %", 100.0 * value),
-        Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
-        Unit::Ratio => format!("{value:.2}"),
-        Unit::AmpereHours => format!("{value:.3} {}", unit.symbol()),
-        Unit::Seconds | Unit::Celsius | Unit::Cycles => format!("{value:.1} {}", unit.symbol()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::alarm::Rule;
     use crate::alarm::{Alarm, AlarmState, Severity};
     use crate::control::protocol::UnknownAlarms;
+    use crate::quantity::CellIndex;
     use crate::quantity::Timestamp;
 
     fn alarm() -> Alarm {

@@ -6,11 +6,11 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 
-use super::Failure;
-use super::output::{self, print, print_json, unless_closed};
+use super::common::output::{self, print, print_json, unless_closed};
 use crate::cell::{Chemistry, Label, ModelBands, advise};
 use crate::config::cell_model::SourcedModel;
 use crate::config::cell_model::library::{self, LibraryEntry};
+use packwatch_host::failure::Failure;
 
 /// Capacity of the cell for which the error of a chemistry is stated, Ah: it does not depend on it.
 const ANY_AH: f64 = 1.0;

@@ -5,9 +5,10 @@
 
 use std::path::PathBuf;
 
-use super::output::{print, print_json, unless_closed};
-use super::{Failure, output};
+use super::common::output;
+use super::common::output::{print, print_json, unless_closed};
 use crate::config::{Description, OutputUse, SignalUse};
+use packwatch_host::failure::Failure;
 
 /// Arguments of `check`.
 #[derive(Debug, clap::Args)]

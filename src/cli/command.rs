@@ -4,15 +4,15 @@
 
 use std::fmt::Write as _;
 
-use super::Failure;
-use super::alarms::{cell, with_unit};
-use super::control_args::{ControlArgs, SelectorArgs};
-use super::output::print;
+use super::common::alarms::{cell, with_unit};
+use super::common::control::{ControlArgs, SelectorArgs, check_stored, replace_pack};
+use super::common::output::print;
 use crate::alarm::Alarm;
 use crate::control::answer::refusal;
 use crate::control::client::ControlClient;
 use crate::control::protocol::{CommandOutcome, Request};
 use crate::monitor::Command;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `acknowledge` and `clear`.
 #[derive(Debug, clap::Args)]
@@ -78,34 +78,6 @@ pub(crate) fn clear(args: &AlarmArgs) -> Result<(), Failure> {
 /// Runs `pack-replaced`.
 pub(crate) fn pack_replaced(args: &ReplacedArgs) -> Result<(), Failure> {
     replace_pack(args.yes, &args.control.client())
-}
-
-/// Informs the running daemon that another pack is connected.
-pub(super) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Failure> {
-    if !yes {
-        return Err(Failure::new(
-            "another pack is connected? then add --yes: the daemon forgets the capacity, the resistance and the other \
-             values it has learned, and the alarms about them, and starts again from the configuration; it writes the \
-             last values of the old pack to its log and events",
-        ));
-    }
-    let done: CommandOutcome = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
-    print(&format!(
-        "the learned values of the old pack are forgotten; alarms about it that ended: {}\n",
-        done.changed
-    ))?;
-    check_stored(&done)
-}
-
-/// A failure when what the command has changed is not on the disk.
-fn check_stored(done: &CommandOutcome) -> Result<(), Failure> {
-    if done.is_stored != Some(false) {
-        return Ok(());
-    }
-    Err(Failure::new(
-        "done, but not on the disk yet: a power cut now would undo it; the daemon stores it when the disk answers again \
-         (`packwatch status`)",
-    ))
 }
 
 fn send(client: &ControlClient, command: Command, word: &str) -> Result<(), Failure> {

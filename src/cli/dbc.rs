@@ -4,13 +4,12 @@
 //! value tables. An output file appears under its name only when it is complete. Exit code 78: the configuration is
 //! invalid, or it has no frames to send.
 
-use std::io::Write as _;
 use std::path::PathBuf;
 
-use super::output::unless_closed;
-use super::{EXIT_CONFIG, Failure};
+use super::common::output::unless_closed;
 use crate::config;
-use crate::io::result_file::ResultFile;
+use crate::io::result_file::write_file;
+use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 /// Arguments of `dbc`.
 #[derive(Debug, clap::Args)]
@@ -30,9 +29,5 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let message = format!("{}: nothing is sent, must have a table [output] that is enabled", args.config.display());
         return Err(Failure { message, code: EXIT_CONFIG });
     };
-    let written = ResultFile::create(&args.output).and_then(|mut file| {
-        file.write_all(&layout.to_dbc_bytes())?;
-        file.finish()
-    });
-    unless_closed(written)
+    unless_closed(write_file(&args.output, &layout.to_dbc_bytes()))
 }

@@ -10,8 +10,7 @@ mod table;
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::Failure;
-use super::output::word;
+use super::common::output::word;
 use crate::alarm::{Change, Rule};
 use crate::can::Frame;
 use crate::can::encode::InputEncoder;
@@ -22,6 +21,7 @@ use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use consumer::Consumer;
+use packwatch_host::failure::Failure;
 use table::Table;
 
 /// Files built into the binary, by the path the configuration calls them.

@@ -8,10 +8,10 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::Failure;
-use super::output::{self, create_folder, failure, print_json, table};
-use super::replay::{Bar, InputArgs, log_options};
-use super::report::cell_model;
+use super::common::cell_model::cell_model;
+use super::common::logs::{InputArgs, log_options};
+use super::common::output::{self, create_folder, failure, print_json, table};
+use super::common::progress::Bar;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
 use crate::cell_faults::{Diagnosis, Finding, FindingKind, UnknownImbalance};
 use crate::config::{self, Config};
@@ -24,6 +24,7 @@ use crate::quantity::CellIndex;
 use crate::replay::{self, ReplaySettings, Sinks};
 use crate::store::HistoryReader;
 use pack::PackPage;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `diagnose`.
 #[derive(Debug, clap::Args)]

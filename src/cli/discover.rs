@@ -8,10 +8,9 @@ use std::sync::atomic::Ordering;
 
 use serde_json::json;
 
-use super::Failure;
-use super::import::{database, named_from, read};
-use super::output::{failure, print, print_json, table, unless_closed};
-use super::replay::Bar;
+use super::common::files::{database, named_from, read};
+use super::common::output::{failure, print, print_json, table, unless_closed};
+use super::common::progress::Bar;
 use crate::config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource, Record};
@@ -19,6 +18,7 @@ use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection, Quantity};
 use crate::lab::import::obdb::ObdbSettings;
 use crate::replay::ReplayProgress;
+use packwatch_host::failure::Failure;
 
 /// Candidates shown of a quantity.
 const SHOWN: usize = 3;

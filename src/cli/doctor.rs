@@ -8,10 +8,11 @@ mod page;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::numbers::above_0_to;
-use super::output::{print_json, progress_bar, unless_closed};
-use super::replay::{Bar, CsvSign, column};
-use super::{EXIT_CONFIG, Failure};
+use super::common::logs::{CsvSign, column};
+use super::common::numbers::above_0_to;
+use super::common::output::{print_json, unless_closed};
+use super::common::progress::{Bar, progress_bar};
+use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 use crate::io::csv_log::CsvOptions;
 use crate::replay::ReplayProgress;

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::Failure;
-use super::logs::LogArgs;
-use super::numbers::{NamedValue, one_of, within};
-use super::output::{failure, print_json, unless_closed, write_table};
+use super::common::many_logs::LogArgs;
+use super::common::numbers::{NamedValue, one_of, within};
+use super::common::output::{failure, print_json, unless_closed, write_table};
 use crate::config::{self, Config};
 use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::{self, ExportResult, ExportSettings, TableFormat};
+use packwatch_host::failure::Failure;
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;

@@ -3,9 +3,9 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use super::Failure;
 use crate::status::standard_path;
 use crate::{exporter, logging};
+use packwatch_host::failure::Failure;
 
 /// Arguments of `exporter`.
 #[derive(Debug, clap::Args)]

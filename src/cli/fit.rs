@@ -7,15 +7,16 @@ mod report;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use super::Failure;
-use super::label::{LabelArgs, one_of_chemistries};
-use super::numbers::finite;
-use super::output::{failure, print, progress_bar, unless_closed};
-use super::replay::{InputArgs, log_options};
+use super::common::label::{LabelArgs, one_of_chemistries};
+use super::common::logs::{InputArgs, log_options};
+use super::common::numbers::finite;
+use super::common::output::{failure, print, unless_closed};
+use super::common::progress::progress_bar;
 use crate::config;
 use crate::lab;
 use crate::lab::fit::logs::LogRequest;
 use crate::lab::fit::{self, FitProgress, FitRequest, MAX_SOC_NODES};
+use packwatch_host::failure::Failure;
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]

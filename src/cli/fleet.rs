@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use indicatif::HumanBytes;
 use serde_json::json;
 
-use super::Failure;
-use super::logs;
-use super::numbers::within;
-use super::output::{check_distinct, failure, print, print_json, progress_bar, unless_closed};
-use super::replay::InputArgs;
+use super::common::logs::InputArgs;
+use super::common::many_logs;
+use super::common::numbers::within;
+use super::common::output::{check_distinct, failure, print, print_json, unless_closed};
+use super::common::progress::progress_bar;
 use crate::config::{self, Config};
 use crate::io::result_file::ResultFile;
 use crate::lab::error::LabError;
@@ -18,6 +18,7 @@ use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::merge::{MergeSummary, merge};
 use crate::lab::fleet::export::{ExportSettings, TableFormat};
 use crate::lab::fleet::vehicles::{self, Outcome, Shard, Vehicle, VehicleRecord};
+use packwatch_host::failure::Failure;
 
 /// Version of the JSON documents.
 const VERSION: u32 = 1;
@@ -143,7 +144,7 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
         None => Ok(usual.clone()),
         Some(path) => config::load(path).map_err(|faults| LabError::Data(faults.0.join("; "))),
     };
-    let open = |config: &Config, found: &[PathBuf]| logs::open(&args.input, config, found);
+    let open = |config: &Config, found: &[PathBuf]| many_logs::open(&args.input, config, found);
     let settings = ExportSettings {
         access: LogAccess { open: &open, sleep_gap_s: args.input.sleep_gap },
         format: TableFormat::Parquet,

@@ -3,12 +3,12 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::{CommandFactory, Subcommand, ValueEnum};
+use clap::{Subcommand, ValueEnum};
 use clap_complete::{generate, shells};
 use clap_mangen::Man;
 
-use super::output::print;
-use super::{Cli, Failure};
+use super::common::output::print;
+use packwatch_host::failure::Failure;
 
 /// Name of the manual page about configurations.
 const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
@@ -64,17 +64,16 @@ enum Shell {
     Fish,
 }
 
-/// Runs the command.
-pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+/// Runs the command; `all` is the whole command line.
+pub(crate) fn run(args: &Args, all: &clap::Command) -> Result<(), Failure> {
     match &args.what {
-        GenerateCommand::Man { folder } => write_all(folder, &manual_pages()),
-        GenerateCommand::Completions { shell } => print(&String::from_utf8_lossy(&completions(*shell))),
+        GenerateCommand::Man { folder } => write_all(folder, &manual_pages(all)),
+        GenerateCommand::Completions { shell } => print(&String::from_utf8_lossy(&completions(*shell, all))),
     }
 }
 
 /// The command line without hidden commands.
-fn visible() -> clap::Command {
-    let all = Cli::command();
+fn visible(all: &clap::Command) -> clap::Command {
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
     let mut command = clap::Command::new("packwatch").propagate_version(true).subcommands(shown);
     command = command.args(all.get_arguments().cloned());
@@ -87,8 +86,8 @@ fn visible() -> clap::Command {
 }
 
 /// File name and text of each page.
-fn manual_pages() -> Vec<(String, Vec<u8>)> {
-    let command = visible();
+fn manual_pages(all: &clap::Command) -> Vec<(String, Vec<u8>)> {
+    let command = visible(all);
     let mut pages = vec![(CONFIGURATION_PAGE.to_owned(), crate::config::manual().into_bytes())];
     add_pages(&command, &mut pages);
     pages
@@ -113,8 +112,8 @@ fn page(command: &clap::Command) -> (String, Vec<u8>) {
     (name, text)
 }
 
-fn completions(shell: Shell) -> Vec<u8> {
-    let (mut command, mut text) = (visible(), Vec::new());
+fn completions(shell: Shell, all: &clap::Command) -> Vec<u8> {
+    let (mut command, mut text) = (visible(all), Vec::new());
     match shell {
         Shell::Bash => generate(shells::Bash, &mut command, "packwatch", &mut text),
         Shell::Zsh => generate(shells::Zsh, &mut command, "packwatch", &mut text),
@@ -134,60 +133,4 @@ fn write_all(folder: &Path, pages: &[(String, Vec<u8>)]) -> Result<(), Failure> 
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Names of all shown commands, each followed by its subcommands: `history`, `history-verify`.
-    fn commands() -> Vec<String> {
-        fn add(of: &clap::Command, before: &str, names: &mut Vec<String>) {
-            for command in of.get_subcommands().filter(|command| !command.is_hide_set()) {
-                let name = format!("{before}{}", command.get_name());
-                names.push(name.clone());
-                add(command, &format!("{name}-"), names);
-            }
-        }
-        let mut names = Vec::new();
-        add(&Cli::command(), "", &mut names);
-        names
-    }
-
-    #[test]
-    fn every_command_has_a_page_and_hidden_ones_have_none() {
-        let names: Vec<String> = manual_pages().into_iter().map(|(name, _)| name).collect();
-        let mut wanted = vec!["packwatch.toml.5".to_owned(), "packwatch.1".to_owned()];
-        wanted.extend(commands().iter().map(|name| format!("packwatch-{name}.1")));
-        assert_eq!(names, wanted);
-        assert!(names.contains(&"packwatch-run.1".to_owned()) && !names.contains(&"packwatch-generate.1".to_owned()));
-    }
-
-    #[test]
-    fn pages_show_the_usage_of_a_command_and_name_the_others() {
-        let pages = manual_pages();
-        let text = |name: &str| {
-            let page = pages.iter().find(|(of, _)| of == name).map(|(_, text)| text.clone());
-            String::from_utf8(page.unwrap_or_default()).unwrap_or_default()
-        };
-        let run = text("packwatch-run.1");
-        assert!(run.contains("\\fBpackwatch run\\fR") && run.contains("\\-\\-config"), "{run}");
-        let whole = text("packwatch.1");
-        assert!(whole.contains("packwatch\\-alarms(1)") && !whole.contains("generate"), "{whole}");
-        // In the order of man-pages(7), and not of itself.
-        let files = whole.find(".SH FILES").unwrap_or(usize::MAX);
-        assert!(
-            whole.find(".SH SEE ALSO").is_some_and(|at| at > files) && !whole.contains(".BR packwatch (1)"),
-            "{whole}"
-        );
-        assert!(run.contains(".BR packwatch (1)"), "{run}");
-    }
-
-    #[test]
-    fn completions_know_every_command_and_nothing_hidden() {
-        for shell in Shell::value_variants().iter().copied() {
-            let text = String::from_utf8(completions(shell)).unwrap_or_default();
-            for name in Cli::command().get_subcommands().filter(|c| !c.is_hide_set()).map(clap::Command::get_name) {
-                assert!(text.contains(name), "{shell:?}: {name}");
-            }
-            assert!(!text.contains("generate "), "{shell:?}");
-        }
-    }
-}
+mod tests;

@@ -7,12 +7,12 @@ mod report;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use super::Failure;
-use super::numbers::whole;
-use super::output::{create_folder, failure, unless_closed};
+use super::common::numbers::whole;
+use super::common::output::{create_folder, failure, unless_closed};
 use crate::lab::gpr::{self, ColumnSelection, ColumnTable, PartColumn, TrainedModel};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs};
+use packwatch_host::failure::Failure;
 
 /// Arguments of `gpr`.
 #[derive(Debug, clap::Args)]

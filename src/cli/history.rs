@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 
-use super::Failure;
-use super::numbers::{NamedValue, one_of};
-use super::output::print;
+use super::common::numbers::{NamedValue, one_of};
+use super::common::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
 use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable, NotedHead};
+use packwatch_host::failure::Failure;
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;

@@ -3,20 +3,16 @@
 //! Standard error gets a count per reason of what was left out; the written file lists each with its place. Exit code 1:
 //! the file cannot be read, is of another kind, or nothing in it can be converted.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use super::Failure;
-use super::output::{failure, unless_closed};
-use crate::can::dbc::Database;
-use crate::io::result_file::{ResultFile, check_place};
+use super::common::files::{database, named_from, read};
+use super::common::output::{failure, unless_closed};
+use crate::io::result_file::{check_place, write_file};
 use crate::lab::import::ImportResult;
 use crate::lab::import::bpx::{self, BpxSettings};
 use crate::lab::import::dbc;
 use crate::lab::import::obdb::{self, ObdbSettings};
-
-/// Largest file read; the largest known signal set has 0.5 MB.
-const MAX_BYTES: u64 = 64 << 20;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `import`.
 #[derive(Debug, clap::Args)]
@@ -115,14 +111,7 @@ fn import_dbc(args: &DbcArgs) -> Result<(), Failure> {
         false => named_from(output, &args.file)?,
     };
     let text = dbc::import(&database(&args.file)?, &name).map_err(failure)?;
-    write(output, &text)
-}
-
-/// A DBC file, read.
-pub(super) fn database(file: &Path) -> Result<Database, Failure> {
-    let fault = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", file.display()));
-    let bytes = std::fs::read(file).map_err(|error| fault(&format!("cannot be read: {error}")))?;
-    Database::parse_bytes(&bytes).map_err(|error| fault(&error))
+    unless_closed(write_file(output, text.as_bytes()))
 }
 
 fn import_obdb(args: &ObdbArgs) -> Result<(), Failure> {
@@ -132,7 +121,7 @@ fn import_obdb(args: &ObdbArgs) -> Result<(), Failure> {
     let settings = ObdbSettings { source: source.clone(), year: args.year, name: args.name.clone() };
     let result = obdb::import(&text, &settings).map_err(failure)?;
     report(&source, &result);
-    write(&args.output.output, &result.text)
+    unless_closed(write_file(&args.output.output, result.text.as_bytes()))
 }
 
 fn import_bpx(args: &BpxArgs) -> Result<(), Failure> {
@@ -145,29 +134,7 @@ fn import_bpx(args: &BpxArgs) -> Result<(), Failure> {
         eprintln!("{source}: note: {note}");
     }
     eprintln!("{source}: {:.3} Ah between the cut-offs, {} Ah nominal", result.capacity_ah, result.nominal_ah);
-    write(&args.write, &result.text)
-}
-
-/// The text of a file of reasonable size.
-pub(super) fn read(file: &Path) -> Result<String, Failure> {
-    let fault = |what: String| Failure::new(format!("{}: {what}", file.display()));
-    let bytes = std::fs::metadata(file).map_err(|error| fault(format!("cannot be read: {error}")))?.len();
-    if bytes > MAX_BYTES {
-        return Err(fault(format!("has {bytes} bytes, must be at most {MAX_BYTES}")));
-    }
-    std::fs::read_to_string(file).map_err(|error| fault(format!("cannot be read: {error}")))
-}
-
-/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
-pub(super) fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
-    let whole =
-        |path: &Path| std::path::absolute(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())));
-    let (config, file) = (whole(config)?, whole(file)?);
-    let name = match config.parent() {
-        Some(folder) => file.strip_prefix(folder).unwrap_or(&file),
-        None => &file,
-    };
-    Ok(name.display().to_string())
+    unless_closed(write_file(&args.write, result.text.as_bytes()))
 }
 
 fn report(source: &str, result: &ImportResult) {
@@ -178,12 +145,4 @@ fn report(source: &str, result: &ImportResult) {
     for (reason, count) in result.counts() {
         eprintln!("  {count} {reason}");
     }
-}
-
-fn write(file: &Path, text: &str) -> Result<(), Failure> {
-    let written = ResultFile::create(file).and_then(|mut file| {
-        file.write_all(text.as_bytes())?;
-        file.finish()
-    });
-    unless_closed(written)
 }

@@ -1,12 +1,11 @@
-//! The command line: one file per command; here only parsing, dispatch and exit codes.
+//! The command line: one file per command, above what they share in `common`; here only parsing, dispatch and exit codes.
 #![expect(clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
 
-mod alarm_groups;
 mod alarms;
 mod cells;
 mod check;
 mod command;
-mod control_args;
+mod common;
 mod dbc;
 mod demo;
 #[cfg(feature = "lab")]
@@ -27,14 +26,7 @@ mod gpr;
 mod history;
 #[cfg(feature = "lab")]
 mod import;
-mod label;
-#[cfg(feature = "lab")]
-mod logs;
 mod model;
-#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
-mod numbers;
-#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
-mod output;
 #[cfg(feature = "lab")]
 mod passport;
 mod replay;
@@ -55,8 +47,7 @@ mod whatif;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
-pub use packwatch_host::failure::{EXIT_CONFIG, Failure};
+use clap::{CommandFactory as _, Parser, Subcommand};
 
 /// Streaming battery health monitoring over SocketCAN.
 #[derive(Debug, Parser)]
@@ -183,7 +174,7 @@ pub fn main() -> ExitCode {
         Command::Cells(args) => cells::run(&args),
         Command::Model(args) => model::run(&args),
         Command::Dbc(args) => dbc::run(&args),
-        Command::Generate(args) => generate::run(&args),
+        Command::Generate(args) => generate::run(&args, &Cli::command()),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]

@@ -7,13 +7,13 @@ mod source;
 use std::io::Write as _;
 use std::path::PathBuf;
 
-use super::Failure;
-use super::output::{print, print_json, unless_closed};
+use super::common::output::{print, print_json, unless_closed};
 use crate::cell::ModelComparison;
 use crate::config::cell_model;
 use crate::io::result_file::{ResultFile, check_place};
 #[cfg(feature = "lab")]
 use crate::lab::{self, chart};
+use packwatch_host::failure::Failure;
 use page::ModelPage;
 use source::SourceArgs;
 
@@ -105,7 +105,7 @@ fn plot(args: &PlotArgs) -> Result<(), Failure> {
         _ => return Err(Failure::new(format!("{}: must end in .svg or .png", args.out.display()))),
     };
     let pictures: Vec<_> = lab::model_pictures::all(&sourced).into_iter().map(|(_, picture)| picture).collect();
-    chart::write_stack(&args.out, &pictures, format).map_err(super::output::failure)
+    chart::write_stack(&args.out, &pictures, format).map_err(super::common::output::failure)
 }
 
 fn export(args: &ExportArgs) -> Result<(), Failure> {

@@ -9,11 +9,11 @@ use std::rc::Rc;
 use serde::Serialize as _;
 use serde_json::{Map, Value};
 
-use super::Failure;
-use super::numbers::{NamedValue, above_0, one_of, within};
-use super::output::{failure, unless_closed};
-use super::replay::{Bar, InputArgs, log_options};
-use super::report::cell_model;
+use super::common::cell_model::cell_model;
+use super::common::logs::{InputArgs, log_options};
+use super::common::numbers::{NamedValue, above_0, one_of, within};
+use super::common::output::{failure, unless_closed};
+use super::common::progress::Bar;
 use crate::config::{self, Config, VehicleIdentity};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
@@ -22,6 +22,7 @@ use crate::lab::passport::{self, Condition, ReadingLimits, Record, Standard, Ter
 use crate::monitor::Monitor;
 use crate::replay::{self, OutputSink, ReplaySettings, Sinks};
 use crate::store::HistoryReader;
+use packwatch_host::failure::Failure;
 
 /// Largest manufacturer's part, bytes: a passport has some ten thousand.
 const MAX_STATIC_BYTES: u64 = 16 << 20;

@@ -7,20 +7,21 @@ mod report;
 use std::io;
 use std::path::Path;
 
-use super::Failure;
-use super::output::print_json;
+use super::common::logs::log_options;
+use super::common::output::print_json;
+use super::common::progress::Bar;
 use crate::config::{self, Config};
 use crate::io::event_log;
-use crate::io::log::{LogOptions, LogSource};
+use crate::io::log::LogSource;
 use crate::io::result_file::ResultFile;
 use crate::io::snapshot_file;
 use crate::io::socket::CanSender;
 use crate::monitor::Monitor;
-use crate::replay::{self, LogReading, ReplayError, ReplaySettings, ReplaySummary, Sinks};
+use crate::replay::{self, ReplayError, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::Recorder;
+use packwatch_host::failure::Failure;
 
-pub(crate) use args::{Args, CsvSign, InputArgs, column};
-pub(crate) use report::Bar;
+pub(crate) use args::Args;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -74,16 +75,6 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
     let sent = result?;
     report::played(sent, interface, source.counts(), args.json)?;
     Ok(())
-}
-
-pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
-    let reading = LogReading {
-        strict: args.strict,
-        columns: args.columns.clone(),
-        charge_positive: args.csv_sign == args::CsvSign::Charge,
-        start_times: args.start_times.clone(),
-    };
-    reading.options(config)
 }
 
 fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {

@@ -5,11 +5,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use super::Failure;
-use super::output::{create_folder, failure, unless_closed};
-use super::replay::{Bar, InputArgs, log_options};
+use super::common::cell_model::cell_model;
+use super::common::logs::{InputArgs, log_options};
+use super::common::output::{create_folder, failure, unless_closed};
+use super::common::progress::Bar;
+use packwatch_host::failure::Failure;
 
-use crate::config::cell_model::SourcedModel;
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
@@ -105,20 +106,6 @@ impl Args {
         let more = if self.logs.len() > 1 { format!(" and {} more", self.logs.len() - 1) } else { String::new() };
         self.title.clone().unwrap_or_else(|| name.unwrap_or_else(|| "Battery".to_owned()) + &more)
     }
-}
-
-/// The cells' model at the end: learned, else that of the configuration.
-pub(super) fn cell_model(
-    snapshot: Option<&Snapshot>,
-    config: Option<&Config>,
-) -> Result<Option<SourcedModel>, Failure> {
-    let label = config.and_then(|config| config.monitor.label);
-    let view = snapshot.map(|snapshot| snapshot.model(label)).transpose().map_err(failure)?.flatten();
-    let configured = || {
-        let config = config?;
-        Some(SourcedModel { model: config.monitor.model.clone(), source: config.model_source.clone() })
-    };
-    Ok(view.as_ref().and_then(config::of_view).or_else(configured))
 }
 
 /// What a report is made of: data, provenance, vehicle and the last state.

@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use super::Failure;
-use super::command;
-use super::control_args::ControlArgs;
-use super::output::print;
+use super::common::control::{ControlArgs, replace_pack};
+use super::common::output::print;
 use crate::store;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `reset`.
 #[derive(Debug, clap::Args)]
@@ -28,7 +27,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let client = args.control.client();
     if !args.yes || client.is_served() {
-        return command::replace_pack(args.yes, &client);
+        return replace_pack(args.yes, &client);
     }
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let pack = store::replace_pack(&folder).map_err(Failure::new)?;

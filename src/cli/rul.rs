@@ -5,11 +5,11 @@ mod report;
 use std::path::PathBuf;
 use std::str::FromStr as _;
 
-use super::Failure;
-use super::numbers::{finite, fraction};
-use super::output::{check_distinct, failure, print, unless_closed};
+use super::common::numbers::{finite, fraction};
+use super::common::output::{check_distinct, failure, print, unless_closed};
 use crate::io::paths::short_names;
 use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
+use packwatch_host::failure::Failure;
 
 /// Most parts of the life: one per per cent.
 const MAX_PARTS: usize = 99;

@@ -3,8 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::Failure;
-use super::numbers::{between, bytes, whole};
+use super::common::numbers::{MAX_SECONDS, away, between, bytes, whole};
 use crate::config;
 use crate::io::can_key::CanKey;
 use crate::io::place::PlaceSetting;
@@ -15,6 +14,7 @@ use crate::monitor::Downtime;
 use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::status::document::ConfigFile;
 use crate::{logging, service::Service};
+use packwatch_host::failure::Failure;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -74,20 +74,8 @@ pub(crate) struct Args {
     status: Option<PathBuf>,
 }
 
-/// Longest time of an option, s: ten years.
-const MAX_SECONDS: f64 = 315_576_000.0;
 /// Largest receive buffer, bytes: the kernel's own limit on the option, halved as it doubles it.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
-
-/// Parses the age of a stored state.
-pub(crate) fn away(text: &str) -> Result<Downtime, String> {
-    match text {
-        "unknown" => Ok(Downtime::Unknown),
-        _ => between(0.0, MAX_SECONDS, "seconds, ")(text)
-            .map(Downtime::Seconds)
-            .map_err(|must| format!("{must}, or unknown")),
-    }
-}
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

@@ -5,8 +5,8 @@ mod bar;
 
 pub(crate) use args::Args;
 
-use super::Failure;
-use super::output::{failure, print};
+use super::common::output::{failure, print};
+use packwatch_host::failure::Failure;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

@@ -10,8 +10,7 @@ mod settings;
 
 use std::path::PathBuf;
 
-use super::Failure;
-use super::numbers::one_of;
+use super::common::numbers::one_of;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
@@ -20,6 +19,7 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use output::{LogWriter, TruthColumns, TruthWriter};
+use packwatch_host::failure::Failure;
 use player::Player;
 
 /// Time between frames sent together, ns: a classic frame of 8 bytes at 1 Mbit/s.

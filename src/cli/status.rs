@@ -9,11 +9,11 @@ mod view;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use super::Failure;
-use super::output::{print, word};
+use super::common::output::{print, word};
 use crate::status::client::{StatusClient, parse};
 use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
+use packwatch_host::failure::Failure;
 
 /// Exit code when no daemon reports its status.
 const EXIT_UNREACHABLE: u8 = 3;

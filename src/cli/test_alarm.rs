@@ -7,15 +7,15 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::Failure;
-use super::control_args::{ControlArgs, rule_parser};
-use super::numbers::above_0_to;
-use super::output::{print, word};
+use super::common::control::{ControlArgs, rule_parser};
+use super::common::numbers::above_0_to;
+use super::common::output::{print, word};
 use crate::alarm::{AlarmState, Rule};
 use crate::config;
 use crate::control::test_alarm::{self, ChannelReport, GenuineAlarm};
 use crate::io::stamp;
 use crate::monitor::MAX_TEST_S;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `test-alarm`.
 #[derive(Debug, clap::Args)]

@@ -8,7 +8,7 @@ use std::os::unix::process::CommandExt as _;
 use std::path::PathBuf;
 use std::process::Command;
 
-use super::Failure;
+use packwatch_host::failure::Failure;
 
 /// Name of the program.
 const PROGRAM: &str = "packwatch-uplink";

@@ -5,11 +5,10 @@ mod report;
 
 use std::path::{Path, PathBuf};
 
-use super::Failure;
-use super::control_args::rule_parser;
-use super::logs::LogArgs;
-use super::numbers::{above_0, percent};
-use super::output::{failure, unless_closed};
+use super::common::control::rule_parser;
+use super::common::many_logs::LogArgs;
+use super::common::numbers::{above_0, percent};
+use super::common::output::{failure, unless_closed};
 use crate::alarm::Rule;
 use crate::config::Config;
 use crate::io::result_file::check_place;
@@ -18,6 +17,7 @@ use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
 use crate::lab::fleet::variants::{self, Choice};
 use crate::lab::fleet::whatif::{self, LogResult, WhatifJob, WhatifSettings};
+use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 /// Capacity at the end of life.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,7 +79,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let grid = variants::grid(&args.config, &args.set)
-        .map_err(|faults| Failure { message: faults.join("\n"), code: super::EXIT_CONFIG })?;
+        .map_err(|faults| Failure { message: faults.join("\n"), code: EXIT_CONFIG })?;
     let plain = &grid.variants[0].config.monitor;
     let rated_ah = plain.model.rated_capacity_ah;
     if args.logs.is_stdin() && grid.replays > 1 {

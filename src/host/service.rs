@@ -197,7 +197,7 @@ impl Service {
 
 /// Logs whether commands from the bus are authenticated.
 fn log_commands(config: &Config) {
-    match (&config.monitor.commands, config.command_words()) {
+    match (&config.monitor.commands, crate::config::command_words(config)) {
         (None, _) => {}
         (Some(commands), words) if commands.plan.authentication().is_some() => tracing::info!("{words}"),
         (Some(_), words) => tracing::warn!("{words}"),

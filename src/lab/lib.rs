@@ -24,15 +24,4 @@ pub mod rul;
 pub mod score;
 pub mod single_cell;
 
-use std::io::Write as _;
-use std::path::Path;
-
-/// Writes a file completely or not at all; `-` is standard output.
-///
-/// # Errors
-/// It cannot be written; the error names it.
-pub fn write_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let mut file = io::result_file::ResultFile::create(path)?;
-    file.write_all(bytes)?;
-    file.finish()
-}
+pub use packwatch_host::io::result_file::write_file;

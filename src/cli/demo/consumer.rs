@@ -3,7 +3,7 @@
 use crate::alarm::Rule;
 use crate::can::Frame;
 use crate::can::dbc::{Database, Message, Signal};
-use crate::cli::Failure;
+use packwatch_host::failure::Failure;
 
 /// Reads frames by a DBC.
 pub(super) struct Consumer {

@@ -3,8 +3,9 @@
 use std::io::IsTerminal as _;
 use std::path::Path;
 
-use super::super::{Failure, output};
+use crate::cli::common::output;
 use crate::wiring::{Change, Finding, Report, Severity};
+use packwatch_host::failure::Failure;
 
 /// Width of the text without a terminal.
 const DEFAULT_WIDTH: usize = 100;

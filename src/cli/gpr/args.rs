@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::Failure;
-use crate::cli::numbers::{NamedValue, one_of, whole};
+use crate::cli::common::numbers::{NamedValue, one_of, whole};
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
 use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
+use packwatch_host::failure::Failure;
 
 /// Below the options.
 pub(super) const GRAMMAR: &str = "\

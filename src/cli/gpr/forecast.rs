@@ -10,14 +10,14 @@ use serde_json::{Value, json};
 use super::args::{FileArgs, GRAMMAR, ModelArgs};
 use super::report::{VERSION, fit_bar, form, mebibytes, score_json, short, show_fits, skipped};
 use super::{ColumnSelection, ColumnTable, PartColumn, read};
-use crate::cli::Failure;
-use crate::cli::numbers::{percent, whole};
-use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
+use crate::cli::common::numbers::{percent, whole};
+use crate::cli::common::output::{create_folder, failure, print_json, unless_closed, write_table};
 use crate::lab::gpr::forecast::{
     self, ForecastPlan, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, RowSpacing, TableForecast, horizons,
 };
 use crate::lab::gpr::{self, peak_kib};
 use crate::regress::Kernel;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `gpr forecast`.
 #[derive(Debug, clap::Args)]

@@ -7,7 +7,8 @@ use std::path::Path;
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
-use crate::cli::output::{print_json, progress_bar, write_table};
+use crate::cli::common::output::{print_json, write_table};
+use crate::cli::common::progress::progress_bar;
 use crate::lab::gpr::{ColumnTable, CrossValidation, TrainedModel, peak_kib};
 use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 

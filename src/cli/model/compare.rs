@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use crate::cell::ModelComparison;
 use crate::cell::model_comparison::{AtTemperature, Difference};
-use crate::cli::output;
+use crate::cli::common::output;
 use crate::config::cell_model::SourcedModel;
 
 /// Rows of the curve: every 10th of its steps of 1 %.

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::cell::{CellModel, Chemistry, ModelBands, advise};
-use crate::cli::output;
+use crate::cli::common::output;
 use crate::config::cell_model::{KnownBy, LearnedFrom, MeasuredRange, SourcedModel, state_words};
 use crate::io::stamp::format_utc;
 use crate::monitor::{ModelChange, ModelState};

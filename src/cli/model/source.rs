@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use crate::cell::{Chemistry, Label};
-use crate::cli::Failure;
-use crate::cli::label::LabelArgs;
-use crate::cli::numbers::above_0;
+use crate::cli::common::label::LabelArgs;
+use crate::cli::common::numbers::above_0;
 use crate::config::cell_model::{self, SourcedModel};
 use crate::config::{self, Config, of_label, of_view};
 use crate::io::snapshot_file;
 use crate::monitor::Snapshot;
 use crate::store::HistoryReader;
+use packwatch_host::failure::Failure;
 
 /// Names a cell model.
 #[derive(Debug, clap::Args)]

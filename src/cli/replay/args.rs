@@ -2,20 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::Failure;
-use crate::cli::run::away;
+use crate::cli::common::logs::InputArgs;
+use crate::cli::common::numbers::{away, positive};
 use crate::io::stamp;
 use crate::monitor::Downtime;
-use crate::replay::{LogTime, SLEEP_GAP_S};
-
-/// Which way a CSV's positive current flows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum CsvSign {
-    /// Positive is discharge
-    Discharge,
-    /// Positive is charge
-    Charge,
-}
+use crate::replay::LogTime;
+use packwatch_host::failure::Failure;
 
 /// Arguments of `replay`.
 #[derive(Debug, clap::Args)]
@@ -77,27 +69,6 @@ pub(crate) struct Args {
     pub(crate) until: Option<LogTime>,
 }
 
-/// How logs are read.
-#[derive(Debug, clap::Args)]
-pub(crate) struct InputArgs {
-    /// End at the first malformed line
-    #[arg(long)]
-    pub(crate) strict: bool,
-    /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
-    #[arg(long, value_name = "S", default_value_t = SLEEP_GAP_S, value_parser = positive)]
-    pub(crate) sleep_gap: f64,
-    /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
-    /// the letter n in braces in the names stands for the number of the cell or sensor, from 1
-    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
-    pub(crate) columns: Vec<(String, String)>,
-    /// Sign of a CSV's current
-    #[arg(long, value_enum, default_value = "discharge")]
-    pub(crate) csv_sign: CsvSign,
-    /// CSV table with the section's column and `start`, which makes stamps absolute
-    #[arg(long, value_name = "TABLE.csv")]
-    pub(crate) start_times: Option<PathBuf>,
-}
-
 impl Args {
     fn results(&self) -> impl Iterator<Item = &Path> {
         [&self.estimates, &self.events, &self.frames, &self.snapshot].into_iter().filter_map(|path| path.as_deref())
@@ -131,26 +102,9 @@ impl Args {
     }
 }
 
-fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|e| format!("{e}"))?;
-    if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) }
-}
-
 fn when(text: &str) -> Result<LogTime, String> {
     let after = text.strip_prefix('+').map(|s| stamp::parse_seconds(s.as_bytes()).map(|t| LogTime::After(t.nanos())));
     after
         .unwrap_or_else(|| stamp::parse_stamp(text).map(LogTime::At))
         .ok_or_else(|| "must be seconds, +seconds or like 2008-04-02T13:08:17.921".to_owned())
-}
-
-pub(crate) fn column(text: &str) -> Result<(String, String), String> {
-    const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
-    let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
-    if !ROLES.contains(&role) {
-        return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));
-    }
-    if role.ends_with("{n}") != name.contains("{n}") {
-        return Err("{n} must be in role and column, or in neither".to_owned());
-    }
-    Ok((role.to_owned(), name.to_owned()))
 }

@@ -10,9 +10,12 @@ use std::time::Instant;
 
 use indicatif::ProgressBar;
 
-use super::{Args, Failure, report};
+use super::args::Args;
+use super::report;
+use packwatch_host::failure::Failure;
 
-use crate::cli::output::{check_distinct, create_folder};
+use crate::cli::common::output::{check_distinct, create_folder};
+use crate::cli::common::progress::bar;
 use crate::config::Config;
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
@@ -149,7 +152,7 @@ struct EachBar {
 
 impl EachBar {
     fn new(logs: &[PathBuf]) -> Self {
-        let bar = report::bar(logs);
+        let bar = bar(logs);
         Self {
             bar,
             logs: logs.len(),

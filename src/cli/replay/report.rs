@@ -1,63 +1,16 @@
-//! Output of `replay` on the terminal: a progress bar, a summary.
+//! Output of `replay` on the terminal: the summary.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::Path;
 
-use indicatif::ProgressBar;
-
-use crate::cli::output::progress_bar;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
-use crate::replay::{ProtectedSummary, ReplayProgress, ReplaySummary};
+use crate::replay::{ProtectedSummary, ReplaySummary};
 
 /// Alarms listed for people; JSON has more.
 const MAX_SHOWN_ALARMS: usize = 20;
 /// Cells listed for people; JSON has all.
 const MAX_SHOWN_CELLS: usize = 16;
-
-/// Progress on standard error, when that is a terminal.
-#[derive(Debug)]
-pub(crate) struct Bar(ProgressBar);
-
-impl Bar {
-    /// A bar for logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
-    pub(crate) fn new(logs: &[PathBuf]) -> Self {
-        Self(bar(logs))
-    }
-
-    /// Shows the current state.
-    pub(crate) fn show(&self, progress: ReplayProgress) {
-        let seconds = self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64();
-        if self.0.is_hidden() {
-            return;
-        }
-        let rate = progress.frames as f64 / seconds;
-        self.0.set_message(format!("{rate:.0} frames/s, {:.0} x real time", progress.times_real_time));
-        self.0.set_position(progress.bytes);
-    }
-
-    /// Seconds since it was made, above 0.
-    pub(crate) fn seconds(&self) -> f64 {
-        self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64()
-    }
-
-    /// Removes the bar.
-    pub(crate) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
-}
-
-/// A bar over the sizes of logs; without an end where one has no size.
-pub(super) fn bar(logs: &[PathBuf]) -> ProgressBar {
-    let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
-    let total: Option<u64> = logs.iter().map(size).sum();
-    let template = match total {
-        Some(_) => "{bar:32} {percent:>3} % {bytes}/{total_bytes} {bytes_per_sec} {msg} eta {eta}",
-        None => "{spinner} {bytes} {bytes_per_sec} {msg}",
-    };
-    progress_bar(total, template)
-}
 
 /// The summary as one line of JSON that begins with the log's name.
 pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummary) -> io::Result<()> {

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use crate::cli::output::write_table;
+use crate::cli::common::output::write_table;
 use crate::health::{Axis, Remaining};
 use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
 

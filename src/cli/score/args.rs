@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::cli::label::LabelArgs;
-use crate::cli::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
+use crate::cli::common::label::LabelArgs;
+use crate::cli::common::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
 use crate::lab::score::{ScoreRequest, Start};
 use crate::lab::single_cell::CellSource;
 

@@ -2,7 +2,7 @@
 
 use indicatif::ProgressBar;
 
-use crate::cli::output::progress_bar;
+use crate::cli::common::progress::progress_bar;
 use crate::lab::score::ScoreJob;
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.

@@ -8,10 +8,10 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 
 use crate::can::Frame;
-use crate::cli::Failure;
 use crate::io::candump::{self, StampDigits};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sim::{Moment, Simulation};
+use packwatch_host::failure::Failure;
 
 /// A file being written, and its name for messages.
 struct Target {

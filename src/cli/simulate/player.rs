@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use crate::can::Frame;
-use crate::cli::Failure;
 use crate::io::socket::CanSender;
 use crate::quantity::Timestamp;
+use packwatch_host::failure::Failure;
 
 /// Sends frames at their time.
 pub(super) struct Player {

@@ -1,9 +1,9 @@
 //! Changes of a scenario's settings by the command line.
 
 use crate::cell_faults::BalancingConfig;
-use crate::cli::Failure;
-use crate::cli::numbers::{NamedValue, between, finite, one_of, share, within};
+use crate::cli::common::numbers::{NamedValue, between, finite, one_of, share, within};
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
+use packwatch_host::failure::Failure;
 
 /// Scenarios by name.
 pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [

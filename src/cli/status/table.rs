@@ -3,9 +3,8 @@
 use std::fmt::Write as _;
 
 use super::{config, duration, number, percent, shown, store, with_std, word};
-use crate::cli::alarm_groups::{AlarmGroup, grouped};
-use crate::cli::alarms::with_unit;
-use crate::cli::output;
+use crate::cli::common::alarms::{AlarmGroup, grouped, with_unit};
+use crate::cli::common::output;
 use crate::io::stamp;
 use crate::monitor::ModelState;
 use crate::status::counters::LATENCY_BOUNDS_S;

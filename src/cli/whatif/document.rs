@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::json;
 
 use super::report::WhatifReport;
-use crate::cli::output::print_json;
+use crate::cli::common::output::print_json;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::variants::Variant;

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use serde::Serialize;
 
 use crate::alarm::{Rule, Severity};
-use crate::cli::output::write_table;
+use crate::cli::common::output::write_table;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 
@@ -20,7 +20,7 @@ mod protect;
 mod uds;
 
 use super::*;
-use crate::can::dbc::FrameFormat;
+use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::encode::OutputPlan;
 use crate::can::{CanId, Frame};
@@ -98,7 +98,7 @@ fn read_merged(pack: &str, cell: &str, dbc: &str, drop_ins: &[&str]) -> Result<(
         None => Err(std::io::ErrorKind::NotFound.into()),
     };
     let files = ConfigFiles { main: "pack.toml".into(), drop_ins: names.iter().map(PathBuf::from).collect() };
-    read_all(&files, &read).map_err(|faults| faults.0)
+    describe_with(&files, &read).map_err(|faults| faults.0)
 }
 
 fn good(pack: &str) -> Config {
@@ -347,8 +347,8 @@ fn the_vehicle_is_optional_and_its_texts_fit_a_line() {
 
 #[test]
 fn every_default_is_a_value_its_key_allows() {
-    use super::schema::Presence;
-    for info in tables::SECTIONS.iter().chain(super::cell_model::SECTIONS) {
+    use super::schema::{Presence, SECTIONS};
+    for info in SECTIONS.iter().chain(super::cell_model::SECTIONS) {
         for key in info.keys.unwrap_or(&[]) {
             assert!(!key.about.trim().is_empty() && key.about.trim().ends_with('.'), "{}.{}", info.path, key.name);
             if key.presence == Presence::Optional {
@@ -373,7 +373,8 @@ fn the_reference_page_is_the_one_in_the_repository() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/REFERENCE.md");
     let page = std::fs::read_to_string(path).unwrap();
     assert!(page == reference(), "regenerate it: packwatch check --reference > config/REFERENCE.md");
-    for key in tables::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
+    for key in super::schema::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten()
+    {
         assert!(page.contains(&format!("| `{}` |", key.name)), "{}", key.name);
     }
 }

@@ -74,6 +74,16 @@ impl Drop for ResultFile {
     }
 }
 
+/// Writes a whole file.
+///
+/// # Errors
+/// As [`ResultFile::create`] and [`ResultFile::finish`].
+pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut file = ResultFile::create(path)?;
+    file.write_all(bytes)?;
+    file.finish()
+}
+
 /// Checks, before hours of work, that a result can be written to its path and is not one of the files that are read.
 ///
 /// # Errors

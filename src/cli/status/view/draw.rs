@@ -9,7 +9,7 @@ use ratatui::widgets::{Block, Paragraph};
 use super::app::{App, Page};
 use super::theme::{Theme, clock};
 use super::{pages, plot};
-use crate::cli::alarm_groups::grouped;
+use crate::cli::common::alarms::grouped;
 use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
 use crate::status::document::StatusDocument;
 

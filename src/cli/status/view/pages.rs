@@ -11,7 +11,7 @@ use super::app::{App, Page, Quantity};
 use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
-use crate::cli::alarm_groups::{AlarmGroup, grouped};
+use crate::cli::common::alarms::{AlarmGroup, grouped};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{duration, number, shown, with_std, word};
 use crate::quantity::Timestamp;

@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{SourcedModel, load_sourced};
-use crate::config::ConfigFaults;
+use super::read::load_sourced;
+use super::source::SourcedModel;
+use crate::config::document::ConfigFaults;
 
 /// Folders below the present one and of the computer, in which models are looked for.
 const FOLDERS: [&str; 3] = ["config/cells", "cells", "/etc/packwatch/cells"];

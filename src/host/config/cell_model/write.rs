@@ -2,7 +2,7 @@
 
 use toml::{Table as TomlTable, Value};
 
-use super::SourcedModel;
+use super::source::SourcedModel;
 use crate::cell::{AgeingLaw, CellModel, Electrodes, ModelSpread, Table};
 
 /// Returns the whole file. `head` is its first comment, without line breaks.

@@ -36,7 +36,7 @@ fn with_key(from: &str, to: &str) -> String {
 
 #[test]
 fn a_table_becomes_a_node_and_each_alarm_a_code() {
-    let config = good(&with(TABLE));
+    let (config, description) = read_texts(&with(TABLE), CELL, DBC).unwrap();
     let j1939 = config.monitor.j1939.as_ref().unwrap();
     let fields = NameFields {
         identity_number: 1234,
@@ -52,7 +52,7 @@ fn a_table_becomes_a_node_and_each_alarm_a_code() {
         [(520_193, 18, Lamp::Amber), (7000, 1, Lamp::Red), (520_195, 17, Lamp::Protect), (520_196, 9, Lamp::Amber)];
     assert_eq!(codes, wanted);
     assert_eq!(
-        super::super::j1939::words(&config)[..2],
+        description.j1939[..2],
         [
             "address 249 (F9) on can0, NAME 00FEFF00FFE004D2; DM1 18FECAF9 every second and on change, DM2 18FECBF9 on request",
             "capacity_low warning: SPN 520193, FMI 18, amber lamp",

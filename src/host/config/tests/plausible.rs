@@ -298,7 +298,7 @@ fn a_byte_order_mark_is_read_over_and_utf_16_is_named() {
             _ => Ok(dbc.clone()),
         };
         let files = ConfigFiles { main: "pack.toml".into(), drop_ins: vec![] };
-        read_all(&files, &read).map(|_| ()).map_err(|faults| faults.0)
+        describe_with(&files, &read).map(|_| ()).map_err(|faults| faults.0)
     };
     let marked = |bytes: &[u8]| [b"\xEF\xBB\xBF", bytes].concat();
     assert_eq!(read_bytes(marked(DBC.as_bytes())), Ok(()));

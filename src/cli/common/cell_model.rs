@@ -1,0 +1,22 @@
+//! The cell model of a record: what was learned, else the configured one.
+
+use packwatch_host::failure::Failure;
+
+use super::output::failure;
+use crate::config::cell_model::SourcedModel;
+use crate::config::{self, Config};
+use crate::monitor::Snapshot;
+
+/// The cells' model at the end: learned, else that of the configuration.
+pub(crate) fn cell_model(
+    snapshot: Option<&Snapshot>,
+    config: Option<&Config>,
+) -> Result<Option<SourcedModel>, Failure> {
+    let label = config.and_then(|config| config.monitor.label);
+    let view = snapshot.map(|snapshot| snapshot.model(label)).transpose().map_err(failure)?.flatten();
+    let configured = || {
+        let config = config?;
+        Some(SourcedModel { model: config.monitor.model.clone(), source: config.model_source.clone() })
+    };
+    Ok(view.as_ref().and_then(config::of_view).or_else(configured))
+}

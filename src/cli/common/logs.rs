@@ -1,0 +1,61 @@
+//! Arguments shared by the commands that read logs: how to read them.
+
+use std::path::PathBuf;
+
+use super::numbers::positive;
+use crate::config::Config;
+use crate::io::log::LogOptions;
+use crate::replay::{LogReading, SLEEP_GAP_S};
+
+/// Which way a CSV's positive current flows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum CsvSign {
+    /// Positive is discharge
+    Discharge,
+    /// Positive is charge
+    Charge,
+}
+
+/// How logs are read.
+#[derive(Debug, clap::Args)]
+pub(crate) struct InputArgs {
+    /// End at the first malformed line
+    #[arg(long)]
+    pub(crate) strict: bool,
+    /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
+    #[arg(long, value_name = "S", default_value_t = SLEEP_GAP_S, value_parser = positive)]
+    pub(crate) sleep_gap: f64,
+    /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
+    /// the letter n in braces in the names stands for the number of the cell or sensor, from 1
+    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
+    pub(crate) columns: Vec<(String, String)>,
+    /// Sign of a CSV's current
+    #[arg(long, value_enum, default_value = "discharge")]
+    pub(crate) csv_sign: CsvSign,
+    /// CSV table with the section's column and `start`, which makes stamps absolute
+    #[arg(long, value_name = "TABLE.csv")]
+    pub(crate) start_times: Option<PathBuf>,
+}
+
+/// How logs are read with a configuration.
+pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
+    let reading = LogReading {
+        strict: args.strict,
+        columns: args.columns.clone(),
+        charge_positive: args.csv_sign == CsvSign::Charge,
+        start_times: args.start_times.clone(),
+    };
+    reading.options(config)
+}
+
+pub(crate) fn column(text: &str) -> Result<(String, String), String> {
+    const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
+    let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
+    if !ROLES.contains(&role) {
+        return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));
+    }
+    if role.ends_with("{n}") != name.contains("{n}") {
+        return Err("{n} must be in role and column, or in neither".to_owned());
+    }
+    Ok((role.to_owned(), name.to_owned()))
+}

@@ -1,0 +1,71 @@
+//! Output shared by the offline commands: tables, JSON documents, result folders, failures.
+//!
+//! Tables and documents go to the writer given or to standard output.
+//! A reader that closes standard output early (`| head`) is no failure.
+
+use std::fmt::Display;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::io::paths;
+use packwatch_host::failure::Failure;
+
+pub(crate) use crate::io::text_table::text_table as table;
+
+/// A failure of the work with this error's text.
+pub(crate) fn failure(error: impl Display) -> Failure {
+    Failure::new(error.to_string())
+}
+
+/// Ignores that the output was closed.
+pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
+    match written {
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.map_err(failure),
+    }
+}
+
+/// Writes to standard output.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    let written = io::stdout().write_all(text.as_bytes());
+    unless_closed(written)
+        .map_err(|failure| Failure::new(format!("standard output cannot be written: {}", failure.message)))
+}
+
+/// A value of an enumeration, as in JSON.
+pub(crate) fn word(value: impl serde::Serialize) -> String {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => word,
+        _ => "?".to_owned(),
+    }
+}
+
+/// Writes one JSON document to standard output.
+pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    serde_json::to_writer_pretty(&mut out, document)?;
+    writeln!(out)
+}
+
+/// Writes such a [`table`].
+pub(crate) fn write_table<H: AsRef<str>>(
+    out: &mut impl Write,
+    heads: &[H],
+    rows: impl IntoIterator<Item = Vec<String>>,
+    left: usize,
+) -> io::Result<()> {
+    out.write_all(table(heads, rows, left).as_bytes())
+}
+
+/// Creates a folder for results.
+pub(crate) fn create_folder(folder: &Path) -> Result<(), Failure> {
+    let created = std::fs::create_dir_all(folder);
+    created.map_err(|error| Failure::new(format!("{}: cannot be created: {error}", folder.display())))
+}
+
+/// Rejects a file that is named twice.
+pub(crate) fn check_distinct(files: &[PathBuf]) -> Result<(), Failure> {
+    paths::check_distinct(files).map_err(Failure::new)
+}

@@ -1,0 +1,50 @@
+//! The model of a cell without a file: that of its label, and what was learned on board from it.
+
+use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
+use crate::cell::{Coverage, Label};
+use crate::monitor::{ModelState, ModelView};
+
+/// The model of a cell of which only the label is known; `None` = no cell of this chemistry has these voltages.
+pub fn of_label(label: &Label) -> Option<SourcedModel> {
+    let source = ModelSource {
+        state: ModelState::Prior,
+        chemistry: Some(label.chemistry.name().to_owned()),
+        measured: MeasuredRange::default(),
+        provenance: toml::Table::new(),
+        learned: None,
+    };
+    label.model().map(|model| SourcedModel { model, source })
+}
+
+/// The model in force of a pack that learns it; `None` = it is of a model file.
+pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
+    let label = view.label?;
+    let SourcedModel { model: prior, source } = of_label(&label)?;
+    let learned = LearnedFrom {
+        seen: Coverage::of_rows(view.notebook.map_or(&[], |notebook| notebook.rows())),
+        residual_v: view.own.map(|own| own.residual_v),
+        chemistry: view.chemistry,
+        fits: view.fits,
+        changes: view.changes.to_vec(),
+        prior: Box::new(prior.clone()),
+    };
+    let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));
+    let origin = match &own {
+        Some(_) => "learned on board from what the vehicle has noted of its own cells, starting from the label",
+        None => "chemistry prior of the label",
+    };
+    let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);
+    let measured = own.as_ref().map_or_else(MeasuredRange::default, |_| seen_range(&learned.seen));
+    let source = ModelSource { state: view.state, provenance, measured, learned: Some(learned), ..source };
+    Some(SourcedModel { model: own.unwrap_or(prior), source })
+}
+
+/// From the lowest to the highest that was seen.
+fn seen_range(seen: &Coverage) -> MeasuredRange {
+    let whole = |ranges: Vec<[f64; 2]>| Some([ranges.first()?[0], ranges.last()?[1]]);
+    MeasuredRange {
+        temperature_c: whole(seen.temperature_ranges_c()),
+        soc: whole(seen.soc_ranges()),
+        ..MeasuredRange::default()
+    }
+}

@@ -1,0 +1,242 @@
+//! A cell model file to a checked [`CellModel`], with every fault at once.
+
+use std::path::Path;
+
+use super::keys::{BranchTables, ElectrodesKeys, Head, Measured, SECTIONS, SpreadKeys, Tables, ThermalKeys, ends};
+use super::source::{MeasuredRange, ModelSource, SourcedModel};
+use crate::cell::{AgedOcv, CellModel, MAX_BRANCHES, Table};
+use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, TablePlace, read_file};
+use crate::config::schema::{SchemaReader, Section as _};
+use crate::monitor::ModelState;
+
+/// Reads and checks a cell model file.
+///
+/// # Errors
+/// Every fault found, one line each.
+pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
+    load_sourced(path).map(|sourced| sourced.model)
+}
+
+/// As [`load`], with where the model comes from.
+///
+/// # Errors
+/// Every fault found, one line each.
+pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
+    let mut faults = Faults::default();
+    let model = load_with(path, &read_file, &mut faults);
+    model.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+}
+
+/// As [`load_sourced`], through `read`; faults are noted with those of other files.
+pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<SourcedModel> {
+    let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
+    let document = Document::parse(&sources, faults);
+    let mut reader = SchemaReader::new(&document, SECTIONS, faults);
+    let head = reader.one::<Head>();
+    let measured = reader.optional::<Measured>();
+    let tables = reader.one::<Tables>();
+    let branches = reader.many::<BranchTables>();
+    let electrodes = reader.optional::<ElectrodesKeys>();
+    let spread = reader.optional::<SpreadKeys>();
+    let thermal = reader.optional::<ThermalKeys>();
+    let written = reader.count(BranchTables::PATH);
+    if let Some(head) = &head {
+        check_head(head, faults);
+    }
+    if let Some(measured) = &measured {
+        check_measured(measured, faults);
+    }
+    let tables = tables?;
+    check_tables(&tables, faults);
+    check_branch_count(&tables.place, written, faults);
+    check_branches(&tables, &branches, faults);
+    if let Some(spread) = &spread {
+        check_spread(spread, &tables, faults);
+    }
+    let head = head?;
+    let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), spread.as_ref(), faults);
+    let source = ModelSource {
+        state: ModelState::Given,
+        chemistry: head.chemistry.clone(),
+        measured: measured.map_or_else(MeasuredRange::default, |keys| keys.range()),
+        provenance: provenance(path, read),
+        learned: None,
+    };
+    let model = CellModel {
+        spread: spread.map(|keys| keys.config()),
+        ..model(head, tables, aged_ocv, &branches, thermal.as_ref())
+    };
+    Some(SourcedModel { model, source })
+}
+
+/// The notes for people; empty when there are none. The file has been parsed before, so that its faults are noted.
+fn provenance(path: &Path, read: ReadFile<'_>) -> toml::Table {
+    let text = read(path).ok().and_then(|bytes| String::from_utf8(bytes).ok()).unwrap_or_default();
+    let notes = text.parse::<toml::Table>().ok().and_then(|mut table| table.remove("provenance"));
+    notes.and_then(|notes| notes.try_into().ok()).unwrap_or_default()
+}
+
+impl Measured {
+    fn range(&self) -> MeasuredRange {
+        let range = |values: &Option<Vec<f64>>| values.as_ref().map(|values| ends(values));
+        MeasuredRange {
+            temperature_c: range(&self.temperature_c),
+            current_a: range(&self.current_a),
+            soc: range(&self.soc),
+        }
+    }
+}
+
+/// How the open-circuit curve ages, with the modes of its spread; notes what no cell can have. Only sound tables are used.
+fn aged_ocv(
+    head: &Head,
+    tables: &Tables,
+    electrodes: Option<&ElectrodesKeys>,
+    spread: Option<&SpreadKeys>,
+    faults: &mut Faults,
+) -> AgedOcv {
+    let mut aged_ocv = ageing(head, tables, electrodes, faults);
+    if faults.is_empty()
+        && let Some([a, b]) = spread.map(|keys| keys.curve_modes_v.as_slice())
+    {
+        aged_ocv.add_spread(&[a.clone(), b.clone()]);
+    }
+    aged_ocv
+}
+
+fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &mut Faults) -> AgedOcv {
+    if !faults.is_empty() {
+        return AgedOcv::default();
+    }
+    let (soc, rows) = (&tables.soc, &tables.ocv_v);
+    let Some(keys) = electrodes else {
+        return AgedOcv::of_shift(head.ocv_ageing_shift.unwrap_or(0.0), soc, head.capacity_ah, rows);
+    };
+    if head.ocv_ageing_shift.is_some() {
+        head.place.fault(faults, "ocv_ageing_shift", "must not be given together with [electrodes]");
+    }
+    let (positive, negative) = (&keys.positive_content, &keys.negative_content);
+    for (key, contents, rises) in [("positive_content", positive, false), ("negative_content", negative, true)] {
+        let [empty, full] = ends(contents);
+        if contents.len() != 2 || empty == full || (full > empty) != rises {
+            let first = if rises { "lower" } else { "higher" };
+            keys.place.fault(faults, key, &format!("must be two numbers, empty and full, the {first} first"));
+        }
+    }
+    if !faults.is_empty() {
+        return AgedOcv::default();
+    }
+    AgedOcv::of_electrodes(&keys.config(), soc, head.capacity_ah, rows).unwrap_or_else(|| {
+        keys.place.note(faults, "positive_content", "these electrodes do not say how the cell ages");
+        AgedOcv::default()
+    })
+}
+
+fn model(
+    head: Head,
+    tables: Tables,
+    aged_ocv: AgedOcv,
+    branches: &[BranchTables],
+    thermal: Option<&ThermalKeys>,
+) -> CellModel {
+    CellModel {
+        name: head.name,
+        rated_capacity_ah: head.rated_capacity_ah,
+        capacity_ah: head.capacity_ah,
+        voltage_min_v: head.voltage_min_v,
+        voltage_max_v: head.voltage_max_v,
+        soc: tables.soc,
+        temperature_c: tables.temperature_c,
+        aged_ocv,
+        ocv_v: Table { values: tables.ocv_v },
+        r0_ohm: Table { values: tables.r0_ohm },
+        branches: branches.iter().map(BranchTables::config).collect(),
+        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
+        thermal: thermal.map(|keys| keys.config()),
+        spread: None,
+    }
+}
+
+fn check_head(head: &Head, faults: &mut Faults) {
+    if head.voltage_max_v <= head.voltage_min_v {
+        let what = format!("must be above voltage_min_v = {}", head.voltage_min_v);
+        head.place.fault(faults, "voltage_max_v", &what);
+    }
+}
+
+fn check_measured(measured: &Measured, faults: &mut Faults) {
+    let Measured { temperature_c, current_a, soc, place, .. } = measured;
+    for (key, range) in [("temperature_c", temperature_c), ("current_a", current_a), ("soc", soc)] {
+        if range.as_ref().is_some_and(|range| range.len() != 2 || range[0] > range[1]) {
+            place.fault(faults, key, "must be two numbers, the lower first");
+        }
+    }
+}
+
+fn check_tables(tables: &Tables, faults: &mut Faults) {
+    let place = &tables.place;
+    if tables.soc.len() < 2 || tables.soc.first() != Some(&0.0) || tables.soc.last() != Some(&1.0) {
+        place.fault(faults, "soc", "must begin with 0 and end with 1");
+    }
+    if tables.temperature_c.is_empty() {
+        place.fault(faults, "temperature_c", "must have at least one temperature");
+    }
+    for (key, values) in [("soc", &tables.soc), ("temperature_c", &tables.temperature_c)] {
+        if let Some((a, b)) = first_not_rising(values) {
+            place.note(faults, key, &format!("{b} follows {a}, must rise strictly"));
+        }
+    }
+    check_shape(place, "ocv_v", &tables.ocv_v, tables, faults);
+    check_shape(place, "r0_ohm", &tables.r0_ohm, tables, faults);
+    if let Some(voltage_error_v) = &tables.voltage_error_v {
+        check_shape(place, "voltage_error_v", voltage_error_v, tables, faults);
+    }
+    for (row, t) in tables.ocv_v.iter().zip(&tables.temperature_c) {
+        if let Some((a, b)) = first_not_rising(row) {
+            place.note(faults, "ocv_v", &format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));
+        }
+    }
+}
+
+fn check_branch_count(place: &TablePlace, written: usize, faults: &mut Faults) {
+    if written == 0 || written > MAX_BRANCHES {
+        let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
+        place.note(faults, "branches", &what);
+    }
+}
+
+fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Faults) {
+    for branch in branches {
+        check_shape(&branch.place, "r_ohm", &branch.r_ohm, tables, faults);
+        check_shape(&branch.place, "c_farad", &branch.c_farad, tables, faults);
+    }
+}
+
+fn check_spread(spread: &SpreadKeys, tables: &Tables, faults: &mut Faults) {
+    let (modes, socs) = (&spread.curve_modes_v, tables.soc.len());
+    if modes.len() != 2 || modes.iter().any(|mode_v| mode_v.len() != socs) {
+        let counts: Vec<String> = modes.iter().map(|mode_v| mode_v.len().to_string()).collect();
+        let what = format!("rows of {} values, must be two rows of {socs}, one value per soc", counts.join(" and "));
+        spread.place.note(faults, "curve_modes_v", &what);
+    }
+}
+
+/// No hole: as many rows as temperatures, as many columns as SOC breakpoints.
+fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables, faults: &mut Faults) {
+    let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
+    if rows.len() != temperatures {
+        let what = format!("{} rows, must be {temperatures}, one per temperature_c", rows.len());
+        place.note(faults, key, &what);
+    }
+    for (number, row) in (1..).zip(rows) {
+        if row.len() != socs {
+            let what = format!("row {number} has {} values, must be {socs}, one per soc", row.len());
+            place.note(faults, key, &what);
+        }
+    }
+}
+
+/// The first neighbours that do not rise.
+fn first_not_rising(values: &[f64]) -> Option<(f64, f64)> {
+    values.windows(2).find(|pair| pair[1] <= pair[0]).map(|pair| (pair[0], pair[1]))
+}

@@ -1,0 +1,217 @@
+//! The keys of `[[alarm]]`: what must fit together, and the rules they make.
+
+use crate::config::document::Faults;
+use crate::config::schema::RawTables;
+use crate::config::schema::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
+use crate::config::schema::{Level, Threshold};
+
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
+use crate::health::RechargeAlarm;
+
+/// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.
+const DEFAULT_HYSTERESIS: f64 = 0.02;
+
+/// The values of a new cell that relative thresholds refer to.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct RatedCell {
+    /// Capacity on the label, Ah.
+    pub capacity_ah: f64,
+    /// Time the reference charger needs for the recharge window of a cell with that capacity, s.
+    pub recharge_period_s: f64,
+}
+
+impl RatedCell {
+    /// Makes it of the rated capacity and the recharge window.
+    pub(crate) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
+        let recharge = recharge.config(capacity_ah);
+        let window = recharge.to_soc - recharge.from_soc;
+        Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
+    }
+
+    /// The value that is 100 % for a rule; `None` where none is.
+    fn whole(&self, rule: Rule) -> Option<f64> {
+        match (rule, rule.spec().unit) {
+            (_, Unit::AmpereHours) => Some(self.capacity_ah),
+            (Rule::RechargePeriodLow, _) => Some(self.recharge_period_s),
+            (Rule::ResistanceHigh, _) | (_, Unit::Fraction | Unit::FractionPerDay) => Some(1.0),
+            (_, Unit::Seconds | Unit::Ratio | Unit::Celsius | Unit::Cycles) => None,
+        }
+    }
+
+    fn value(&self, rule: Rule, level: Level) -> Option<f64> {
+        match level {
+            Level::Absolute(value) => Some(value),
+            Level::Relative(part) => self.whole(rule).map(|whole| part * whole),
+        }
+    }
+}
+
+impl Alarm {
+    /// The thresholds that are written, by severity, with their keys.
+    pub(crate) fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
+        let all = [
+            ("info", Severity::Info, self.info),
+            ("warning", Severity::Warning, self.warning),
+            ("severe", Severity::Severe, self.severe),
+        ];
+        all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
+    }
+
+    /// The value back at which an alarm clears.
+    fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
+        match threshold.clear {
+            Some(clear) => rated.value(self.rule, clear),
+            // A fault that has just begun does not end the one before.
+            None if lasts_only_while_there(self.rule) => Some(0.0),
+            None => {
+                let hysteresis = self.hysteresis.unwrap_or(DEFAULT_HYSTERESIS * set.abs());
+                Some(set - beyond_sign(self.rule) * hysteresis)
+            }
+        }
+    }
+
+    /// The rules it makes; relative thresholds of a rule that has no whole were noted by [`check`].
+    pub(crate) fn rules(&self, rated: &RatedCell) -> Vec<RuleConfig> {
+        let rule = |(_, severity, threshold): (_, _, Threshold)| {
+            let set = rated.value(self.rule, threshold.set)?;
+            Some(RuleConfig {
+                rule: self.rule,
+                severity,
+                threshold: set,
+                clear: self.clear(rated, set, &threshold)?,
+                when: self.when,
+                debounce_s: self.debounce_s,
+                debounce_events: self.debounce_events,
+                is_latching: self.latched,
+            })
+        };
+        self.thresholds().filter_map(rule).collect()
+    }
+}
+
+/// Whether the value of a rule is the duration of a fault: then only 0 means that there is none.
+fn lasts_only_while_there(rule: Rule) -> bool {
+    matches!(rule, Rule::BusFault | Rule::StoreFailed)
+}
+
+/// 1 where larger values are worse, -1 where smaller ones are.
+fn beyond_sign(rule: Rule) -> f64 {
+    match rule.spec().direction {
+        Direction::Below => -1.0,
+        Direction::Above => 1.0,
+    }
+}
+
+/// Notes keys of the alarms that do not fit together.
+pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>, faults: &mut Faults) {
+    for (index, alarm) in raw.alarms.iter().enumerate() {
+        let place = &alarm.place;
+        for (key, severity, _) in alarm.thresholds() {
+            let same = |other: &&Alarm| other.rule == alarm.rule && other.thresholds().any(|(_, s, _)| s == severity);
+            if let Some(twin) = raw.alarms[..index].iter().find(same) {
+                let line = twin.place.at.beside(place.line_of(key));
+                let what = format!("must be one per rule, {} in {line} has one", twin.place.path);
+                place.fault(faults, key, &what);
+            }
+        }
+        check_needs(alarm, raw, faults);
+        if alarm.thresholds().next().is_none() {
+            let text = format!("{} has no threshold, must have info, warning or severe", place.path);
+            faults.add_at(&place.at, text);
+        }
+        if let Some(rated) = rated {
+            check_thresholds(alarm, rated, faults);
+        }
+    }
+}
+
+/// Notes what a rule needs from the rest of the file and is missing.
+fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
+    let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
+    let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
+    let missing = match alarm.rule {
+        Rule::UsableCapacityLow if !raw.is_written::<Usable>() => "must have a table [usable] that states the load",
+        Rule::TemperatureHigh if raw.temperatures.is_empty() && !raw.broken => "must have an [[input.temperature]]",
+        Rule::CellImbalance if cells < 2 => "must have the voltages of at least two cells",
+        Rule::CellLeak | Rule::ConnectionResistance | Rule::ChannelFaulty if cells < 3 => {
+            "must have the voltages of at least three cells"
+        }
+        Rule::BmsDisagrees if !is_reported => "must have [input.reported_soc] or [input.reported_soh]",
+        _ => "",
+    };
+    if !missing.is_empty() {
+        alarm.place.fault(faults, "rule", missing);
+    }
+    let is_raw_period = alarm.rule == Rule::RechargePeriodLow
+        && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
+    if alarm.when != Comparison::Mean && (!alarm.rule.spec().has_deviation || is_raw_period) {
+        let what = if is_raw_period {
+            "must be \"mean\" with recharge.alarm_on = \"raw\": that period has no standard deviation"
+        } else {
+            "must be \"mean\": the value of this rule has no standard deviation"
+        };
+        alarm.place.fault(faults, "when", what);
+    }
+}
+
+/// Each clear threshold on the healthy side, each more severe threshold further out.
+fn check_thresholds(alarm: &Alarm, rated: &RatedCell, faults: &mut Faults) {
+    let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
+    let side = if sign > 0.0 { "below" } else { "above" };
+    let mut milder: Option<(&str, f64)> = None;
+    for (key, _, threshold) in alarm.thresholds() {
+        let Some(set) = rated.value(alarm.rule, threshold.set) else {
+            place.fault(faults, key, "must be a number: nothing is 100 % for this rule");
+            continue;
+        };
+        check_unit(alarm, key, set, faults);
+        match threshold.clear.map(|clear| rated.value(alarm.rule, clear)) {
+            Some(None) => place.fault(faults, key, "must clear at a number: nothing is 100 % for this rule"),
+            Some(Some(clear)) if sign * (clear - set) > 0.0 => {
+                let what = format!("must clear at {set} or {side} it, on the healthy side, not at {clear}");
+                place.fault(faults, key, &what);
+            }
+            Some(Some(_)) | None => {}
+        }
+        check_reachable(alarm, key, rated, set, &threshold, faults);
+        if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
+            let beyond = if sign > 0.0 { "above" } else { "below" };
+            place.fault(faults, key, &format!("must be {beyond} {other} = {value}: it is the graver one"));
+        }
+        milder = Some((key, set));
+    }
+}
+
+/// Notes an alarm that no value can clear: it would stay for ever.
+fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold, faults: &mut Faults) {
+    let written = if threshold.clear.is_some() { key } else { "hysteresis" };
+    if lasts_only_while_there(alarm.rule) {
+        if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
+            alarm.place.fault(faults, written, "must not be given: it is cleared at 0, when all is in order again");
+        }
+        return;
+    }
+    let Some(clear) = alarm.clear(rated, set, threshold) else { return };
+    let (low, high) = match alarm.rule.spec().unit {
+        Unit::Fraction | Unit::FractionPerDay => (0.0, 1.0),
+        Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
+        Unit::Celsius => return,
+    };
+    let is_within = (0.0..=high).contains(&set); // otherwise there is a fault already, or it is never raised
+    if is_within && !(low..=high).contains(&clear) {
+        let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
+        alarm.place.fault(
+            faults,
+            written,
+            &format!("must leave a value that clears {key} within {range}, not {clear}"),
+        );
+    }
+}
+
+/// Notes a percent written without its sign: such a threshold is always or never passed.
+fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
+    let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
+    if is_fraction && !(0.0..=1.0).contains(&set) {
+        alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
+    }
+}

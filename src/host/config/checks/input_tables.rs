@@ -1,0 +1,82 @@
+//! Checks of the input tables that need no whole table: their interfaces, and signal names where another key is faulty.
+//!
+//! In: the document, so that a table that cannot be read as a whole is checked all the same and every fault is reported at
+//! once.
+
+use toml::de::{DeTable, DeValue};
+
+use super::signals::{self, Databases};
+use crate::config::document::{Document, Faults, TablePlace};
+use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
+use crate::config::schema::{RawTables, SECTIONS};
+use crate::config::schema::{Section as _, SectionInfo};
+
+/// Notes interfaces that are not there, and missing ones where there are several.
+pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut Faults) {
+    if raw.broken {
+        return;
+    }
+    let count = raw.count::<Interface>();
+    let allowed = match raw.has_all_interfaces() {
+        true => format!("must be {}", raw.interface_names()),
+        false => format!("must be the name of one of {count} interfaces"),
+    };
+    if count > 1 && !raw.is_written::<CurrentInput>() {
+        let text = format!("{}.interface is missing, {allowed}", CurrentInput::PATH);
+        match raw.input.as_ref() {
+            Some(input) => faults.add_at(&input.place.at, text),
+            None => faults.add(&document.file, 1, text),
+        }
+    }
+    for (place, table) in with_key("interface").flat_map(|info| tables(document, info)) {
+        let is_fault = match table.get("interface").map(|value| value.get_ref().as_str()) {
+            Some(Some(name)) => {
+                raw.has_all_interfaces() && count > 0 && !raw.interfaces.iter().any(|interface| interface.name == name)
+            }
+            Some(None) => false, // not a text: noted when it was read
+            None => count > 1,
+        };
+        if is_fault {
+            place.fault(faults, "interface", &allowed);
+        }
+    }
+}
+
+/// Notes signals that are not in the DBC files, of tables with another fault.
+pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases, faults: &mut Faults) {
+    let read: Vec<&str> = raw.places().map(|place| place.path.as_str()).collect();
+    for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {
+        let signal = table.get("signal").and_then(|value| value.get_ref().as_str());
+        let Some(signal) = signal.filter(|name| !name.contains('{') && !read.contains(&place.path.as_str())) else {
+            continue;
+        };
+        let source =
+            SignalSource { place: &place, signal, interface: None, scale: 1.0, offset: 0.0, not_available: &[] };
+        signals::check_name(raw, databases, &source, faults);
+    }
+}
+
+/// The input tables that have a key.
+fn with_key(key: &str) -> impl Iterator<Item = &'static SectionInfo> {
+    let has = move |info: &&SectionInfo| info.keys.is_some_and(|keys| keys.iter().any(|known| known.name == key));
+    SECTIONS.iter().filter(|info| info.path.starts_with("input.")).filter(has)
+}
+
+/// The tables of a section as they are written, with their places.
+fn tables<'d>(document: &'d Document<'d>, info: &SectionInfo) -> Vec<(TablePlace, &'d DeTable<'d>)> {
+    let Some(value) = document.find(info.path) else { return Vec::new() };
+    match value.get_ref() {
+        DeValue::Table(table) => {
+            vec![(document.place(info.path, document.line(&value.span()), table), table)]
+        }
+        DeValue::Array(items) => {
+            let tables = (1..).zip(items.iter()).filter_map(|(number, item)| {
+                let DeValue::Table(table) = item.get_ref() else { return None };
+                let path = format!("{}[{number}]", info.path);
+                Some((document.place(&path, document.line(&item.span()), table), table))
+            });
+            tables.collect()
+        }
+        _ => Vec::new(),
+    }
+}

@@ -1,0 +1,151 @@
+//! `[j1939]` and the `spn` of each alarm to a node's settings: its NAME, and each alarm as a trouble code.
+//!
+//! Nothing the node sends may be mistaken for an input or for a frame of `[output]`, and no two rules may share a code.
+
+use super::signals::Checks;
+use crate::alarm::{Direction, Rule, Severity};
+use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
+use crate::config::document::Faults;
+use crate::config::schema::keys::{Alarm, J1939};
+use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
+use crate::quantity::BusIndex;
+
+/// First suspect parameter number left to makers (unverified: from memory of J1939-73); rules follow it by their numbers.
+const FIRST_MAKER_SPN: u32 = 520_192;
+
+/// Failure mode of a test: condition exists.
+const TEST_FMI: u8 = 31;
+
+/// The node; `None` = there is none (not configured, silenced, or faults noted).
+pub(crate) fn node(checks: &mut Checks<'_>, output: Option<&OutputConfig>) -> Option<J1939Config> {
+    let raw = checks.raw;
+    let Some(keys) = &raw.j1939 else {
+        if !raw.broken && !raw.is_written::<J1939>() {
+            for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
+                let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
+                alarm.place.fault(checks.faults, key, "must have a table [j1939], without it nothing is sent on J1939");
+            }
+        }
+        return None;
+    };
+    let alarms = codes(&raw.alarms, checks.faults);
+    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place, checks.faults);
+    let node = NodeConfig { name: name(keys, checks.faults)?, address: address(keys, checks.faults)? };
+    check_ids(keys, &node, bus?, output, checks);
+    let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
+    let test_code = test_code.map_err(|error| keys.place.fault(checks.faults, "test_spn", &error.to_string())).ok()?;
+    Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
+}
+
+fn address(keys: &J1939, faults: &mut Faults) -> Option<u8> {
+    let address = Some(keys.address).filter(|address| *address <= MAX_ADDRESS);
+    if address.is_none() {
+        keys.place.fault(faults, "address", &format!("must be 0 to {MAX_ADDRESS}"));
+    }
+    address
+}
+
+fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
+    let fields = NameFields {
+        arbitrary_address_capable: false,
+        industry_group: keys.industry_group,
+        vehicle_system_instance: keys.vehicle_system_instance,
+        vehicle_system: keys.vehicle_system,
+        function: keys.function,
+        function_instance: keys.function_instance,
+        ecu_instance: keys.ecu_instance,
+        manufacturer_code: keys.manufacturer_code,
+        identity_number: keys.identity_number,
+    };
+    Name::new(&fields).map_err(|error| keys.place.fault(faults, error.field, &error.to_string())).ok()
+}
+
+/// The code of every threshold; `None` when one is faulty (noted).
+fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
+    let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
+    let mut is_good = true;
+    for alarm in alarms {
+        for (key, severity, _) in alarm.thresholds() {
+            let Some(own) = code(alarm, severity, faults) else {
+                is_good = false;
+                continue;
+            };
+            let same = |(other, of): &&(&Alarm, AlarmCode)| other.rule != alarm.rule && of.code == own.code;
+            if let Some((twin, _)) = codes.iter().find(same) {
+                let line = twin.place.at.beside(alarm.place.line_of("spn"));
+                let (path, fmi) = (&twin.place.path, own.code.fmi());
+                let what = format!("must not give two rules one code, {path} in {line} has it with FMI {fmi} ({key})");
+                alarm.place.fault(faults, "spn", &what);
+                is_good = false;
+            }
+            codes.push((alarm, own));
+        }
+    }
+    is_good.then(|| codes.into_iter().map(|(_, code)| code).collect())
+}
+
+fn code(alarm: &Alarm, severity: Severity, faults: &mut Faults) -> Option<AlarmCode> {
+    // The rule's number as in alarm frames.
+    let spn = alarm.spn.unwrap_or(FIRST_MAKER_SPN + u32::from(alarm.rule as u8));
+    let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
+    match TroubleCode::new(spn, fmi, 0) {
+        Ok(code) => Some(AlarmCode { rule: alarm.rule, severity, code, lamp: lamp(severity) }),
+        Err(error) => {
+            alarm.place.fault(faults, "spn", &error.to_string());
+            None
+        }
+    }
+}
+
+/// Failure mode identifiers of J1939-73, appendix A.
+fn failure_mode(rule: Rule, severity: Severity) -> u8 {
+    match rule {
+        // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.
+        Rule::InputMissing => 9,
+        Rule::BusFault => 19,
+        Rule::InputImplausible | Rule::BmsDisagrees | Rule::ChannelFaulty => 2,
+        Rule::EstimateUntrusted | Rule::StoreFailed => 31,
+        Rule::CapacityLow
+        | Rule::UsableCapacityLow
+        | Rule::RechargePeriodLow
+        | Rule::ResistanceHigh
+        | Rule::SocLow
+        | Rule::TemperatureHigh
+        | Rule::CellImbalance
+        | Rule::RemainingLifeLow
+        | Rule::CellLeak
+        | Rule::ConnectionResistance => match (rule.spec().direction, severity) {
+            // Data valid, but beyond normal: least, moderately, most severe.
+            (Direction::Below, Severity::Info) => 17,
+            (Direction::Below, Severity::Warning) => 18,
+            (Direction::Below, Severity::Severe) => 1,
+            (Direction::Above, Severity::Info) => 15,
+            (Direction::Above, Severity::Warning) => 16,
+            (Direction::Above, Severity::Severe) => 0,
+        },
+    }
+}
+
+/// Never the malfunction lamp: that one is about emissions.
+fn lamp(severity: Severity) -> Lamp {
+    match severity {
+        Severity::Info => Lamp::Protect,
+        Severity::Warning => Lamp::Amber,
+        Severity::Severe => Lamp::Red,
+    }
+}
+
+/// No identifier of the node is one of an input or of a frame of `[output]` on its interface.
+fn check_ids(keys: &J1939, node: &NodeConfig, bus: BusIndex, output: Option<&OutputConfig>, checks: &mut Checks<'_>) {
+    let Checks { found, faults, .. } = checks;
+    let sent = node.sent_ids();
+    if let Some(input) = found.iter().find(|f| f.bus == bus && sent.contains(&f.message.id)) {
+        let (name, id) = (&input.message.name, input.message.id);
+        keys.place.fault(faults, "address", &format!("must not be the address of an input, {name} has {id}"));
+    }
+    let output = output.filter(|output| output.buses.contains(&bus));
+    if let Some(id) = output.and_then(|output| output.plan.ids().into_iter().find(|id| sent.contains(id))) {
+        let what = format!("must not be the address in the identifier of a frame of [output], {id}");
+        keys.place.fault(faults, "address", &what);
+    }
+}

@@ -1,0 +1,523 @@
+//! Checks of what is written correctly and cannot be meant: signals beyond their message, shared bits, units, empty ranges,
+//! the capacity of another cell.
+//!
+//! In: the tables, the signals found, the cell model. Out: faults where it is certainly wrong, warnings where it is only
+//! unlikely. A `scale` (or `offset`) that is written overrules the unit of the DBC.
+
+use super::modules::Module;
+use super::signals::{self, ResolvedSignal};
+use crate::can::dbc::{MuxCondition, Signal};
+use crate::can::signal::{ByteOrder, SignalLayout};
+use crate::can::unit::{Quantity, SignalUnit};
+use crate::cell::CellModel;
+use crate::config::document::{Faults, TablePlace};
+use crate::config::schema::RawTables;
+use crate::quantity::{Channel, bounds};
+use crate::sample::Limits;
+
+/// A scale that differs from the unit's by less is a calibration.
+const SCALE_TOLERANCE: f64 = 0.1;
+/// An offset that differs from the unit's by less is a calibration, K.
+const OFFSET_TOLERANCE_C: f64 = 20.0;
+/// The rated capacity over the cell model's, or its reciprocal, from which they are of different cells: the estimator learns a
+/// resistance of at most this many times the model's.
+const OTHER_CELL: f64 = 3.0;
+/// The same from which it is unlikely that they are of one cell.
+const UNLIKE_CELL: f64 = 1.25;
+/// Labels of one cell differ by less than this fraction.
+const LABEL_TOLERANCE: f64 = 0.05;
+
+/// Voltages of a lithium cell whose model cannot be read, V.
+const ANY_CELL_V: (f64, f64) = (1.2, 4.6);
+/// Temperatures of which a sensor must be able to report some, degrees C.
+const TEMPERATURES_C: (f64, f64) = (-40.0, 80.0);
+
+/// Notes what cannot be meant about the signals found.
+pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
+    let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
+    for (place, signals) in by_table(raw, found) {
+        unreadable(place, &signals, faults);
+        ends(place, &signals, faults);
+        let before = faults.len();
+        units(place, &signals, (model, series), faults);
+        if faults.len() == before {
+            reach(place, &signals, (model, series), faults);
+        }
+    }
+    overlaps(raw, found, faults);
+}
+
+/// Values of which a channel must be able to report some, in its unit; `None` = any.
+fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
+    let (low, high) = model.map_or(ANY_CELL_V, |model| (model.voltage_min_v, model.voltage_max_v));
+    match channel {
+        Channel::CellVoltage(_) => Some((low, high)),
+        Channel::PackVoltage => Some((low * f64::from(series), high * f64::from(series))),
+        Channel::Temperature(_) => Some(TEMPERATURES_C),
+        _ => None,
+    }
+}
+
+/// What the bits of a signal hold after a conversion.
+fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
+    let (low, high) = resolved.signal.layout.extent();
+    (low * scale + offset, high * scale + offset)
+}
+
+/// Signals whose bits cannot hold a value that the pack has: the first of the table.
+fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16), faults: &mut Faults) {
+    let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
+        let needed = needed_values(resolved.channel, pack)?;
+        let (low, high) = held(resolved, resolved.scale, resolved.offset);
+        (low > needed.1 || high < needed.0).then_some((resolved, needed, (low, high)))
+    });
+    let Some((resolved, (from, to), (low, high))) = beyond else { return };
+    let unit = needed(resolved.channel).map_or("", |(_, unit)| unit);
+    let (name, low, high) = (name(resolved, resolved.signal), digits(low, 3), digits(high, 3));
+    let what = format!(
+        "the bits of {name} hold {low} to {high} {unit} after factor and scale, must reach {} to {} {unit}",
+        digits(from, 3),
+        digits(to, 3)
+    );
+    place.fault(faults, if place.has("scale") { "scale" } else { "signal" }, &what);
+}
+
+/// The signals of each table, in the order of the file.
+fn by_table<'r, 'd>(
+    raw: &'r RawTables,
+    found: &'r [ResolvedSignal<'d>],
+) -> Vec<(&'r TablePlace, Vec<&'r ResolvedSignal<'d>>)> {
+    let mut tables: Vec<(&TablePlace, Vec<&ResolvedSignal<'_>>)> = Vec::new();
+    for resolved in found {
+        let Some(source) = raw.source(resolved.channel) else { continue };
+        match tables.iter_mut().find(|(place, _)| place.path == source.place.path) {
+            Some((_, signals)) => signals.push(resolved),
+            None => tables.push((source.place, vec![resolved])),
+        }
+    }
+    tables
+}
+
+/// The signal's name, and that of its table's message.
+fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
+    format!("{}.{}", resolved.message.name, signal.name)
+}
+
+/// Signals with a layout or range that is no layout or range: one fault per table and reason.
+fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+    let mut reasons: Vec<(String, &ResolvedSignal<'_>, usize)> = Vec::new();
+    for resolved in signals {
+        let Err(reason) = resolved.binding() else { continue };
+        let reason = reason.to_string();
+        match reasons.iter_mut().find(|(known, ..)| *known == reason) {
+            Some((.., others)) => *others += 1,
+            None => reasons.push((reason, resolved, 0)),
+        }
+    }
+    for (reason, first, others) in reasons {
+        let (name, file) = (name(first, first.signal), first.file);
+        let others = match others {
+            0 => String::new(),
+            1 => " and 1 other".to_owned(),
+            others => format!(" and {others} others"),
+        };
+        place.fault(faults, "signal", &format!("{name}{others} in {file} cannot be read: {reason}"));
+    }
+}
+
+/// Signals, and the multiplexors they depend on, that reach beyond their message: one fault per table.
+fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+    // An answer has no length that is known before it comes.
+    let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
+    let parts = in_frames.flat_map(|resolved| {
+        let selectors = selectors(resolved).map(|(_, selector)| selector);
+        selectors.chain([resolved.signal]).map(|signal| (*resolved, signal))
+    });
+    let is_beyond = |(resolved, signal): &(&ResolvedSignal<'_>, &Signal)| {
+        signal.layout.end_byte() > u32::from(resolved.message.len_bytes)
+    };
+    let mut beyond: Vec<(&ResolvedSignal<'_>, &Signal)> = parts.filter(is_beyond).collect();
+    beyond.dedup_by(|a, b| std::ptr::eq(a.1, b.1));
+    let Some(&(resolved, signal)) = beyond.first() else { return };
+    let others = match beyond.len() - 1 {
+        0 => " ends".to_owned(),
+        1 => " and 1 other end".to_owned(),
+        others => format!(" and {others} others end"),
+    };
+    let whose = if beyond.len() == 1 { "its" } else { "their" };
+    let (byte, len, file) = (signal.layout.end_byte(), resolved.message.len_bytes, resolved.file);
+    let mut what = format!(
+        "{}{others} in byte {byte} of {whose} message, must end within the {len} that {file} gives it",
+        name(resolved, signal)
+    );
+    if let Some((order, layout)) = other_order(&signal.layout)
+        && layout.end_byte() <= u32::from(len)
+    {
+        what +=
+            &format!("; with the other byte order ({order}) {} would", if beyond.len() == 1 { "it" } else { "they" });
+    }
+    place.fault(faults, "signal", &what);
+}
+
+/// The layout with the byte order's character in the DBC exchanged; `None` for a signal within a byte.
+fn other_order(layout: &SignalLayout) -> Option<(&'static str, SignalLayout)> {
+    let (order, byte_order) = match layout.byte_order {
+        ByteOrder::LittleEndian => ("@0", ByteOrder::BigEndian),
+        ByteOrder::BigEndian => ("@1", ByteOrder::LittleEndian),
+    };
+    (layout.length_bits > 1).then_some((order, SignalLayout { byte_order, ..*layout }))
+}
+
+/// The multiplexors a signal depends on, with its condition on each.
+fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r MuxCondition, &'r Signal)> {
+    let conditions = resolved.signal.conditions.iter();
+    conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
+}
+
+/// Inputs of one message that share bits, or have bits of a multiplexor: one fault per pair of tables.
+fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) {
+    for (place, signals) in by_table(raw, found) {
+        let mut pairs: Vec<(String, String)> = Vec::new();
+        for resolved in signals {
+            let selectors = selectors(resolved).map(|(_, selector)| selector);
+            let earlier = found.iter().take_while(|other| !std::ptr::eq(*other, resolved));
+            let beside = earlier.filter(|other| is_beside(other, resolved) && has_bits_of(other, resolved));
+            let selectors = selectors.filter(|other| other.layout.overlaps(&resolved.signal.layout));
+            let shared = selectors.chain(beside.map(|other| other.signal));
+            pairs.extend(shared.map(|other| (name(resolved, other), name(resolved, resolved.signal))));
+        }
+        let Some((first, second)) = pairs.first() else { continue };
+        let more = match pairs.len() - 1 {
+            0 => String::new(),
+            1 => " (and 1 other pair)".to_owned(),
+            more => format!(" (and {more} other pairs)"),
+        };
+        let what = format!("{first} and {second}{more} share bits of one message, must be apart");
+        place.fault(faults, "signal", &what);
+    }
+}
+
+/// Whether two inputs are different signals of one message that a payload can carry together.
+fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
+    let is_other_page = |condition: &MuxCondition| {
+        let same = b.signal.conditions.iter().find(|other| other.selector == condition.selector);
+        same.is_some_and(|other| !condition.ranges.iter().any(|range| other.ranges.iter().any(|o| is_met(*range, *o))))
+    };
+    a.bus == b.bus
+        && std::ptr::eq(a.message, b.message)
+        && !std::ptr::eq(a.signal, b.signal)
+        && !a.signal.conditions.iter().any(is_other_page)
+}
+
+/// Whether two inputs of one message share bits; the layouts of an answer's signals begin at their own first bytes.
+fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
+    let bits = |resolved: &ResolvedSignal<'_>| {
+        let first = resolved.answer?.bit(&resolved.signal.layout);
+        Some(first..first + usize::from(resolved.signal.layout.length_bits))
+    };
+    match (bits(a), bits(b)) {
+        (Some(a), Some(b)) => a.start < b.end && b.start < a.end,
+        _ => a.signal.layout.overlaps(&b.signal.layout),
+    }
+}
+
+/// Whether two ranges, ends included, have a code in common.
+fn is_met(a: (u64, u64), b: (u64, u64)) -> bool {
+    a.0 <= b.1 && b.0 <= a.1
+}
+
+/// The quantity a channel needs and its unit; `None` = any.
+fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
+    match channel {
+        Channel::Current => Some((Quantity::Current, "A")),
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage => Some((Quantity::Voltage, "V")),
+        Channel::Temperature(_) => Some((Quantity::Temperature, "degrees C")),
+        Channel::ReportedSoc | Channel::ReportedSoh => Some((Quantity::PERCENTAGE, "% or a fraction")),
+        Channel::Balancing(_) | Channel::PackIdentity | Channel::Contactor => None,
+    }
+}
+
+/// Units of the DBC that are not those of the input, each once.
+fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16), faults: &mut Faults) {
+    let mut seen: Vec<&str> = Vec::new();
+    for resolved in signals {
+        let text = resolved.signal.unit.as_str();
+        let (Some((quantity, wanted)), Some(unit)) = (needed(resolved.channel), SignalUnit::parse(text)) else {
+            continue;
+        };
+        if seen.contains(&text) {
+            continue;
+        }
+        seen.push(text);
+        let name = name(resolved, resolved.signal);
+        if unit.quantity == Quantity::PERCENTAGE && quantity == unit.quantity {
+            continue; // its scale is 0.01 where none is written
+        }
+        if unit.quantity == quantity {
+            let is_held = needed_values(resolved.channel, pack).is_none_or(|(low, high)| {
+                let held = held(resolved, unit.factor, unit.offset);
+                held.0 <= high && held.1 >= low
+            });
+            conversion(place, (resolved, unit, is_held), (&name, wanted), faults);
+        } else {
+            other_quantity(place, unit.quantity, (&name, text, wanted), faults);
+        }
+    }
+}
+
+/// Whether the configuration says how the DBC's values are converted.
+fn is_converted(place: &TablePlace) -> bool {
+    place.has("scale") || place.has("offset")
+}
+
+fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&str, &str, &str), faults: &mut Faults) {
+    let found = match found {
+        Quantity::Current => "a current",
+        Quantity::Voltage => "a voltage",
+        Quantity::Temperature => "a temperature",
+        Quantity::Other(quantity) => quantity,
+    };
+    if is_converted(place) {
+        let key = if place.has("scale") { "scale" } else { "offset" };
+        place.warn(faults, key, &format!("the unit of {name} is {unit:?}, {found}, where {wanted} is expected"));
+    } else {
+        let what =
+            format!("the unit of {name} is {unit:?}, {found}, must be {wanted} (scale = 1.0 if the DBC is wrong)");
+        place.fault(faults, "signal", &what);
+    }
+}
+
+/// `is_held`: the bits can hold a pack's value in that unit; if not, the DBC's unit is wrong.
+fn conversion(
+    place: &TablePlace,
+    (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
+    (name, wanted): (&str, &str),
+    faults: &mut Faults,
+) {
+    let (scale, offset) = (resolved.scale.abs(), resolved.offset);
+    let is_scale = (scale / unit.factor - 1.0).abs() <= SCALE_TOLERANCE;
+    let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= OFFSET_TOLERANCE_C;
+    if is_scale && is_offset {
+        return;
+    }
+    let (key, needed) = if is_scale { ("offset", unit.offset) } else { ("scale", unit.factor) };
+    let (needed, text) = (toml(needed), &resolved.signal.unit);
+    let beside =
+        if is_scale || unit.offset == 0.0 { String::new() } else { format!(", with offset = {}", toml(unit.offset)) };
+    if !is_held && !is_converted(place) {
+        let what = format!("the unit of {name} is {text:?}, in which its bits hold no pack's value: taken as {wanted}");
+        place.warn(faults, "signal", &what);
+    } else if is_converted(place) {
+        let what = format!("would be {needed}{beside} by the unit {text:?} of {name}");
+        place.warn(faults, key, &what);
+    } else {
+        let unscaled = if key == "offset" { "0.0" } else { "1.0" };
+        let what = format!(
+            "must be {needed}{beside}: the unit of {name} is {text:?} ({unscaled} if the DBC is wrong and it is {wanted})"
+        );
+        place.fault(faults, key, &what);
+    }
+}
+
+/// A float as TOML writes it, of ten digits.
+fn toml(value: f64) -> String {
+    format!("{:?}", digits(value, 9))
+}
+
+/// Rounded to `decimals` digits behind the first.
+fn digits(value: f64, decimals: usize) -> f64 {
+    format!("{value:.decimals$e}").parse().unwrap_or(value)
+}
+
+/// What readings of one kind may be, and where the limits are written.
+struct AllowedRange<'a> {
+    place: &'a TablePlace,
+    keys: [&'static str; 2],
+    limits: Limits,
+    /// Limits of the DBC after scale.
+    dbc: (f64, f64),
+    /// Where a limit comes from that is not written.
+    origin: &'static str,
+    unit: &'static str,
+    /// Input whose DBC gives the range.
+    input: Option<&'a TablePlace>,
+}
+
+/// Notes ranges of plausible readings that allow none.
+pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
+    let Some(pack) = &raw.pack else { return };
+    let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
+    let dbc = signals::ranges(&readable, pack.cells);
+    let input = |belongs: fn(Channel) -> bool| {
+        let first = found.iter().find(|resolved| belongs(resolved.channel))?;
+        raw.source(first.channel).map(|source| source.place)
+    };
+    if let Some(keys) = &raw.current_limits {
+        allowed(
+            &AllowedRange {
+                place: &keys.place,
+                keys: ["max_charge_a", "max_discharge_a"],
+                limits: keys.config(dbc.current_a),
+                dbc: dbc.current_a,
+                origin: "of the DBC",
+                unit: "A",
+                input: input(|channel| channel == Channel::Current),
+            },
+            faults,
+        );
+    }
+    if let Some(keys) = &raw.temperature_limits {
+        allowed(
+            &AllowedRange {
+                place: &keys.place,
+                keys: ["min_c", "max_c"],
+                limits: keys.config(dbc.temperature_c),
+                dbc: dbc.temperature_c,
+                origin: "of the DBC",
+                unit: "degrees C",
+                input: input(|channel| matches!(channel, Channel::Temperature(_))),
+            },
+            faults,
+        );
+    }
+    let (Some(keys), Some(model)) = (&raw.voltage_limits, model) else { return };
+    let range = AllowedRange {
+        place: &keys.place,
+        keys: ["min_v", "max_v"],
+        limits: keys.config(model, dbc.voltage_v),
+        dbc: dbc.voltage_v,
+        origin: "of the DBC or the cell model",
+        unit: "V",
+        input: input(|channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage)),
+    };
+    if allowed(&range, faults) {
+        voltages_of_model(&range, model, faults);
+    }
+}
+
+/// Whether the range allows anything; a fault if not.
+fn allowed(range: &AllowedRange<'_>, faults: &mut Faults) -> bool {
+    let AllowedRange { place, keys: [low_key, high_key], limits, dbc, origin, unit, input } = range;
+    let (low, high) = (digits(limits.min, 9), digits(limits.max, 9));
+    if low < high {
+        return true;
+    }
+    match (place.has(low_key), place.has(high_key)) {
+        (true, true) => {} // noted where the keys are compared
+        (false, true) => {
+            let what =
+                format!("allows nothing: the smallest plausible value is {low} {unit} ({origin}), must be above it");
+            place.fault(faults, high_key, &what);
+        }
+        (true, false) => {
+            let what =
+                format!("allows nothing: the largest plausible value is {high} {unit} ({origin}), must be below it");
+            place.fault(faults, low_key, &what);
+        }
+        (false, false) => {
+            let (from, to) = (digits(dbc.0, 9), digits(dbc.1, 9));
+            let what = format!(
+                "the DBC's range is {from} to {to} {unit} after scale, must have values a pack can have; [{}] overrides it",
+                place.path
+            );
+            if let Some(input) = input {
+                input.fault(faults, "signal", &what);
+            }
+        }
+    }
+    false
+}
+
+/// Notes limits without any voltage that the cell model has.
+fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel, faults: &mut Faults) {
+    let Limits { min, max, .. } = range.limits;
+    let (low, high) = (model.voltage_min_v, model.voltage_max_v);
+    if min < high && max > low {
+        return;
+    }
+    let what = format!(
+        "allows {} to {} V, must allow some of the {low} to {high} V of the cell model",
+        digits(min, 9),
+        digits(max, 9)
+    );
+    let key = range.keys[usize::from(max <= low)];
+    match range.input.filter(|_| !range.place.has(key)) {
+        Some(input) => input.fault(faults, "signal", &what),
+        None => range.place.fault(faults, key, &what),
+    }
+}
+
+/// Notes an initial capacity that no cell of the model can have.
+pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
+    initial_of(&pack.place, pack.initial_capacity_ah, model, faults);
+}
+
+/// Notes a module's initial capacity that no cell of its model has, a rated one that is not of a cell like it, and cells of
+/// another size than the pack's own, which have `own_ah`.
+pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>, faults: &mut Faults) {
+    let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
+    if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
+        let (ratio, own_ah) = (digits(beside, 3), digits(own_ah, 3));
+        let what =
+            format!("are cells of {ratio} times the {own_ah} Ah of the pack's own, which carry the same current");
+        keys.place.warn(faults, "cells", &what);
+    }
+    initial_of(&keys.place, keys.initial_capacity_ah, model, faults);
+    let ratio = model.rated_capacity_ah / model.capacity_ah;
+    if ratio.max(1.0 / ratio) >= OTHER_CELL {
+        let what =
+            format!("must be that of one cell of {:?}, which has {} Ah", model.name, digits(model.capacity_ah, 3));
+        keys.place.fault(faults, "rated_capacity_ah", &what);
+    }
+}
+
+fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel, faults: &mut Faults) {
+    let Some(initial_ah) = initial_ah else { return };
+    if !bounds::INITIAL_CAPACITY.has(initial_ah / model.capacity_ah) {
+        let [low, high] =
+            [bounds::INITIAL_CAPACITY.low, bounds::INITIAL_CAPACITY.high].map(|by| digits(by * model.capacity_ah, 3));
+        let what = format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name);
+        place.fault(faults, "initial_capacity_ah", &what);
+    }
+}
+
+/// Notes a rated capacity that is not of a cell like the model's.
+pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+    let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
+    let Some(rated_ah) = pack.rated_capacity_ah else { return };
+    let ratio = rated_ah / model.rated_capacity_ah;
+    let unlike = ratio.max(1.0 / ratio);
+    if unlike < UNLIKE_CELL {
+        return;
+    }
+    let model_ah = digits(model.rated_capacity_ah, 3);
+    let found = format!("is {} times the {model_ah} Ah of the cell model {:?}", digits(ratio, 3), model.name);
+    let hint = parallel_cells(ratio, pack.strings);
+    if unlike >= OTHER_CELL {
+        let [low, high] = [1.0 / OTHER_CELL, OTHER_CELL].map(|by| digits(model.rated_capacity_ah * by, 3));
+        let what = format!("{found}, must be that of one cell of this model, {low} to {high} Ah{hint}");
+        pack.place.fault(faults, "rated_capacity_ah", &what);
+    } else {
+        let soh = digits(100.0 * pack.initial_capacity_ah.unwrap_or(model.capacity_ah) / rated_ah, 3);
+        let what =
+            format!("{found}: SOH begins at {soh} %, and resistances are those of a cell of {model_ah} Ah{hint}");
+        pack.place.warn(faults, "rated_capacity_ah", &what);
+    }
+}
+
+/// What may be meant by a capacity of `ratio` cells.
+fn parallel_cells(ratio: f64, strings: u16) -> String {
+    let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= LABEL_TOLERANCE;
+    let whole = ratio.round();
+    if strings > 1 && is_about(f64::from(strings)) {
+        format!("; it is that of all {strings} strings together")
+    } else if whole >= 2.0 && is_about(whole) {
+        let strings = whole * f64::from(strings);
+        format!("; {whole} cells in parallel are strings = {strings} without this key")
+    } else if ratio > 1.0 {
+        "; no number of cells in parallel gives it".to_owned()
+    } else {
+        String::new()
+    }
+}

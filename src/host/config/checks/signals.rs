@@ -1,0 +1,376 @@
+//! Configured signal names to signals of the DBC files.
+//!
+//! Every name must be found in exactly one of the files, every cell exactly once, and a signal longer than a
+//! classic frame only on an interface with `fd = true`. All faults are noted, none ends the search.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::answers::{self, AnswerDefinition, AnswerPlace};
+use super::pattern::Pattern;
+use crate::can::CanId;
+use crate::can::dbc::{Database, Message, Signal};
+use crate::can::decode::{Binding, InputMap};
+use crate::can::signal::{LayoutFault, ValueType};
+use crate::config::document::{Faults, ReadFile, TablePlace, beside};
+use crate::config::schema::RawTables;
+use crate::config::schema::did_you_mean;
+use crate::config::schema::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
+use crate::quantity::{BusIndex, CellIndex, Channel};
+
+/// Most cell numbers named in one fault.
+const MAX_NAMED_CELLS: usize = 8;
+
+/// Longest identity, bits: the whole numbers a reading represents exactly.
+const MAX_IDENTITY_BITS: u16 = 53;
+
+/// The DBC files and diagnostic answers of a configuration.
+#[derive(Debug)]
+pub(crate) struct Databases {
+    files: Vec<(String, Database)>,
+    answers: Vec<AnswerDefinition>,
+}
+
+/// A signal that can be named.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct NamedSignal<'d> {
+    /// DBC file, or table of the answer.
+    pub file: &'d str,
+    /// Its message.
+    pub message: &'d Message,
+    /// The signal.
+    pub signal: &'d Signal,
+    /// Its position, where it is in a diagnostic answer.
+    pub answer: Option<AnswerPlace<'d>>,
+}
+
+impl NamedSignal<'_> {
+    /// `Message.Signal`.
+    pub(crate) fn full_name(&self) -> String {
+        format!("{}.{}", self.message.name, self.signal.name)
+    }
+
+    fn is_named(&self, full_name: &str) -> bool {
+        let rest = full_name.strip_prefix(self.message.name.as_str()).and_then(|rest| rest.strip_prefix('.'));
+        rest == Some(self.signal.name.as_str())
+    }
+}
+
+/// A configured signal, found.
+#[derive(Debug, Clone)]
+pub(crate) struct ResolvedSignal<'d> {
+    /// Input that it feeds.
+    pub channel: Channel,
+    /// Interface that carries it.
+    pub bus: BusIndex,
+    /// DBC it was found in.
+    pub file: &'d str,
+    /// Its message.
+    pub message: &'d Message,
+    /// The signal.
+    pub signal: &'d Signal,
+    /// Its position, where it is in a diagnostic answer.
+    pub answer: Option<AnswerPlace<'d>>,
+    /// Factor from the DBC's unit and sign to ours; negative when the bus counts charge positive.
+    pub scale: f64,
+    /// Added after it, in our unit and sign.
+    pub offset: f64,
+    /// Raw codes that mean "not available", the configuration's and the DBC's.
+    pub not_available: Vec<u64>,
+}
+
+/// Ranges and steps the DBC gives, in our units and sign; infinite where it gives none.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct DbcRanges {
+    /// Pack current, A, positive = discharge.
+    pub current_a: (f64, f64),
+    /// Cell voltage, V.
+    pub voltage_v: (f64, f64),
+    /// Temperature, degrees C.
+    pub temperature_c: (f64, f64),
+    /// Coarsest step of a cell's voltage, V; 0 where it is unknown.
+    pub voltage_step_v: f64,
+}
+
+/// A range that refuses nothing.
+pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
+
+/// What later checks look at, and where they note what they find.
+pub(crate) struct Checks<'a> {
+    pub raw: &'a RawTables,
+    pub found: &'a [ResolvedSignal<'a>],
+    pub faults: &'a mut Faults,
+}
+
+impl Databases {
+    /// Reads the files and answers; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
+    pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+        let mut files = Vec::new();
+        for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
+            let path = beside(config, name);
+            files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
+        }
+        let files = files.into_iter().collect::<Option<Vec<_>>>()?;
+        let answers = answers::definitions(raw, faults);
+        let are_all_usable = answers.len() == raw.count::<DiagnosticInput>();
+        (are_all_usable && !(files.is_empty() && answers.is_empty())).then_some(Self { files, answers })
+    }
+
+    /// Every signal that can be named.
+    pub(crate) fn signals(&self) -> impl Iterator<Item = NamedSignal<'_>> {
+        let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
+        let of_files = messages.flat_map(|(file, message)| {
+            message.signals.iter().map(move |signal| NamedSignal { file, message, signal, answer: None })
+        });
+        let of_answers = self.answers.iter().flat_map(|answer| {
+            let (file, message) = (answer.table.as_str(), &answer.message);
+            answer.signals().map(move |(signal, place)| NamedSignal { file, message, signal, answer: Some(place) })
+        });
+        of_files.chain(of_answers)
+    }
+
+    fn file_names(&self) -> String {
+        let mut names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
+        names.extend((!self.answers.is_empty()).then_some("[[input.diagnostic]]"));
+        names.join(" or ")
+    }
+}
+
+/// Reads one DBC, or notes why not.
+pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Database> {
+    let file = path.display().to_string();
+    let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
+    Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()
+}
+
+/// Finds every configured signal.
+pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mut Faults) -> Vec<ResolvedSignal<'d>> {
+    let mut search = Search { raw, databases, faults, found: Vec::new() };
+    for (channel, source) in raw.sources() {
+        match channel {
+            Channel::CellVoltage(_) => {
+                let first = raw.cell_voltage.as_ref().map_or(1, |keys| keys.first);
+                search.cells(&source, first, Channel::CellVoltage);
+            }
+            Channel::Balancing(_) => {
+                let first = raw.balancing.as_ref().map_or(1, |keys| keys.first);
+                search.cells(&source, first, Channel::Balancing);
+            }
+            Channel::Current => search.one(channel, &source, current_sign(raw)),
+            _ => search.one(channel, &source, 1.0),
+        }
+    }
+    search.found
+}
+
+/// Notes a signal that is in none of the files.
+pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>, faults: &mut Faults) {
+    if !databases.signals().any(|signal| signal.is_named(source.signal)) {
+        Search { raw, databases, faults, found: Vec::new() }.not_found(source);
+    }
+}
+
+/// Factor from the bus's sign of the current to ours.
+fn current_sign(raw: &RawTables) -> f64 {
+    match raw.current.as_ref().map(|keys| keys.positive) {
+        Some(PositiveCurrent::Charge) => -1.0,
+        Some(PositiveCurrent::Discharge) | None => 1.0,
+    }
+}
+
+struct Search<'s, 'd> {
+    raw: &'s RawTables,
+    databases: &'d Databases,
+    faults: &'s mut Faults,
+    found: Vec<ResolvedSignal<'d>>,
+}
+
+impl<'d> Search<'_, 'd> {
+    /// A signal with a name of its own.
+    fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
+        let name = source.signal;
+        let hits: Vec<NamedSignal<'d>> = self.databases.signals().filter(|signal| signal.is_named(name)).collect();
+        match hits[..] {
+            [] => self.not_found(source),
+            [hit] => self.add(channel, source, sign, hit),
+            [first, .., last] => {
+                let what = format!("must be in one place, is in {} and {}", first.file, last.file);
+                source.place.fault(self.faults, "signal", &what);
+            }
+        }
+    }
+
+    fn not_found(&mut self, source: &SignalSource<'_>) {
+        let what = format!("must be a signal (Message.Signal) of {}", self.databases.file_names());
+        let names: Vec<String> = self.databases.signals().map(|signal| signal.full_name()).collect();
+        let hint = did_you_mean(source.signal, names.iter().map(String::as_str));
+        source.place.fault(self.faults, "signal", &(what + &hint));
+    }
+
+    /// The signals of all cells, by their pattern; `first`: the first cell's number in it.
+    fn cells(&mut self, source: &SignalSource<'_>, first: u16, channel: fn(CellIndex) -> Channel) {
+        let Some(pack) = &self.raw.pack else { return };
+        let cells = pack.cells;
+        let pattern = match Pattern::parse(source.signal) {
+            Ok(pattern) => pattern,
+            Err(what) => return source.place.fault(self.faults, "signal", &what),
+        };
+        if !pattern.has_cell() && cells > 1 {
+            return source.place.fault(self.faults, "signal", "must have {n} in place of the cell's number");
+        }
+        let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
+        for hit in self.databases.signals() {
+            if let Some(number) = pattern.fits(&hit.full_name()) {
+                hits.entry(number.unwrap_or(u32::from(first))).or_default().push(hit);
+            }
+        }
+        if hits.is_empty() {
+            return self.not_found(source);
+        }
+        let mut missing = Vec::new();
+        for (index, number) in (0..cells).zip(u32::from(first)..) {
+            match hits.get(&number).map(Vec::as_slice) {
+                None | Some([]) => missing.push(number),
+                Some([hit]) => self.add(channel(CellIndex(index)), source, 1.0, *hit),
+                Some([a, .., b]) => {
+                    let what =
+                        format!("must give each cell one signal, {number} is {} and {}", a.full_name(), b.full_name());
+                    source.place.fault(self.faults, "signal", &what);
+                }
+            }
+        }
+        if !missing.is_empty() {
+            let what = format!("must give every cell a signal, none for number {}", list(&missing));
+            source.place.fault(self.faults, "signal", &what);
+        }
+    }
+
+    fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, named: NamedSignal<'d>) {
+        let NamedSignal { file, message, signal, answer } = named;
+        let Some(bus) = self.raw.bus_of(source.interface) else {
+            return; // an interface that is not there was noted by the cross checks
+        };
+        let full_name = named.full_name();
+        let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
+        if message.len_bytes > 8 && !fd && answer.is_none() {
+            let what = format!(
+                "message {} has {} bytes, must have fd = true on its interface",
+                message.name, message.len_bytes
+            );
+            source.place.fault(self.faults, "signal", &what);
+        }
+        if let Some(other) = self.found.iter().find(|f| f.bus == bus && std::ptr::eq(f.signal, signal)) {
+            let what = format!("must not be used twice, is also {}", channel_words(other.channel));
+            source.place.fault(self.faults, "signal", &what);
+        }
+        if channel == Channel::PackIdentity && signal.layout.length_bits > MAX_IDENTITY_BITS {
+            let what =
+                format!("{full_name} has {} bits, must have at most {MAX_IDENTITY_BITS}", signal.layout.length_bits);
+            source.place.fault(self.faults, "signal", &what);
+        }
+        let largest = u64::MAX >> (64 - u32::from(signal.layout.length_bits.clamp(1, 64)));
+        if source.not_available.iter().any(|&code| code > largest) {
+            let what = format!("must be 0 to {largest:#X}, the codes of {full_name}");
+            source.place.fault(self.faults, "not_available", &what);
+        }
+        let mut not_available = signal.not_available_codes();
+        not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
+        not_available.sort_unstable();
+        not_available.dedup();
+        let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
+        let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
+        let (scale, offset) = (sign * usual_scale, sign * source.offset);
+        self.found.push(ResolvedSignal { channel, bus, file, message, signal, answer, scale, offset, not_available });
+    }
+}
+
+/// Name of a channel, for people (cells and sensors from 1).
+pub(crate) fn channel_words(channel: Channel) -> String {
+    match channel {
+        Channel::Current => "pack current".to_owned(),
+        Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
+        Channel::PackVoltage => "pack voltage".to_owned(),
+        Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
+        Channel::ReportedSoc => "reported SOC".to_owned(),
+        Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::Balancing(cell) => format!("cell {} balancing", cell.0 + 1),
+        Channel::SupplyVoltage => "supply voltage".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
+        Channel::Contactor => "contactors".to_owned(),
+    }
+}
+
+/// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
+pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], checks: &mut Checks<'_>) {
+    if let Some(input) = checks.found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
+        let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
+        place.fault(checks.faults, "id", &what);
+    }
+}
+
+fn list(numbers: &[u32]) -> String {
+    let mut words: Vec<String> = numbers.iter().take(MAX_NAMED_CELLS).map(u32::to_string).collect();
+    if numbers.len() > MAX_NAMED_CELLS {
+        words.push(format!("... ({} in all)", numbers.len()));
+    }
+    words.join(", ")
+}
+
+impl ResolvedSignal<'_> {
+    /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
+    pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
+        let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
+        binding.scale = self.scale;
+        binding.offset = self.offset;
+        binding.not_available.clone_from(&self.not_available);
+        Ok(binding)
+    }
+
+    /// Distance of two neighbouring values, in our unit; 0 for IEEE floats.
+    fn step(&self) -> f64 {
+        match self.signal.layout.value_type {
+            ValueType::Unsigned | ValueType::Signed => (self.signal.layout.factor * self.scale).abs(),
+            ValueType::Float32 | ValueType::Float64 => 0.0,
+        }
+    }
+
+    /// The DBC's range in our unit and sign; infinite when it gives none.
+    pub(crate) fn range(&self) -> (f64, f64) {
+        let layout = &self.signal.layout;
+        if !layout.has_range() {
+            return UNLIMITED;
+        }
+        let (a, b) = (layout.minimum * self.scale + self.offset, layout.maximum * self.scale + self.offset);
+        (a.min(b), a.max(b))
+    }
+}
+
+/// The decoder's map, without the diagnostic answers; `None` when a layout cannot be read (noted when it was found).
+pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
+    let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
+    let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();
+    bindings.ok().map(InputMap::new)
+}
+
+/// The widest range the DBC gives each kind of value; a total voltage counts per cell.
+pub(crate) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
+    let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
+        let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(ResolvedSignal::range);
+        let widest = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))).unwrap_or(UNLIMITED);
+        (widest.0 / divisor, widest.1 / divisor)
+    };
+    let voltage_v = if found.iter().any(|resolved| resolved.channel == Channel::PackVoltage) {
+        widest(|channel| channel == Channel::PackVoltage, f64::from(series))
+    } else {
+        widest(|channel| matches!(channel, Channel::CellVoltage(_)), 1.0)
+    };
+    let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
+    let steps = found.iter().filter(|resolved| is_voltage(resolved.channel)).map(ResolvedSignal::step);
+    let per_cell = if found.iter().any(|it| it.channel == Channel::PackVoltage) { f64::from(series) } else { 1.0 };
+    DbcRanges {
+        voltage_step_v: steps.fold(0.0, f64::max) / per_cell,
+        current_a: widest(|channel| channel == Channel::Current, 1.0),
+        voltage_v,
+        temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),
+    }
+}

@@ -1,0 +1,152 @@
+//! The frames that are received, checked, asked for and sent, in words.
+
+use serde::Serialize;
+
+use crate::can::dbc::FrameFormat;
+use crate::can::e2e::Protection;
+use crate::can::j1939::Lamp;
+use crate::can::poll::{FOREIGN_SILENCE_NS, PollRequest};
+use crate::can::secoc::Authentication;
+use crate::can::uds::Controller;
+use crate::config::checks::ResolvedSignal;
+use crate::config::result::Config;
+use crate::monitor::{AlarmCode, SupplyConfig};
+
+/// A frame that is sent.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct OutputUse {
+    /// `status`, `health`, `alarm`, `digest`, `reply`, `freshness`.
+    pub frame: &'static str,
+    /// Identifier as candump writes it.
+    pub id: String,
+    /// Interfaces.
+    pub interfaces: Vec<String>,
+    /// Period, ms; `None` = sent on an event only.
+    pub period_ms: Option<f64>,
+    /// `classic`, `FD`, `FD with bit rate switch`.
+    pub kind: &'static str,
+    /// End-to-end protection: `profile 1A, data id 0x123`, or `none`.
+    pub protection: String,
+    /// Authentication: `SecOC fd, data id 0x123`, or `none`.
+    pub authentication: String,
+}
+
+/// An authentication in words.
+fn authentication_words(Authentication { profile, data_id }: Authentication) -> String {
+    format!("SecOC {}, data id {data_id:#X}", profile.name())
+}
+
+/// Describes the sent frames.
+pub(crate) fn outputs(config: &Config) -> Vec<OutputUse> {
+    let Some(output) = &config.monitor.output else { return Vec::new() };
+    let names = output.buses.iter().filter_map(|bus| config.interfaces.get(bus.index()));
+    let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();
+    let used = output.plan.messages().map(|sent| OutputUse {
+        frame: sent.message.name(),
+        id: sent.id.to_string(),
+        interfaces: names.clone(),
+        period_ms: sent.cycle_time_ms.map(f64::from),
+        kind: match sent.format {
+            FrameFormat::Classic => "classic",
+            FrameFormat::Fd { brs: false } => "FD",
+            FrameFormat::Fd { brs: true } => "FD with bit rate switch",
+        },
+        protection: sent.protection.map_or("none".to_owned(), |Protection { profile, data_id }| {
+            format!("profile {}, data id {data_id:#X}", profile.name())
+        }),
+        authentication: sent.secoc.map_or("none".to_owned(), authentication_words),
+    });
+    used.collect()
+}
+/// How commands of other ECUs are checked.
+pub fn command_words(config: &Config) -> String {
+    let Some(commands) = &config.monitor.commands else { return "commands of other ECUs are not executed".to_owned() };
+    match (commands.plan.authentication(), &config.key) {
+        (Some(secoc), Some(key)) => {
+            format!("commands of other ECUs are authenticated, {}, key in {key}", authentication_words(secoc))
+        }
+        _ => "commands of other ECUs are unauthenticated: every node of the bus can make one".to_owned(),
+    }
+}
+
+/// Describes how frames are checked before they are read.
+pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<String> {
+    let monitor = &config.monitor;
+    let rate = monitor.flood.max_frames_per_s;
+    let mut words = vec![format!("at most {rate} frames a second of one identifier, a tenth of them at once")];
+    if monitor.guards.is_empty() {
+        words.push(
+            "no end-to-end protection: a damaged, repeated or old frame cannot be distinguished from a good one"
+                .to_owned(),
+        );
+    }
+    words.push(command_words(config));
+    for guard in &monitor.guards {
+        let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));
+        let name = input.map_or("unauthenticated commands", |input| input.message.name.as_str());
+        let interface = config.interfaces.get(guard.bus.index()).map_or("", |interface| interface.name.as_str());
+        let Protection { profile, data_id } = guard.check.protection;
+        let missed = match guard.cycle_time_s {
+            Some(period_s) => format!("one missing is counted each {} ms", period_s * 1000.0),
+            None => "without a cycle time in the DBC missing ones are not counted".to_owned(),
+        };
+        words.push(format!(
+            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, {} lost in a row allowed, {missed}",
+            guard.id,
+            profile.name(),
+            guard.check.max_delta_counter_init,
+        ));
+    }
+    words
+}
+/// What will be sent, in sentences.
+pub(crate) fn polling(config: &Config) -> Vec<String> {
+    let Some(poll) = &config.monitor.poll else { return Vec::new() };
+    let mut words: Vec<String> = poll.requests.iter().map(|request| request_words(config, request)).collect();
+    words.push(format!(
+        "at most {} requests a second, one at a time; nothing else can be sent to a controller",
+        poll.max_requests_per_s
+    ));
+    let low_supply = |supply: SupplyConfig| format!(", while the supply is below {} V or not known", supply.minimum_v);
+    words.push(format!(
+        "silent for {} s after another tester's request, while the bus sleeps{}, and on standby",
+        FOREIGN_SILENCE_NS / 1_000_000_000,
+        config.monitor.supply.map(low_supply).unwrap_or_default()
+    ));
+    if config.monitor.supply.is_none() {
+        words.push("the vehicle's supply voltage is not watched ([input.supply_voltage])".to_owned());
+    }
+    words
+}
+
+/// `can0: asks 7E4 for 22 01 01 every 1 s while driving, every 5 s while charging`.
+fn request_words(config: &Config, request: &PollRequest) -> String {
+    let Controller { bus, request: id, .. } = request.question.controller;
+    let interface = config.interfaces.get(bus.index()).map_or("?", |interface| interface.name.as_str());
+    let bytes: Vec<String> = request.question.request().iter().map(|byte| format!("{byte:02X}")).collect();
+    let states = ["while driving", "while charging", "while parked and awake"];
+    let period = |(every_s, state): (&Option<f64>, _)| every_s.map(|every_s| format!("every {every_s} s {state}"));
+    let periods: Vec<String> = request.every_s.iter().zip(states).filter_map(period).collect();
+    format!("{interface}: asks {id} for {} {}", bytes.join(" "), periods.join(", "))
+}
+
+/// Describes the node and its codes.
+pub(crate) fn j1939(config: &Config) -> Vec<String> {
+    let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
+    let interface = config.interfaces.get(j1939.bus.index()).map_or("", |interface| interface.name.as_str());
+    let [dm1, dm2, ..] = j1939.node.sent_ids();
+    let node = format!(
+        "address {} ({0:02X}) on {interface}, NAME {}; DM1 {dm1} every second and on change, DM2 {dm2} on request",
+        j1939.node.address, j1939.node.name
+    );
+    let alarms = j1939.alarms.iter().map(|AlarmCode { rule, severity, code, lamp }| {
+        let lamp = match lamp {
+            Lamp::None => "no lamp",
+            Lamp::Protect => "protect lamp",
+            Lamp::Amber => "amber lamp",
+            Lamp::Red => "red lamp",
+        };
+        format!("{} {}: SPN {}, FMI {}, {lamp}", rule.name(), severity.name(), code.spn(), code.fmi())
+    });
+    std::iter::once(node).chain(alarms).collect()
+}

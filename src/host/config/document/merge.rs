@@ -1,0 +1,149 @@
+//! The TOML texts of a configuration merged, with the lines their values stand on.
+
+use std::ops::Range;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::faults::{Faults, KeyPlace, SourceLine, TablePlace};
+use super::source::{SourceFile, Sources};
+
+/// Longest piece of the file quoted in a fault, characters: enough to recognise it, short enough for one line.
+const MAX_QUOTE: usize = 48;
+/// Faults of syntax listed one by one; a file with more is of another kind.
+const MAX_SYNTAX_FAULTS: usize = 10;
+
+/// The tables of a configuration: of one file, or of a file and its drop-ins merged.
+#[derive(Debug)]
+pub(crate) struct Document<'t> {
+    /// The file, as people named it; of several the one that the drop-ins belong to.
+    pub file: String,
+    /// Whether the syntax is broken somewhere: a missing key may then stand in the broken part.
+    pub broken: bool,
+    sources: &'t Sources,
+    root: DeTable<'t>,
+}
+
+impl<'t> Document<'t> {
+    /// Parses every file of `sources` and merges them in order. Syntax faults go to `faults`; the readable rest is kept
+    /// and checked.
+    pub(crate) fn parse(sources: &'t Sources, faults: &mut Faults) -> Self {
+        let (mut root, mut broken) = (DeTable::new(), false);
+        for source in sources.files() {
+            let (table, errors) = DeTable::parse_recoverable(source.placed_text());
+            note_syntax(source, &errors, faults);
+            broken |= !errors.is_empty();
+            merge(&mut root, table.into_inner());
+        }
+        Self { file: sources.main_file().to_owned(), broken, sources, root }
+    }
+
+    /// The whole as a table.
+    pub(crate) fn root(&self) -> &DeTable<'t> {
+        &self.root
+    }
+
+    /// The value at a dotted path.
+    pub(crate) fn find(&self, path: &str) -> Option<&Spanned<DeValue<'t>>> {
+        let mut parts = path.split('.');
+        let mut value = self.root.get(parts.next()?)?;
+        for part in parts {
+            let DeValue::Table(table) = value.get_ref() else { return None };
+            value = table.get(part)?;
+        }
+        Some(value)
+    }
+
+    /// The text at a dotted path, also where another key of its table is faulty.
+    pub(crate) fn text(&self, path: &str) -> Option<&str> {
+        self.find(path)?.get_ref().as_str()
+    }
+
+    /// The first line of the file.
+    pub(crate) fn first_line(&self) -> SourceLine {
+        SourceLine { file: self.file.clone(), line: 1 }
+    }
+
+    /// File and line on which `span` begins.
+    pub(crate) fn line(&self, span: &Range<usize>) -> SourceLine {
+        self.sources.line(span)
+    }
+
+    /// The text at `span`, as it is written.
+    pub(crate) fn written(&self, span: &Range<usize>) -> &'t str {
+        self.sources.written(span)
+    }
+
+    /// The text at `span`, cut to one short line.
+    pub(crate) fn quote(&self, span: &Range<usize>) -> String {
+        let words: Vec<&str> = self.written(span).split_whitespace().collect();
+        shorten(&words.join(" "))
+    }
+
+    /// The found text of a fault at `span`, which is within `value`.
+    pub(crate) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
+        let is_inline = self.written(&value.span()).starts_with('{');
+        if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
+    }
+
+    /// The place of a table: its path for people, its line, and where its keys stand.
+    pub(crate) fn place(&self, path: &str, at: SourceLine, table: &DeTable<'_>) -> TablePlace {
+        let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
+            let key: &Spanned<std::borrow::Cow<'_, str>> = key;
+            (
+                key.get_ref().to_string(),
+                KeyPlace { at: self.line(&key.span()), found: self.found(value, &value.span()) },
+            )
+        };
+        TablePlace { at, path: path.to_owned(), spots: table.iter().map(spot).collect() }
+    }
+}
+
+fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &mut Faults) {
+    let line = |error: &toml::de::Error| error.span().map_or(0, |span| source.line(&span));
+    for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
+        faults.add(source.name(), line(error), error.message().trim().replace('\n', ", "));
+    }
+    if let Some(error) = errors.get(MAX_SYNTAX_FAULTS) {
+        let more = errors.len() - MAX_SYNTAX_FAULTS;
+        faults.add(source.name(), line(error), format!("and {more} more faults of syntax from here"));
+    }
+}
+
+/// Merges `over` into `under`: tables by key, lists of tables one after the other; anything else replaces. An empty list
+/// replaces too, so that a drop-in can remove the tables before it.
+fn merge<'t>(under: &mut DeTable<'t>, over: DeTable<'t>) {
+    for (key, new) in over {
+        let Some((old_key, mut old)) = under.remove_entry(&key) else {
+            under.insert(key, new);
+            continue;
+        };
+        let is_list = is_list_of_tables(&old) && is_list_of_tables(&new);
+        let (span, new) = (new.span(), new.into_inner());
+        match (old.get_mut(), new) {
+            (DeValue::Table(table), DeValue::Table(more)) => merge(table, more),
+            (DeValue::Array(items), DeValue::Array(more)) if is_list => {
+                more.into_iter().for_each(|item| items.push(item))
+            }
+            (_, new) => {
+                under.insert(key, Spanned::new(span, new));
+                continue;
+            }
+        }
+        under.insert(old_key, old);
+    }
+}
+
+/// Whether a value is a list of at least one table, and of nothing else.
+pub(crate) fn is_list_of_tables(value: &Spanned<DeValue<'_>>) -> bool {
+    let items = value.get_ref().as_array();
+    items.is_some_and(|items| !items.is_empty() && items.iter().all(|item| item.get_ref().is_table()))
+}
+
+/// `text` cut to the length of a quotation.
+pub(crate) fn shorten(text: &str) -> String {
+    match text.char_indices().nth(MAX_QUOTE) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text.to_owned(),
+    }
+}

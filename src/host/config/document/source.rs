@@ -1,0 +1,227 @@
+//! The files a configuration is written in: the file itself and its drop-ins, and their texts.
+//!
+//! The drop-ins of `FILE` are the files `FILE.d/*.toml`, in the order of their names. In: paths. Out: the texts in order, in
+//! which a position stands for file and line.
+
+use std::ffi::OsString;
+use std::io;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use super::faults::{ConfigFaults, Faults, SourceLine};
+
+/// Most drop-ins of one file: each changes a part of a file that has some 30 tables.
+const MAX_DROP_INS: usize = 100;
+
+/// Reads the bytes of a file: from the disk, or (demo, tests) from memory.
+pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
+
+/// A configuration file and its drop-ins.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConfigFiles {
+    /// The configuration file.
+    pub main: PathBuf,
+    /// Its drop-ins, in the order in which they are merged.
+    pub drop_ins: Vec<PathBuf>,
+}
+
+impl ConfigFiles {
+    /// Finds the drop-ins of `main`: the files `main.d/*.toml` by name, without those whose name begins with a dot.
+    ///
+    /// # Errors
+    /// When the folder cannot be listed or holds too many.
+    pub fn find(main: &Path) -> Result<Self, ConfigFaults> {
+        let folder = drop_in_folder(main);
+        let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", folder.display())]);
+        let drop_ins = list(&folder).map_err(|error| fault(format!("cannot be listed: {error}")))?;
+        if drop_ins.len() > MAX_DROP_INS {
+            return Err(fault(format!("holds {} drop-ins, must be at most {MAX_DROP_INS}", drop_ins.len())));
+        }
+        Ok(Self { main: main.to_owned(), drop_ins })
+    }
+
+    /// A configuration file without drop-ins.
+    pub fn alone(main: &Path) -> Self {
+        Self { main: main.to_owned(), drop_ins: Vec::new() }
+    }
+
+    /// All files, in the order in which they are merged.
+    pub fn all(&self) -> impl Iterator<Item = &Path> {
+        std::iter::once(&self.main).chain(&self.drop_ins).map(PathBuf::as_path)
+    }
+}
+
+/// The folder of the drop-ins: `packwatch.toml.d` beside `packwatch.toml`.
+fn drop_in_folder(main: &Path) -> PathBuf {
+    let mut name = OsString::from(main);
+    name.push(".d");
+    PathBuf::from(name)
+}
+
+/// The drop-ins in a folder, by name; none where there is no such folder.
+fn list(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let entries = match std::fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(error),
+    };
+    let mut paths = entries.map(|entry| entry.map(|entry| entry.path())).collect::<io::Result<Vec<_>>>()?;
+    let is_hidden = |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+    paths.retain(|path| path.extension().is_some_and(|extension| extension == "toml") && !is_hidden(path));
+    paths.sort();
+    Ok(paths)
+}
+
+/// The text of one file.
+#[derive(Debug)]
+pub(crate) struct SourceFile {
+    name: String,
+    /// Position of its first byte among all texts.
+    start: usize,
+    /// As many blanks as there are bytes before it, and the text: a position in it is one among all texts.
+    placed: String,
+}
+
+impl SourceFile {
+    /// Name as people gave it.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The text to be parsed, whose positions are those among all texts.
+    pub(crate) fn placed_text(&self) -> &str {
+        &self.placed
+    }
+
+    /// Line, from 1, on which `span` begins.
+    pub(crate) fn line(&self, span: &Range<usize>) -> usize {
+        let before = self.placed.as_bytes().get(..span.start).unwrap_or(self.placed.as_bytes());
+        1 + before.iter().filter(|&&b| b == b'\n').count()
+    }
+}
+
+/// The texts of a configuration, in the order in which they are merged. There is at least one.
+#[derive(Debug)]
+pub(crate) struct Sources {
+    files: Vec<SourceFile>,
+}
+
+impl Sources {
+    /// Reads all files; `None` = one of them cannot be read (noted).
+    pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+        let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
+        // Every one is read, so that each fault is noted.
+        let texts: Vec<_> = files.all().map(text).collect();
+        Some(Self::new(texts.into_iter().collect::<Option<Vec<_>>>()?))
+    }
+
+    fn new(texts: Vec<(String, String)>) -> Self {
+        let (mut files, mut start) = (Vec::new(), 0);
+        for (name, text) in texts {
+            // A byte order mark may only be at the very beginning, where the blanks are.
+            let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
+            let placed = " ".repeat(start) + text;
+            let end = placed.len();
+            files.push(SourceFile { name, start, placed });
+            start = end + 1;
+        }
+        Self { files }
+    }
+
+    pub(crate) fn files(&self) -> &[SourceFile] {
+        &self.files
+    }
+
+    /// Name of the first file, to which the others are drop-ins.
+    pub(crate) fn main_file(&self) -> &str {
+        self.files.first().map_or("", |file| &file.name)
+    }
+
+    /// File and line on which `span` begins.
+    pub(crate) fn line(&self, span: &Range<usize>) -> SourceLine {
+        match self.at(span) {
+            Some(file) => SourceLine { file: file.name.clone(), line: file.line(span) },
+            None => SourceLine { file: String::new(), line: 0 },
+        }
+    }
+
+    /// The text at `span`, as it is written.
+    pub(crate) fn written(&self, span: &Range<usize>) -> &str {
+        self.at(span).and_then(|file| file.placed.get(span.clone())).unwrap_or("")
+    }
+
+    fn at(&self, span: &Range<usize>) -> Option<&SourceFile> {
+        self.files.iter().rev().find(|file| file.start <= span.start)
+    }
+}
+
+/// `named`, relative to the folder of `path`.
+pub(crate) fn beside(path: &Path, named: &str) -> PathBuf {
+    path.parent().unwrap_or(Path::new("")).join(named)
+}
+
+pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
+    std::fs::read(path)
+}
+
+/// The file as UTF-8 text, or `None` with a fault noted.
+pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<String> {
+    let file = path.display().to_string();
+    let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
+    match String::from_utf8(bytes) {
+        Ok(text) => Some(text),
+        Err(error) => {
+            let good = error.utf8_error().valid_up_to();
+            let line = 1 + error.as_bytes()[..good].iter().filter(|&&b| b == b'\n').count();
+            faults.add(&file, line, "is not UTF-8 text");
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn drop_ins_are_the_toml_files_beside_the_file_in_order_of_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let main = folder.path().join("pack.toml");
+        assert_eq!(ConfigFiles::find(&main), Ok(ConfigFiles::alone(&main)), "no folder, no drop-ins");
+        let drop_ins = folder.path().join("pack.toml.d");
+        std::fs::create_dir(&drop_ins).expect("created");
+        for name in ["20-b.toml", "10-z.toml", "note.txt", ".hidden.toml", "10-a.toml~"] {
+            std::fs::write(drop_ins.join(name), "").expect("written");
+        }
+        let found = ConfigFiles::find(&main).expect("listed");
+        assert_eq!(found.drop_ins, ["10-z.toml", "20-b.toml"].map(|name| drop_ins.join(name)));
+    }
+
+    #[test]
+    fn a_folder_that_is_none_or_holds_too_many_is_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let main = folder.path().join("pack.toml");
+        std::fs::write(folder.path().join("pack.toml.d"), "").expect("written");
+        let faults = ConfigFiles::find(&main).expect_err("no folder").0;
+        assert!(faults[0].contains("pack.toml.d: cannot be listed: "), "{faults:?}");
+        std::fs::remove_file(folder.path().join("pack.toml.d")).expect("removed");
+        std::fs::create_dir(folder.path().join("pack.toml.d")).expect("created");
+        for number in 0..=MAX_DROP_INS {
+            std::fs::write(folder.path().join(format!("pack.toml.d/{number}.toml")), "").expect("written");
+        }
+        let faults = ConfigFiles::find(&main).expect_err("too many").0;
+        assert!(faults[0].ends_with("pack.toml.d: holds 101 drop-ins, must be at most 100"), "{faults:?}");
+    }
+
+    #[test]
+    fn a_position_stands_for_file_and_line() {
+        let texts = [("a", "x = 1\ny = 2\n"), ("b", "\u{feff}"), ("c", "z = 3\n\nw = 4")];
+        let sources = Sources::new(texts.map(|(name, text)| (name.to_owned(), text.to_owned())).into());
+        for (written, line) in [("y = 2", "a:2"), ("z", "c:1"), ("w = 4", "c:3")] {
+            let file = sources.files().iter().find(|file| file.placed.contains(written)).expect("there");
+            let start = file.placed.find(written).expect("there");
+            let span = start..start + written.len();
+            assert_eq!((sources.written(&span), sources.line(&span).to_string()), (written, line.to_owned()));
+        }
+    }
+}

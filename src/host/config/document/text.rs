@@ -1,0 +1,141 @@
+//! The merged tables of a configuration as one TOML text, for people: each part with the file and line it comes from.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::faults::{ConfigFaults, Faults};
+use super::merge::{Document, is_list_of_tables};
+use super::source::{ConfigFiles, ReadFile, Sources, read_file};
+
+/// The configuration file and its drop-ins as one TOML text, each part with the file and line it comes from. Keys and
+/// values are not checked.
+///
+/// # Errors
+/// When a file cannot be read or is no TOML: every such fault.
+pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
+    merged_with(&ConfigFiles::find(path)?, &read_file)
+}
+
+/// As [`merged`], with files read by `read`.
+///
+/// # Errors
+/// When a file cannot be read or is no TOML: every such fault.
+pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, ConfigFaults> {
+    let mut faults = Faults::default();
+    let sources = Sources::read(files, read, &mut faults);
+    let text = sources.as_ref().map(|sources| text(&Document::parse(sources, &mut faults)));
+    text.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+}
+
+/// The text, in the order of the files. Reading it gives the same tables.
+fn text(document: &Document<'_>) -> String {
+    let mut page = String::new();
+    table(document, "", document.root(), &mut page);
+    page
+}
+
+fn table(document: &Document<'_>, path: &str, table: &DeTable<'_>, page: &mut String) {
+    let mut entries: Vec<_> = table.iter().collect();
+    entries.sort_by_key(|(key, _)| key.span().start);
+    // Behind the header of another table they would belong to that one.
+    let (tables, values): (Vec<_>, Vec<_>) = entries.into_iter().partition(|(_, value)| has_header(document, value));
+    for (key, value) in values {
+        let (name, text) = (document.written(&key.span()), document.written(&value.span()));
+        // Writing to a String cannot fail.
+        let _ = writeln!(page, "{name} = {text} # {}", document.line(&key.span()));
+    }
+    for (key, value) in tables {
+        let name = document.written(&key.span());
+        let path = if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
+        tables_at(document, &path, value, page);
+    }
+}
+
+/// The table, or the list of tables, at `path`.
+fn tables_at(document: &Document<'_>, path: &str, value: &Spanned<DeValue<'_>>, page: &mut String) {
+    let (items, header) = match value.get_ref() {
+        DeValue::Array(items) => (items.iter().collect(), format!("[[{path}]]")),
+        _ => (vec![value], format!("[{path}]")),
+    };
+    for item in items {
+        let DeValue::Table(below) = item.get_ref() else { continue };
+        let _ = writeln!(page, "\n{header} # {}", document.line(&item.span()));
+        table(document, path, below, page);
+    }
+}
+
+/// Whether a value is shown below a header: tables are, except those that stand whole in one line.
+fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
+    (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
+}
+
+/// Whether a value is written as a value, `{ ... }` or `[ ... ]`, and no other file adds to it.
+fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
+    let (span, written) = (value.span(), document.written(&value.span()));
+    let is_within = |part: std::ops::Range<usize>| span.start <= part.start && part.end <= span.end;
+    match value.get_ref() {
+        DeValue::Table(table) => {
+            written.starts_with('{')
+                && table.iter().all(|(key, below)| is_within(key.span()) && is_inline(document, below))
+        }
+        DeValue::Array(items) => items.iter().all(|item| is_within(item.span()) && is_inline(document, item)),
+        _ => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::path::{Path, PathBuf};
+
+    use crate::config::{ConfigFiles, merged_with};
+
+    /// The merged text of these files, the first of which the others are drop-ins of.
+    fn merged(texts: &[(&str, &str)]) -> String {
+        let texts: BTreeMap<PathBuf, &str> = texts.iter().map(|(name, text)| (PathBuf::from(name), *text)).collect();
+        let mut names = texts.keys().cloned();
+        let files = ConfigFiles { main: names.next().expect("a file"), drop_ins: names.collect() };
+        let read = |path: &Path| Ok(texts[path].as_bytes().to_vec());
+        merged_with(&files, &read).unwrap_or_else(|faults| panic!("{faults:?}"))
+    }
+
+    #[test]
+    fn tables_are_merged_keys_replace_lists_of_tables_are_appended() {
+        let page = merged(&[
+            ("a", "top = 1\n[pack]\ncells = 4 # as built\nlist = [1, 2]\n[[alarm]]\nrule = \"x\"\n"),
+            ("b", "pack.cells = 5\npack.strings = 2\n[[alarm]]\nrule = \"y\"\nwarning = { set = 1,\n clear = 2 }\n"),
+            ("c", "[pack]\nlist = [3]\n[new.table]\n\"a key\" = 1\n"),
+        ]);
+        let expected = "top = 1 # a:1\n\n[pack] # a:2\ncells = 5 # b:1\nstrings = 2 # b:2\nlist = [3] # c:2\n\n\
+                        [[alarm]] # a:5\nrule = \"x\" # a:6\n\n[[alarm]] # b:3\nrule = \"y\" # b:4\n\
+                        warning = { set = 1,\n clear = 2 } # b:5\n\n[new] # c:3\n\n[new.table] # c:3\n\"a key\" = 1 # c:4\n";
+        assert_eq!(page, expected);
+    }
+
+    #[test]
+    fn an_empty_list_removes_the_tables_before_it() {
+        let page =
+            merged(&[("a", "[[alarm]]\nrule = \"x\"\n"), ("b", "alarm = []\n"), ("c", "[[alarm]]\nrule = \"y\"\n")]);
+        assert_eq!(page.parse::<toml::Table>(), "[[alarm]]\nrule = \"y\"\n".parse());
+    }
+
+    #[test]
+    fn the_page_reads_as_the_tables_it_shows() {
+        let one = "t = { x = 1, y = { z = 2 } }\nl = [{ a = 1 }, { a = 2 }]\n[deep.er]\ns = \"\"\"\nmany # no comment\n\"\"\"\n\
+                   [[deep.list]]\nk = 1\n[[deep.list.below]]\nm = [\n 1, # one\n 2,\n]\n";
+        assert_eq!(merged(&[("a", one)]).parse::<toml::Table>(), one.parse());
+        let page = merged(&[("a", one), ("b", "t.y.w = 3\n[[l]]\na = 3\n")]);
+        let whole = one.replace("z = 2 }", "z = 2, w = 3 }").replace("{ a = 2 }]", "{ a = 2 }, { a = 3 }]");
+        assert_eq!(page.parse::<toml::Table>(), whole.parse(), "{page}");
+    }
+
+    #[test]
+    fn a_shipped_configuration_is_what_it_was() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/example.toml");
+        let text = std::fs::read_to_string(&path).expect("shipped");
+        assert_eq!(merged(&[("example.toml", &text)]).parse::<toml::Table>(), text.parse());
+    }
+}

@@ -1,0 +1,14 @@
+//! The checked configuration, which the rest of the program uses, and the steps that make it.
+
+mod config;
+mod key_source;
+mod partial;
+mod read;
+mod vehicle;
+
+pub use config::{Config, InterfaceConfig, StoreConfig};
+pub use key_source::KeySource;
+pub(crate) use partial::PartialConfig;
+pub(crate) use read::read_and;
+pub use read::{load, load_with};
+pub use vehicle::VehicleIdentity;

@@ -1,0 +1,57 @@
+//! Where the key of authenticated frames is: `[authentication]`.
+
+use std::path::{Path, PathBuf};
+
+use crate::config::document::{Faults, beside};
+use crate::config::schema::RawTables;
+
+/// Where the key of authenticated frames is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum KeySource {
+    /// The credential of this name that the service manager passes.
+    Credential(String),
+    /// A file.
+    File(PathBuf),
+}
+
+impl std::fmt::Display for KeySource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Credential(name) => write!(f, "credential {name}"),
+            Self::File(path) => write!(f, "file {}", path.display()),
+        }
+    }
+}
+
+/// Where the key of authenticated frames is; `None` = no frame is authenticated, or faults are noted.
+pub(crate) fn key_source(
+    raw: &RawTables,
+    config: &Path,
+    has_authenticated: bool,
+    faults: &mut Faults,
+) -> Option<KeySource> {
+    let keys = raw.authentication.as_ref()?;
+    match (&keys.credential, &keys.key_file) {
+        (Some(_), Some(_)) => {
+            keys.place.fault(faults, "key_file", "must not be given beside credential");
+            None
+        }
+        (Some(name), None) if !is_file_name(name) => {
+            keys.place.fault(faults, "credential", "must be a name without /");
+            None
+        }
+        (Some(name), None) => has_authenticated.then(|| KeySource::Credential(name.clone())),
+        (None, Some(file)) => has_authenticated.then(|| KeySource::File(beside(config, file))),
+        (None, None) => {
+            if has_authenticated {
+                let what = "must be given, or key_file: secoc needs a key";
+                keys.place.fault(faults, "credential", what);
+            }
+            None
+        }
+    }
+}
+
+fn is_file_name(name: &str) -> bool {
+    !name.contains('/') && name != "." && name != ".."
+}

@@ -1,0 +1,65 @@
+//! The readable part of a configuration and all its faults, for `packwatch doctor`.
+
+use std::path::Path;
+
+use super::config::Config;
+use super::read::{load, read_model};
+use crate::can::guard::GuardConfig;
+use crate::cell::CellModel;
+use crate::config::checks::{Checks, Databases, ResolvedSignal, protect, signals};
+use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, Sources, read_file};
+use crate::config::schema::RawTables;
+
+/// The readable part of a configuration.
+#[derive(Debug)]
+pub(crate) struct PartialConfig {
+    /// The whole, when it is good.
+    pub config: Option<Config>,
+    /// Every fault; empty when it is good.
+    pub faults: Vec<String>,
+    /// The tables of the file and its drop-ins.
+    pub raw: RawTables,
+    /// The DBC files.
+    pub databases: Databases,
+    /// The cell model.
+    pub model: Option<CellModel>,
+}
+
+impl PartialConfig {
+    /// Reads what can be read.
+    ///
+    /// # Errors
+    /// When the file or a DBC file cannot be read: every fault found.
+    pub(crate) fn read(path: &Path) -> Result<Self, ConfigFaults> {
+        let (config, faults) = match load(path) {
+            Ok(config) => (Some(config), Vec::new()),
+            Err(faults) => (None, faults.0),
+        };
+        // The second reading finds the same faults again.
+        let again = &mut Faults::default();
+        let sources = Sources::read(&ConfigFiles::find(path)?, &read_file, again);
+        let Some(sources) = sources else { return Err(ConfigFaults(faults)) };
+        let document = Document::parse(&sources, again);
+        let raw = RawTables::read(&document, again);
+        let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
+        let model = read_model(path, &document, &raw, &read_file, again);
+        let model = model.map(|sourced| sourced.model);
+        Ok(Self { config, faults, raw, databases, model })
+    }
+
+    /// The configured signals that are found.
+    pub(crate) fn signals(&self) -> Vec<ResolvedSignal<'_>> {
+        signals::resolve(&self.raw, &self.databases, &mut Faults::default())
+    }
+
+    /// End-to-end protection of the inputs, as far as it can be read.
+    pub(crate) fn guards(&self, signals: &[ResolvedSignal<'_>]) -> Vec<GuardConfig> {
+        match &self.config {
+            Some(config) => config.monitor.guards.clone(),
+            None => {
+                let checks = &mut Checks { raw: &self.raw, found: signals, faults: &mut Faults::default() };
+                protect::guards(checks, false)
+            }
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! Keys that are a choice between words, and ranges that several tables share.
+
+use crate::alarm::Rule;
+use crate::can::e2e::Profile;
+use crate::can::secoc;
+use crate::cell::{CapacityState, Chemistry, Discretisation};
+use crate::config::schema::key::{ValueRange, within};
+use crate::config::schema::setting::choice;
+use crate::health::RechargeAlarm;
+use crate::quantity::bounds;
+
+/// Coldest and hottest temperature that may be configured, degrees C.
+pub(crate) const TEMPERATURE_C: ValueRange = within(bounds::TEMPERATURE_C);
+/// Range of standard deviations and of noise densities.
+pub(crate) const DEVIATION: ValueRange = within(bounds::DEVIATION);
+
+/// Which way a positive current flows on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PositiveCurrent {
+    /// Into the pack.
+    Charge,
+    /// Out of the pack.
+    Discharge,
+}
+
+/// Which byte of a number comes first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum WireOrder {
+    /// The most significant one.
+    Big,
+    /// The least significant one.
+    Little,
+}
+
+/// Method that measures the capacity in a half-cycle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MethodKey {
+    /// Charge over the swing between the SOCs that the voltages give.
+    Swing,
+    /// Charge over a nominal swing.
+    Nominal,
+}
+
+/// End-to-end protection of a frame: the AUTOSAR profile; `None` = off.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct E2eKey(pub Option<Profile>);
+
+choice!(PositiveCurrent { "charge" => Self::Charge, "discharge" => Self::Discharge });
+choice!(WireOrder { "big" => Self::Big, "little" => Self::Little });
+choice!(MethodKey { "swing" => Self::Swing, "nominal" => Self::Nominal });
+choice!(E2eKey {
+    "off" => Self(None),
+    "1A" => Self(Some(Profile::P01A)),
+    "1C" => Self(Some(Profile::P01C)),
+    "5" => Self(Some(Profile::P05)),
+});
+choice!(secoc::Profile { "1" => Self::P1, "3" => Self::P3, "fd" => Self::Fd });
+choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
+choice!(Chemistry {
+    "nmc811-graphite" => Self::Nmc811Graphite,
+    "nmc-graphite" => Self::NmcGraphite,
+    "nca-graphite" => Self::NcaGraphite,
+    "lco-graphite" => Self::LcoGraphite,
+    "lmo-graphite" => Self::LmoGraphite,
+    "lfp-graphite" => Self::LfpGraphite,
+});
+choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
+choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
+choice!(Profile { "1A" => Self::P01A, "1C" => Self::P01C, "5" => Self::P05 });
+choice!(Rule {
+    "capacity_low" => Self::CapacityLow,
+    "usable_capacity_low" => Self::UsableCapacityLow,
+    "recharge_period_low" => Self::RechargePeriodLow,
+    "input_missing" => Self::InputMissing,
+    "input_implausible" => Self::InputImplausible,
+    "estimate_untrusted" => Self::EstimateUntrusted,
+    "resistance_high" => Self::ResistanceHigh,
+    "soc_low" => Self::SocLow,
+    "temperature_high" => Self::TemperatureHigh,
+    "cell_imbalance" => Self::CellImbalance,
+    "remaining_life_low" => Self::RemainingLifeLow,
+    "bms_disagrees" => Self::BmsDisagrees,
+    "store_failed" => Self::StoreFailed,
+    "bus_fault" => Self::BusFault,
+    "cell_leak" => Self::CellLeak,
+    "connection_resistance" => Self::ConnectionResistance,
+    "channel_faulty" => Self::ChannelFaulty,
+});

@@ -1,0 +1,251 @@
+//! The mechanism behind every declared key: a line of [`section!`] gives its type, reading, faults and reference text.
+//!
+//! [`section!`] declares a table of a file and, where the table `gives` a parameter struct, makes that struct of the keys.
+//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads declared tables from a document and notes every fault:
+//! missing, unknown, of the wrong type, out of range.
+
+use toml::Spanned;
+use toml::de::DeValue;
+
+use super::key::{Key, Setting, TableReader, ValueFault, ValueRange};
+
+/// A declared table of a file.
+pub(crate) trait Section: Sized {
+    /// Dotted path; empty for the top of the file.
+    const PATH: &'static str;
+    /// Purpose of the table.
+    const ABOUT: &'static str;
+    /// Its keys.
+    const KEYS: &'static [Key];
+    /// Reads it; `None` when a key is bad (noted in the faults).
+    fn read(table: &mut TableReader<'_>) -> Option<Self>;
+}
+
+/// A declared table, for the check of unknown keys and for the reference page.
+#[derive(Debug)]
+pub(crate) struct SectionInfo {
+    /// Dotted path.
+    pub path: &'static str,
+    /// Whether it is written `[[path]]`, any number of times.
+    pub many: bool,
+    /// Purpose of the table.
+    pub about: &'static str,
+    /// Its keys; `None` = any key (notes for people).
+    pub keys: Option<&'static [Key]>,
+}
+
+impl SectionInfo {
+    /// A table written once.
+    pub(crate) const fn one<S: Section>() -> Self {
+        Self { path: S::PATH, many: false, about: S::ABOUT, keys: Some(S::KEYS) }
+    }
+
+    /// A table written once or not at all.
+    pub(crate) const fn optional<S: Section>() -> Self {
+        Self::one::<S>()
+    }
+
+    /// A table written any number of times.
+    pub(crate) const fn many<S: Section>() -> Self {
+        Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
+    }
+
+    /// A table for people, never read.
+    pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
+        Self { path, many: false, about, keys: None }
+    }
+}
+
+/// Declares a table of a file: the struct, its keys, how it is read and, after `gives`, the parameters it stands for.
+///
+/// ```text
+/// section! {
+///     /// What the table is for.
+///     Transition at "transition" gives TransitionConfig, |keys, pack_ah: f64| {
+///         /// A key that is the field of the same name.
+///         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
+///         /// A key from which a field is computed; behind an arrow alone, no field is.
+///         dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional => dead_band_a: keys.dead_band_a.unwrap_or(pack_ah / 50.0);
+///     } and {
+///         a_field_without_a_key: 1.0,
+///     }
+/// }
+/// ```
+///
+/// The parameters are then those of `config(&self, pack_ah: f64) -> TransitionConfig`.
+macro_rules! section {
+    // Collects the fields of the parameters, one key at a time.
+    (@fields $target:ident $keys:ident [$($done:tt)*]) => { $target { $($done)* } };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)* $key: $keys.$key,] $($rest)*)
+    };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident []; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)*] $($rest)*)
+    };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident [$field:ident: $value:expr]; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)* $field: $value,] $($rest)*)
+    };
+    (
+        $(#[doc = $about:literal])+
+        $name:ident at $path:literal gives $target:ident $(<$borrow:lifetime>)?, |$keys:ident $(, $argument:ident: $argument_type:ty)*| {
+            $(
+                $(#[doc = $doc:literal])+
+                $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr
+                $(=> $($field:ident: $value:expr)?)?;
+            )*
+        } $(and { $($more:ident: $more_value:expr),* $(,)? })?
+    ) => {
+        $crate::config::schema::section! {
+            $(#[doc = $about])+
+            $name at $path {
+                $( $(#[doc = $doc])+ $key: $type, $unit, $allowed, $presence; )*
+            }
+        }
+
+        impl $name {
+            /// The parameters these keys stand for.
+            pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target $(<$borrow>)? {
+                let $keys = self;
+                $crate::config::schema::section!(
+                    @fields $target $keys [] $( $key $([ $($field: $value)? ])?; )* $($( $more [$more: $more_value]; )*)?
+                )
+            }
+        }
+    };
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal {
+        $( $(#[doc = $doc:literal])+ $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr; )*
+    }) => {
+        $(#[doc = $about])+
+        #[derive(Debug, Clone)]
+        #[allow(dead_code, reason = "some keys are for people only, and not every table is checked again at its place")]
+        pub(crate) struct $name {
+            /// Place in the file.
+            pub place: $crate::config::document::TablePlace,
+            $( $(#[doc = $doc])+ pub $key: $type, )*
+        }
+
+        impl $crate::config::schema::Section for $name {
+            const PATH: &'static str = $path;
+            const ABOUT: &'static str = concat!($($about),+);
+            const KEYS: &'static [$crate::config::schema::Key] = &[$(
+                $crate::config::schema::Key {
+                    name: stringify!($key),
+                    about: concat!($($doc),+),
+                    unit: $unit,
+                    kind: <$type as $crate::config::schema::Setting>::KIND,
+                    choices: <$type as $crate::config::schema::Setting>::CHOICES,
+                    allowed: $allowed,
+                    presence: $presence,
+                },
+            )*];
+
+            fn read(table: &mut $crate::config::schema::TableReader<'_>) -> Option<Self> {
+                let mut keys = Self::KEYS.iter();
+                $( let $key: Option<$type> = keys.next().and_then(|key| table.setting(key)); )*
+                Some(Self { place: table.place.clone(), $( $key: $key?, )* })
+            }
+        }
+    };
+}
+pub(crate) use section;
+
+/// The field of [`tables!`] for a table: a list where it may be written many times.
+macro_rules! table_field {
+    (many $section:ty) => { Vec<$section> };
+    ($kind:ident $section:ty) => { Option<$section> };
+}
+pub(crate) use table_field;
+
+/// Lists the tables of a file, in the order of the reference page: the struct of all of them and how it is read.
+///
+/// Each is `one` (always read: without it in the file its defaults hold, and its required keys are missing), `optional`
+/// (read where it is written) or `many` (`[[path]]`, any number of times); `with` names the tables that one of its keys holds.
+macro_rules! tables {
+    ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
+        $(#[$about])*
+        #[derive(Debug)]
+        pub(crate) struct $name {
+            /// The file, as people named it.
+            pub file: String,
+            /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
+            pub broken: bool,
+            /// How often each table is written, faulty or not.
+            written: std::collections::BTreeMap<&'static str, usize>,
+            $( pub $field: $crate::config::schema::table_field!($kind $section), )+
+        }
+
+        impl $name {
+            /// Reads every table; faults of single keys and unknown keys are noted.
+            pub(crate) fn read(
+                document: &$crate::config::document::Document<'_>,
+                faults: &mut $crate::config::document::Faults,
+            ) -> Self {
+                use $crate::config::schema::Section as _;
+                let mut reader = $crate::config::schema::SchemaReader::new(document, $sections, faults);
+                Self {
+                    file: document.file.clone(),
+                    broken: reader.broken,
+                    written: [$( ($section::PATH, reader.count($section::PATH)) ),+].into_iter().collect(),
+                    $( $field: reader.$kind(), )+
+                }
+            }
+
+            /// Whether a table is written, faulty or not.
+            pub(crate) fn is_written<S: $crate::config::schema::Section>(&self) -> bool {
+                self.count::<S>() > 0
+            }
+
+            /// How often a table is written, faulty or not.
+            pub(crate) fn count<S: $crate::config::schema::Section>(&self) -> usize {
+                self.written.get(S::PATH).copied().unwrap_or_default()
+            }
+
+            /// Place of each table.
+            pub(crate) fn places(&self) -> impl Iterator<Item = &$crate::config::document::TablePlace> {
+                std::iter::empty() $( .chain(self.$field.iter().map(|keys| &keys.place)) )+
+            }
+        }
+
+        /// Every table, in the order of the reference page.
+        pub(crate) const $sections: &[$crate::config::schema::SectionInfo] =
+            &[$( $crate::config::schema::SectionInfo::$kind::<$section>(), $( $crate::config::schema::SectionInfo::many::<$below>(), )? )+];
+    };
+}
+pub(crate) use tables;
+
+impl TableReader<'_> {
+    /// The tables below a key; `None` when one of them is faulty (noted).
+    fn sub_tables<S: Section>(&mut self, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Vec<S>> {
+        let DeValue::Array(items) = value.get_ref() else { return None }; // noted by the check for unknown keys
+        if items.is_empty() {
+            self.place.fault(self.faults, key.name, &key.must_be());
+            return None;
+        }
+        let read = |(item, number): (&Spanned<DeValue<'_>>, usize)| {
+            let DeValue::Table(table) = item.get_ref() else { return None };
+            let path = format!("{}[{number}]", self.place.key(key.name));
+            let place = self.document.place(&path, self.document.line(&item.span()), table);
+            let Self { document, broken, ref mut faults, .. } = *self;
+            S::read(&mut TableReader { document, broken, table: Some(table), place, faults })
+        };
+        // Every one is read, so that each fault is noted.
+        let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
+        tables.into_iter().collect()
+    }
+}
+
+/// A key whose value is a list of declared tables, `[{ ... }, ...]` or `[[...]]`.
+#[derive(Debug, Clone)]
+pub(crate) struct SubTables<S>(pub Vec<S>);
+
+impl<S: Section> Setting for SubTables<S> {
+    const KIND: &'static str = "a list of tables";
+
+    fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
+        Err(ValueFault::Type(value.span()))
+    }
+
+    fn read_tables(reader: &mut TableReader<'_>, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
+        Some(reader.sub_tables(key, value).map(Self))
+    }
+}

@@ -1,0 +1,139 @@
+//! The tables of a configuration file as they are read: one line per table.
+
+use super::keys::{
+    Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
+    CurrentInput, CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
+    OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackModule,
+    PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store,
+    SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
+};
+use super::section::tables;
+use crate::config::document::{Faults, TablePlace};
+use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+
+tables! {
+    /// The tables of a file; `None` = not written, or faulty (and noted).
+    RawTables, SECTIONS {
+        vehicle: one Vehicle,
+        pack: one Pack,
+        modules: many PackModule,
+        interfaces: many Interface,
+        input: one Input,
+        diagnostics: many DiagnosticInput with AnswerSignalKeys,
+        current: one CurrentInput,
+        contactor: optional ContactorInput,
+        cell_voltage: optional CellVoltageInput,
+        balancing: optional BalancingInput,
+        pack_voltage: optional PackVoltageInput,
+        temperatures: many TemperatureInput,
+        reported_soc: optional ReportedSocInput,
+        reported_soh: optional ReportedSohInput,
+        supply_voltage: optional SupplyVoltageInput,
+        pack_identity: optional PackIdentityInput,
+        protected: many ProtectedInput,
+        current_limits: one CurrentLimits,
+        voltage_limits: one VoltageLimits,
+        temperature_limits: one TemperatureLimits,
+        estimator: one Estimator,
+        transition: one Transition,
+        capacity: one Capacity,
+        recharge: one Recharge,
+        usable: optional Usable,
+        alarms: many Alarm,
+        j1939: optional J1939,
+        poll: one Poll,
+        output: optional Output,
+        output_status: one OutputStatus,
+        output_health: one OutputHealth,
+        output_alarm: one OutputAlarm,
+        output_digest: one OutputDigest,
+        output_reply: one OutputReply,
+        output_freshness: one OutputFreshness,
+        commands: one Commands,
+        authentication: one Authentication,
+        store: one Store,
+    }
+}
+
+impl RawTables {
+    /// Whether every `[[interface]]` that is written is in `interfaces`; otherwise names cannot be judged.
+    pub(crate) fn has_all_interfaces(&self) -> bool {
+        !self.broken && self.interfaces.len() == self.count::<Interface>()
+    }
+
+    /// Whether the pack's total voltage is configured, so that the pack is estimated as one cell.
+    pub(crate) fn is_pack_total(&self) -> bool {
+        self.is_written::<PackVoltageInput>()
+    }
+
+    /// Whether `[output]` is written with `enabled = false`.
+    pub(crate) fn is_output_disabled(&self) -> bool {
+        self.output.as_ref().is_some_and(|output| !output.enabled)
+    }
+
+    /// The interface of this name, the first one without a name; `None` = not there (noted by the cross checks).
+    pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
+        let index = match interface {
+            Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
+            None => 0,
+        };
+        u8::try_from(index).ok().map(BusIndex)
+    }
+
+    /// The interface of a table that belongs to one; `None` = it is not there, or must be named (noted).
+    pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace, faults: &mut Faults) -> Option<BusIndex> {
+        let is_clear = interface.is_some() || self.interfaces.len() <= 1;
+        let bus = self.bus_of(interface).filter(|_| is_clear);
+        if bus.is_none() && self.has_all_interfaces() && !self.interfaces.is_empty() {
+            place.fault(faults, "interface", &format!("must be {}", self.interface_names()));
+        }
+        bus
+    }
+
+    /// Names of the interfaces, as a fault lists them.
+    pub(crate) fn interface_names(&self) -> String {
+        let names: Vec<&str> = self.interfaces.iter().map(|interface| interface.name.as_str()).collect();
+        names.join(" or ")
+    }
+
+    /// Notes an FD frame on interfaces without FD, at the key `fd` of its table.
+    pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex], faults: &mut Faults) {
+        let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
+        for interface in interfaces.filter(|interface| !interface.fd) {
+            place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
+        }
+    }
+
+    /// The configured signal of a channel.
+    pub(crate) fn source(&self, channel: Channel) -> Option<SignalSource<'_>> {
+        match channel {
+            Channel::Current => self.current.as_ref().map(|keys| keys.config()),
+            Channel::Temperature(sensor) => self.temperatures.get(usize::from(sensor.0)).map(|keys| keys.config()),
+            Channel::PackVoltage => self.pack_voltage.as_ref().map(|keys| keys.config()),
+            Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.config()),
+            Channel::Balancing(_) => self.balancing.as_ref().map(|keys| keys.config()),
+            Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.config()),
+            Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
+            Channel::SupplyVoltage => self.supply_voltage.as_ref().map(|keys| keys.config()),
+            Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.config()),
+            Channel::Contactor => self.contactor.as_ref().map(|keys| keys.config()),
+        }
+    }
+
+    /// All configured signals, `[input.cell_voltage]` and `[input.balancing]` once, for the first cell.
+    pub(crate) fn sources(&self) -> impl Iterator<Item = (Channel, SignalSource<'_>)> {
+        let sensors = (0..).take(self.temperatures.len()).map(|index| Channel::Temperature(SensorIndex(index)));
+        let others = [
+            Channel::PackVoltage,
+            Channel::ReportedSoc,
+            Channel::ReportedSoh,
+            Channel::SupplyVoltage,
+            Channel::PackIdentity,
+            Channel::Contactor,
+            Channel::CellVoltage(CellIndex(0)),
+            Channel::Balancing(CellIndex(0)),
+        ];
+        let channels = [Channel::Current].into_iter().chain(sensors).chain(others);
+        channels.filter_map(|channel| Some((channel, self.source(channel)?)))
+    }
+}
