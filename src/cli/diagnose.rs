@@ -40,7 +40,7 @@ pub(crate) struct Args {
     state: Option<PathBuf>,
     #[command(flatten)]
     input: InputArgs,
-    /// Write a picture of every difference as SVG and PNG into this folder
+    /// Write a picture of every difference as SVG into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print JSON
@@ -113,7 +113,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     if let Some(folder) = &args.plots {
         create_folder(folder)?;
-        chart::write_all(folder, &lab::finding_pictures::all(diagnosis)).map_err(failure)?;
+        chart::write_each(folder, &lab::finding_pictures::all(diagnosis)).map_err(failure)?;
     }
     let imbalance = snapshot.imbalance().unwrap_or(Err(UnknownImbalance::NotCompared));
     let model = cell_model(Some(&snapshot), config.as_ref())?.map(|sourced| sourced.model);

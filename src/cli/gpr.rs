@@ -57,7 +57,7 @@ struct CvArgs {
     /// Write the prediction of every row
     #[arg(long, value_name = "FILE.csv")]
     predictions: Option<PathBuf>,
-    /// Draw predicted against measured, a stretch with its interval, and errors, as SVG and PNG, into this folder
+    /// Draw predicted against measured, a stretch with its interval, and errors, as SVG, into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print one JSON document

@@ -52,7 +52,7 @@ struct PlotArgs {
     #[command(flatten)]
     source: SourceArgs,
     /// Picture to write
-    #[arg(short, long, value_name = "FILE.svg|png")]
+    #[arg(short, long, value_name = "FILE.svg")]
     out: PathBuf,
 }
 
@@ -99,13 +99,11 @@ fn show(args: &ShowArgs) -> Result<(), Failure> {
 fn plot(args: &PlotArgs) -> Result<(), Failure> {
     let (_, sourced) = args.source.load()?;
     check_place(&args.out, args.source.files()).map_err(Failure::new)?;
-    let format = match args.out.extension().and_then(|extension| extension.to_str()) {
-        Some("svg") => chart::Format::Svg,
-        Some("png") => chart::Format::Png,
-        _ => return Err(Failure::new(format!("{}: must end in .svg or .png", args.out.display()))),
-    };
+    if args.out.extension().is_none_or(|extension| extension != "svg") {
+        return Err(Failure::new(format!("{}: must end in .svg", args.out.display())));
+    }
     let pictures: Vec<_> = lab::model_pictures::all(&sourced).into_iter().map(|(_, picture)| picture).collect();
-    chart::write_stack(&args.out, &pictures, format).map_err(super::common::output::failure)
+    chart::write_stack(&args.out, &pictures).map_err(super::common::output::failure)
 }
 
 fn export(args: &ExportArgs) -> Result<(), Failure> {

@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// Page to write; - is standard output
     #[arg(short, long, value_name = "FILE.html", default_value = "report.html")]
     out: PathBuf,
-    /// Write every picture as SVG and PNG into this folder as well
+    /// Write every picture as SVG into this folder as well
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Truth to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)

@@ -15,7 +15,7 @@ mod svg;
 mod thin;
 
 pub use axis::{Axis, Scale};
-pub use files::{Format, PlotError, write, write_all, write_stack};
+pub use files::{PlotError, write_each, write_stack};
 pub use heat::Heat;
 pub use plot::{Chart, Layer, Point, Shape};
 pub use state_bands::{Span, StateBand, StateBands};

@@ -5,16 +5,14 @@
 //! white noise. Hyperparameters maximise the marginal likelihood, whose gradient is exact. (Rasmussen and Williams,
 //! *Gaussian Processes for Machine Learning*, 2006, chapters 2, 5 and 8.)
 //!
-//! Data flow: [`TrainingRows`] are checked and standardised ([`scale`]) -> one of three forms computes the likelihood with
+//! Data flow: [`TrainingRows`] are checked and standardised ([`scale`]) -> one of two forms computes the likelihood with
 //! its gradient, the coefficients and predictions ([`exact`]: all pairs of rows; [`nearest`]: each row with its nearest
-//! ones; [`inducing`]: through a few points) -> [`search`] maximises -> [`Model`] predicts, is saved and loaded; [`folds`]
-//! cross-validates. Bad rows, settings and saved models are a [`RegressionError`].
+//! ones) -> [`search`] maximises -> [`Model`] predicts, is saved and loaded; [`folds`] cross-validates. Bad rows, settings and saved models are a [`RegressionError`].
 //!
 //! | form | memory | time of one likelihood | good for |
 //! | --- | --- | --- | --- |
 //! | [`Form::Exact`] | n^2 | n^3 | up to some thousands of rows |
-//! | [`Form::Nearest`] | n m | n m^3 | any number of rows, few inputs; rough kernels above all |
-//! | [`Form::Inducing`] | n m | n m^2 | smooth functions, many inputs |
+//! | [`Form::Nearest`] | n m | n m^3 | any number of rows, few inputs |
 //!
 //! Deviation 1: the paper used a fully independent conditional (inducing points) for its 30,723 rows. [`Form::Nearest`] is
 //! the default for as many: a few hundred points cannot represent a rough function over months.
@@ -31,7 +29,6 @@ mod calibration;
 mod error;
 mod exact;
 mod folds;
-mod inducing;
 mod jitter;
 mod kd_tree;
 mod kernel;
@@ -57,6 +54,5 @@ pub use jitter::Jitter;
 pub use kernel::{Kernel, Shape};
 pub use model::{FitOutcome, Hyperparameter, Model, ModelSpec, Prediction, fit};
 pub use settings::{
-    FitProgress, Form, GprSettings, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback,
-    TrainingRows,
+    FitProgress, Form, GprSettings, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_NEIGHBOURS, ProgressCallback, TrainingRows,
 };

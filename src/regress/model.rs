@@ -21,12 +21,12 @@ use super::plan::{Covariance, Plan};
 use super::scale::{Scale, StandardisedRows, check};
 use super::search::{SearchMonitor, descend, first_start, log_bounds, random_start};
 use super::settings::{FitProgress, Form, GprSettings, ProgressCallback, TrainingRows};
-use super::{exact, inducing, nearest};
+use super::{exact, nearest};
 
 /// Rows whose factors the search of [`Form::Nearest`] sums over; the effect of this choice on the hyperparameters is far
 /// too small to show in a prediction.
 const SEARCH_ROWS: usize = 6000;
-/// Most choices of neighbours or inducing points while the length scales move.
+/// Most choices of neighbours while the length scales move.
 const MAX_ROUNDS: usize = 4;
 /// Change of the ratio of two length scales below which the choice is kept.
 const SAME_METRIC: f64 = 1.3;
@@ -85,7 +85,7 @@ pub struct ModelSpec {
     pub basis: Basis,
     /// Whether every input has a length scale of its own.
     pub ard: bool,
-    /// Exact or sparse.
+    /// Exact, or by nearest neighbours.
     pub form: Form,
     /// Number of inputs of a row.
     pub dimensions: usize,
@@ -99,7 +99,7 @@ pub struct FitOutcome {
     pub log_likelihood: f64,
     /// Jitter on diagonals.
     pub jitter: Jitter,
-    /// Steps of the best search, over all its choices of neighbours or inducing points.
+    /// Steps of the best search, over all its choices of neighbours.
     pub iterations: usize,
 }
 
@@ -107,7 +107,6 @@ pub struct FitOutcome {
 pub(super) enum Posterior {
     Exact(Box<exact::Posterior>),
     Nearest(Box<nearest::Posterior>),
-    Inducing(Box<inducing::Posterior>),
 }
 
 impl Posterior {
@@ -115,7 +114,6 @@ impl Posterior {
         match self {
             Self::Exact(posterior) => &posterior.data,
             Self::Nearest(posterior) => &posterior.data,
-            Self::Inducing(posterior) => &posterior.data,
         }
     }
 
@@ -123,7 +121,6 @@ impl Posterior {
         match self {
             Self::Exact(posterior) => Ok(posterior.predict(queries)),
             Self::Nearest(posterior) => posterior.predict(queries, None),
-            Self::Inducing(posterior) => Ok(posterior.predict(queries)),
         }
     }
 
@@ -131,7 +128,6 @@ impl Posterior {
     fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.left_out(rows)),
-            Self::Inducing(posterior) => Ok(posterior.left_out(rows)),
             Self::Nearest(posterior) => {
                 let data = &posterior.data;
                 let queries: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
@@ -235,7 +231,7 @@ impl<'a> FitJob<'a> {
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
-    /// One search; chooses neighbours or inducing points again until the metric is stable.
+    /// One search; chooses neighbours again until the metric is stable.
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
@@ -279,16 +275,6 @@ impl<'a> FitJob<'a> {
                     Ok((sums.value, sums.gradient))
                 })
             }
-            Form::Inducing { points } => {
-                let choose = || inducing::choose(&self.data, metric, points, self.settings.seed);
-                let points = self.pool.install(choose);
-                descend(start, bounds, steps, monitor, |theta| {
-                    self.pool.install(|| {
-                        let posterior = inducing::Posterior::new(&self.data, &self.plan, theta, &points)?;
-                        Ok((posterior.value, posterior.gradient()))
-                    })
-                })
-            }
         }
     }
 
@@ -307,13 +293,7 @@ impl<'a> FitJob<'a> {
                     ConditionalFactors::new(&data, evenly_spaced(data.len(), usize::MAX), &metric, neighbours);
                 let sums = factors.sums(&data, &plan, &theta, false)?;
                 let posterior = nearest::Posterior::new(data, plan, &theta, sums.coefficients, neighbours);
-                Ok((Posterior::Nearest(Box::new(posterior)), sums.value, sums.jitter))
-            }
-            Form::Inducing { points } => {
-                let points = inducing::choose(&data, &metric, points, self.settings.seed);
-                let posterior = inducing::Posterior::new(&data, &plan, &theta, &points)?;
-                let (value, jitter) = (posterior.value, posterior.jitter);
-                Ok::<_, RegressionError>((Posterior::Inducing(Box::new(posterior)), value, jitter))
+                Ok::<_, RegressionError>((Posterior::Nearest(Box::new(posterior)), sums.value, sums.jitter))
             }
         })?;
         let outcome = FitOutcome { log_likelihood: -value, jitter, iterations };
@@ -420,7 +400,7 @@ impl Model {
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * p.role.unit(&self.scale) }).collect()
     }
 
-    /// Natural logarithm of the density of the training targets, in their units (of a sparse form: of its own density).
+    /// Natural logarithm of the density of the training targets, in their units (of the nearest form: of its own density).
     pub fn log_marginal_likelihood(&self) -> f64 {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }

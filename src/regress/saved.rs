@@ -13,7 +13,7 @@ use super::model::{FitOutcome, Model, ModelSpec, Posterior, threads};
 use super::plan::Plan;
 use super::scale::{Scale, StandardisedRows};
 use super::settings::{Form, MAX_DIMENSIONS};
-use super::{exact, inducing, nearest};
+use super::{exact, nearest};
 
 /// Format name in the header.
 const FORMAT: &str = "packwatch gaussian process";
@@ -47,9 +47,6 @@ struct Body {
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     ratios: Vec<f64>,
-    /// Inducing points, row after row.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    points: Vec<f64>,
 }
 
 /// FNV-1a, 64 bits: detects damage, is no signature.
@@ -79,15 +76,10 @@ impl Model {
             beta_covariance: vec![],
             left_out: self.calibration.rows.clone(),
             ratios: self.calibration.ratios.clone(),
-            points: vec![],
         };
-        match &self.posterior {
-            Posterior::Exact(_) => {}
-            Posterior::Nearest(posterior) => {
-                body.beta.clone_from(&posterior.coefficients.beta);
-                body.beta_covariance.clone_from(&posterior.coefficients.covariance);
-            }
-            Posterior::Inducing(posterior) => body.points = posterior.points().to_vec(),
+        if let Posterior::Nearest(posterior) = &self.posterior {
+            body.beta.clone_from(&posterior.coefficients.beta);
+            body.beta_covariance.clone_from(&posterior.coefficients.covariance);
         }
         let json = |error: serde_json::Error| RegressionError::Saved(format!("cannot be written: {error}"));
         let body = serde_json::to_string(&body).map_err(json)?;
@@ -138,22 +130,13 @@ impl Body {
         same("theta", self.theta.len(), plan.parameters.len())?;
         let size = self.spec.basis.size(d);
         self.spec.form.check(n).map_err(damaged)?;
-        match self.spec.form {
-            Form::Exact => {}
-            Form::Nearest { .. } => {
-                same("coefficients", self.beta.len(), size)?;
-                same("their covariance", self.beta_covariance.len(), size * size)?;
-            }
-            Form::Inducing { .. } if self.points.is_empty() => return Err(damaged("no inducing points")),
-            Form::Inducing { .. } => same("their inputs", self.points.len() % d, 0)?,
+        if matches!(self.spec.form, Form::Nearest { .. }) {
+            same("coefficients", self.beta.len(), size)?;
+            same("their covariance", self.beta_covariance.len(), size * size)?;
         }
         let scale = &self.scale;
         let numbers = [&self.inputs, &self.targets, &self.theta, &scale.means, &scale.deviations, &self.beta];
-        let finite = numbers
-            .into_iter()
-            .chain([&self.beta_covariance, &self.points, &self.ratios])
-            .flatten()
-            .all(|x| x.is_finite());
+        let finite = numbers.into_iter().chain([&self.beta_covariance, &self.ratios]).flatten().all(|x| x.is_finite());
         let positive = scale.deviations.iter().chain([&scale.target_deviation]).all(|x| *x > 0.0);
         let small = self.theta.iter().all(|x| x.abs() < 100.0);
         let rows = scale.target_mean.is_finite() && self.left_out.iter().all(|row| (*row as usize) < n);
@@ -172,11 +155,7 @@ impl Body {
                 let coefficients =
                     Coefficients { beta: self.beta, covariance: self.beta_covariance, squared_norm: 0.0 };
                 let posterior = nearest::Posterior::new(data, plan, &theta, coefficients, neighbours);
-                Ok(Posterior::Nearest(Box::new(posterior)))
-            }
-            Form::Inducing { .. } => {
-                let posterior = inducing::Posterior::new(&data, &plan, &theta, &self.points)?;
-                Ok::<_, RegressionError>(Posterior::Inducing(Box::new(posterior)))
+                Ok::<_, RegressionError>(Posterior::Nearest(Box::new(posterior)))
             }
         })?;
         let calibration = match self.left_out.len() {

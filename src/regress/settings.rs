@@ -16,8 +16,6 @@ pub const MAX_DIMENSIONS: usize = 256;
 pub const MAX_EXACT_ROWS: usize = 20_000;
 /// Most neighbours of a row.
 pub const MAX_NEIGHBOURS: usize = 500;
-/// Most inducing points.
-pub const MAX_INDUCING: usize = 5_000;
 
 /// Rows to learn from.
 #[derive(Debug, Clone, Copy)]
@@ -44,20 +42,14 @@ pub enum Form {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
     },
-    /// Through inducing points with a row-wise correction of the noise (fully independent training conditional).
-    Inducing {
-        /// Number of inducing points, 1 to 5000.
-        points: usize,
-    },
 }
 
 impl Form {
     /// Checks its numbers, and that of the rows, against the limits.
     pub(super) fn check(self, rows: usize) -> Result<(), RegressionError> {
         let (what, found, most, advice) = match self {
-            Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; take a sparse form"),
+            Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; take the form nearest"),
             Self::Nearest { neighbours } => ("neighbours", neighbours, MAX_NEIGHBOURS, ""),
-            Self::Inducing { points } => ("inducing points", points, MAX_INDUCING, ""),
         };
         if (1..=most).contains(&found) {
             return Ok(());
@@ -77,11 +69,11 @@ pub struct GprSettings {
     pub ard: bool,
     /// Inputs are brought to mean 0 and standard deviation 1; length scales are then in standard deviations.
     pub standardise: bool,
-    /// Exact or sparse.
+    /// Exact, or by nearest neighbours.
     pub form: Form,
     /// Searches from seeded random starts in addition to the first.
     pub restarts: usize,
-    /// Seed of starts, order, inducing points and folds.
+    /// Seed of starts, order and folds.
     pub seed: u64,
     /// Most steps of one search; 0 = the start is the result.
     pub max_iterations: usize,

@@ -1,4 +1,4 @@
-//! The three forms against each other and against finite differences; whole fits.
+//! Both forms against each other and against finite differences; whole fits.
 
 use std::ops::ControlFlow;
 
@@ -51,7 +51,7 @@ fn check_gradient(plan: &Plan, name: &str, of: impl Fn(&[f64]) -> (f64, Vec<f64>
 }
 
 #[test]
-fn gradients_of_all_forms_agree_with_finite_differences() {
+fn gradients_of_both_forms_agree_with_finite_differences() {
     for (kernel, basis, ard) in
         [(KERNELS[0], Basis::Constant, true), (KERNELS[1], Basis::Zero, false), (KERNELS[2], Basis::Linear, true)]
     {
@@ -65,11 +65,6 @@ fn gradients_of_all_forms_agree_with_finite_differences() {
         check_gradient(&plan, "nearest", |theta| {
             let sums = factors.sums(&data, &plan, theta, true).expect("positive definite");
             (sums.value, sums.gradient)
-        });
-        let points = inducing::choose(&data, &[1.0, 1.0], 9, 1);
-        check_gradient(&plan, "inducing", |theta| {
-            let posterior = inducing::Posterior::new(&data, &plan, theta, &points).expect("positive definite");
-            (posterior.value, posterior.gradient())
         });
     }
 }
@@ -92,7 +87,7 @@ fn assert_close(found: &[Prediction], expected: &[Prediction], within: f64) {
 }
 
 #[test]
-fn the_sparse_forms_with_all_rows_agree_with_the_exact_form() {
+fn the_nearest_form_with_all_rows_agrees_with_the_exact_form() {
     for basis in [Basis::Zero, Basis::Constant, Basis::Linear] {
         let fixed = |settings: &mut GprSettings| {
             (settings.basis, settings.max_iterations, settings.calibrate) = (basis, 0, false);
@@ -100,18 +95,11 @@ fn the_sparse_forms_with_all_rows_agree_with_the_exact_form() {
         let exact = fitted(Form::Exact, fixed);
         let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
-        for (form, within) in [(Form::Nearest { neighbours: 119 }, 1e-8), (Form::Inducing { points: 120 }, 1e-5)] {
-            let sparse = fitted(form, fixed);
-            let likelihoods = (sparse.log_marginal_likelihood(), exact.log_marginal_likelihood());
-            assert!((likelihoods.0 - likelihoods.1).abs() < 1e3 * within, "{form:?}: {likelihoods:?}");
-            if form == (Form::Nearest { neighbours: 119 }) {
-                // A prediction conditions on one row more than a factor.
-                continue;
-            }
-            assert_close(&sparse.predict(&queries).expect("finite"), &expected, within);
-        }
-        let sparse = fitted(Form::Nearest { neighbours: 120 }, fixed);
-        assert_close(&sparse.predict(&queries).expect("finite"), &expected, 1e-8);
+        // A prediction conditions on one row more than a factor.
+        let nearest = fitted(Form::Nearest { neighbours: 120 }, fixed);
+        let likelihoods = (nearest.log_marginal_likelihood(), exact.log_marginal_likelihood());
+        assert!((likelihoods.0 - likelihoods.1).abs() < 1e-5, "{likelihoods:?}");
+        assert_close(&nearest.predict(&queries).expect("finite"), &expected, 1e-8);
     }
 }
 
@@ -121,7 +109,6 @@ fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
     let plan = Plan::new(&"matern32".parse().expect("a kernel"), 2, false);
     let at = theta(&plan);
     let all = exact::Posterior::new(data.clone(), plan.clone(), &at).expect("positive definite");
-    let inducing_all = inducing::Posterior::new(&data, &plan, &at, &data.inputs).expect("positive definite");
     for row in [0_usize, 17, 49] {
         let mut without = data.clone();
         without.inputs.drain(2 * row..2 * row + 2);
@@ -129,22 +116,19 @@ fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
         let without = exact::Posterior::new(without, plan.clone(), &at).expect("positive definite");
         let (mean, variance) = without.predict(data.row(row))[0];
         let expected = (data.targets[row] - mean, variance + without.covariance.noise_variance);
-        for (residual, measured) in [all.left_out(&[row as u32])[0], inducing_all.left_out(&[row as u32])[0]] {
-            assert!((residual - expected.0).abs() < 1e-5 && (measured - expected.1).abs() < 1e-5, "row {row}");
-        }
+        let (residual, measured) = all.left_out(&[row as u32])[0];
+        assert!((residual - expected.0).abs() < 1e-5 && (measured - expected.1).abs() < 1e-5, "row {row}");
     }
 }
 
 #[test]
 fn the_search_recovers_noise_and_function() {
-    for form in [Form::Exact, Form::Nearest { neighbours: 25 }, Form::Inducing { points: 40 }] {
+    for form in [Form::Exact, Form::Nearest { neighbours: 25 }] {
         let model = fitted(form, |settings| settings.restarts = 1);
         let hyperparameters = model.hyperparameters();
         let noise_sd = hyperparameters.last().expect("the noise is there").value;
-        // The exact noise of these 120 rows is 0.086. Inducing points underestimate it: deviations that they cannot represent
-        // count as noise of the single rows.
-        let minimum = if matches!(form, Form::Inducing { .. }) { 0.06 } else { 0.075 };
-        assert!((minimum..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
+        // The exact noise of these 120 rows is 0.086.
+        assert!((0.075..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
         let (queries, targets) = wavy_plane(400, 99);
         let predictions = model.predict(&queries).expect("finite");
         let score = score(&predictions, &targets);
@@ -182,25 +166,20 @@ fn equal_rows_with_hardly_any_noise_need_jitter_and_it_is_counted() {
     let inputs: Vec<f64> = (0..40).map(|k| f64::from(k / 4) * 1e-3).collect();
     let targets: Vec<f64> = inputs.iter().map(|x| x.sin()).collect();
     let rows = TrainingRows { inputs: &inputs, dimensions: 1, targets: &targets, lines: &[] };
-    for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
+    for form in [Form::Exact, Form::Nearest { neighbours: 30 }] {
         let mut settings = GprSettings::new("squared_exponential".parse().expect("a kernel"), 40);
         (settings.form, settings.max_iterations) = (form, 0);
         settings.start = vec![3.0, 1.0, 1e-12];
         let model = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect("jitter helps");
-        if !matches!(form, Form::Inducing { .. }) {
-            assert!(
-                model.outcome.jitter.matrices > 0 && model.outcome.jitter.largest >= 1e-10,
-                "{form:?}: {:?}",
-                model.outcome.jitter
-            );
-        }
+        let jitter = model.outcome.jitter;
+        assert!(jitter.matrices > 0 && jitter.largest >= 1e-10, "{form:?}: {jitter:?}");
     }
     assert_eq!(fitted(Form::Exact, |_| ()).outcome.jitter, Jitter::default());
 }
 
 #[test]
 fn a_model_survives_saving_and_loading() {
-    for form in [Form::Exact, Form::Nearest { neighbours: 20 }, Form::Inducing { points: 30 }] {
+    for form in [Form::Exact, Form::Nearest { neighbours: 20 }] {
         let model = fitted(form, |settings| settings.basis = Basis::Linear);
         let text = model.save().expect("can be written");
         let loaded = Model::load(&text, 1).expect("sound");
@@ -277,7 +256,6 @@ fn settings_out_of_range_are_rejected() {
     };
     assert_eq!(refused(&|s| s.threads = 0), "threads = 0, must be 1 to 1024");
     assert_eq!(refused(&|s| s.form = Form::Nearest { neighbours: 0 }), "neighbours = 0, must be 1 to 500");
-    assert_eq!(refused(&|s| s.form = Form::Inducing { points: 9999 }), "inducing points = 9999, must be 1 to 5000");
     assert_eq!(refused(&|s| s.start = vec![1.0]), "start = [1.0], must be 3 positive numbers");
     assert_eq!(refused(&|s| s.restarts = usize::MAX), format!("restarts = {}, must be at most 1000", usize::MAX));
     let model = fitted(Form::Exact, |_| ());
@@ -286,7 +264,7 @@ fn settings_out_of_range_are_rejected() {
 
 #[test]
 fn numbers_too_large_to_square_are_rejected() {
-    for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
+    for form in [Form::Exact, Form::Nearest { neighbours: 30 }] {
         let model = fitted(form, |_| ());
         let predicted = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
         // Either so distant that the prior applies, or rejected by row.

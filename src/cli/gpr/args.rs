@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::cli::common::numbers::{NamedValue, one_of, whole};
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
-use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
+use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_NEIGHBOURS};
 use packwatch_host::failure::Failure;
 
 /// Below the options.
@@ -45,8 +45,6 @@ pub(super) enum FormName {
     Exact,
     /// Every row with its nearest (Vecchia): any number of rows
     Nearest,
-    /// Through inducing points (FITC): smooth functions
-    Inducing,
 }
 
 /// Mean functions by name.
@@ -71,16 +69,13 @@ pub(super) struct ModelArgs {
     /// Neighbours of a row in the form nearest
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = whole::<1, MAX_NEIGHBOURS>)]
     neighbours: usize,
-    /// Inducing points in the form inducing
-    #[arg(long, value_name = "N", default_value_t = 500, value_parser = whole::<1, MAX_INDUCING>)]
-    points: usize,
     /// Further searches for hyperparameters, from random starts
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole::<0, 100>)]
     restarts: usize,
     /// Most steps of a search
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = whole::<1, 10_000>)]
     max_iterations: usize,
-    /// Seed of folds, starts, orders and inducing points
+    /// Seed of folds, starts, and orders
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(super) seed: u64,
     /// Threads [default: one per core]
@@ -95,7 +90,6 @@ impl ModelArgs {
         settings.form = match self.form {
             Some(FormName::Exact) => Form::Exact,
             Some(FormName::Nearest) => Form::Nearest { neighbours: self.neighbours },
-            Some(FormName::Inducing) => Form::Inducing { points: self.points },
             None if settings.form == Form::Exact => Form::Exact,
             None => Form::Nearest { neighbours: self.neighbours },
         };

@@ -58,7 +58,7 @@ pub(super) struct ForecastArgs {
     /// Write every forecast made
     #[arg(long, value_name = "FILE.csv")]
     predictions: Option<PathBuf>,
-    /// Draw the fan at the origin, error and coverage over the rows ahead, as SVG and PNG, into this folder
+    /// Draw the fan at the origin, error and coverage over the rows ahead, as SVG, into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print one JSON document

@@ -43,7 +43,6 @@ pub(super) fn form(form: Form) -> String {
     match form {
         Form::Exact => "exact".to_owned(),
         Form::Nearest { neighbours } => format!("nearest, {neighbours} neighbours"),
-        Form::Inducing { points } => format!("inducing, {points} points"),
     }
 }
 

@@ -84,11 +84,6 @@ pub fn variables() -> String {
     ) + &classes()
 }
 
-/// The classes alone, light, without variables, for viewers without style sheet variables.
-pub(super) fn fixed() -> String {
-    COLOURS.iter().fold(classes(), |text, (name, light, _)| text.replace(&format!("var(--{name})"), light))
-}
-
 fn classes() -> String {
     let mut text = String::from(
         "text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif;fill:var(--word)}\

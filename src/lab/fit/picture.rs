@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::FitOutcome;
-use crate::chart::{self, Chart, Format, Ink, Layer, Picture};
+use crate::chart::{self, Chart, Ink, Layer, Picture};
 use crate::error::LabError;
 use crate::ident::pass::residuals;
 
@@ -16,7 +16,7 @@ const MAX_PANELS: usize = 40;
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
     let panels: Vec<Picture> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
-    Ok(chart::write_stack(path, &panels, Format::Svg)?)
+    Ok(chart::write_stack(path, &panels)?)
 }
 
 /// One file; its stretches follow each other.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
+use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
 /// Rows of the stretch that is drawn with its interval: each can be seen.
 const STRETCH: usize = 150;
@@ -14,17 +14,17 @@ const SCATTER: usize = 3000;
 /// Rows before the origin that a fan shows, at least.
 const BEFORE: usize = 60;
 
-/// Draws the cross-validation of every kernel, as SVG and PNG.
+/// Draws the cross-validation of every kernel, as SVG.
 ///
 /// # Errors
-/// A file cannot be written, or there is no font for the words of a PNG.
+/// A file cannot be written.
 pub fn write_cross_validation(folder: &Path, data: &ColumnTable, all: &[CrossValidation]) -> Result<(), PlotError> {
     let output = data.names.last().map_or("", String::as_str);
     let truth: Vec<f64> = data.column(data.width() - 1).collect();
     for validated in all {
         let charts =
             [scatter(validated, &truth, output), stretch(validated, &truth, output), errors(validated, &truth, output)];
-        write_both(folder, &format!("cv_{}", slug(&validated.kernel)), charts.into())?;
+        write_charts(folder, &format!("cv_{}", slug(&validated.kernel)), charts.into())?;
     }
     Ok(())
 }
@@ -39,15 +39,14 @@ pub fn write_forecast(folder: &Path, data: &ColumnTable, forecast: &TableForecas
         if output.horizons.iter().any(|horizon| horizon.score.is_some()) {
             charts.extend([growth(output), coverage(output), held_out(data, output)]);
         }
-        write_both(folder, &format!("forecast_{}", slug(&output.name)), charts)?;
+        write_charts(folder, &format!("forecast_{}", slug(&output.name)), charts)?;
     }
     Ok(())
 }
 
-fn write_both(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), PlotError> {
+fn write_charts(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), PlotError> {
     let pictures: Vec<Picture> = charts.into_iter().map(Picture::Chart).collect();
-    chart::write_stack(&folder.join(format!("{name}.svg")), &pictures, Format::Svg)?;
-    chart::write_stack(&folder.join(format!("{name}.png")), &pictures, Format::Png)
+    chart::write_stack(&folder.join(format!("{name}.svg")), &pictures)
 }
 
 /// Letters and digits, for a file's name.

@@ -27,13 +27,13 @@ const MAX_HOLE_BINS: usize = 3;
 /// The last half-cycles get their own picture when they are at most this part of the record.
 const MAX_RECENT: f64 = 0.9;
 
-/// Writes every picture of the report into a folder, as SVG and PNG; gives how many pictures.
+/// Writes every picture of the report into a folder, as SVG; returns the number of pictures.
 ///
 /// # Errors
-/// A file cannot be written, or there is no font for the words of a PNG.
+/// A file cannot be written.
 pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Result<usize, PlotError> {
     let pictures = all(data, context);
-    chart::write_all(folder, &pictures)?;
+    chart::write_each(folder, &pictures)?;
     Ok(pictures.len())
 }
 

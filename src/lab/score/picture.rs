@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::life::{DischargeScore, LifeScore};
 use super::soc::SocSample;
 use super::{Case, STD_OF_95};
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError};
+use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
 /// Words for an error of the capacity and one of the current.
 const WORDS: [&str; 2] = ["capacity", "current"];
@@ -27,7 +27,7 @@ pub(super) fn draw(
     let path =
         folder.join(format!("{}_{}.svg", name.replace('/', "_"), case.words("_", WORDS).replace([' ', '%'], "")));
     let pictures: Vec<Picture> = panels.into_iter().map(Picture::Chart).collect();
-    chart::write_stack(&path, &pictures, Format::Svg)?;
+    chart::write_stack(&path, &pictures)?;
     Ok(path)
 }
 
