@@ -5,6 +5,7 @@ pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor,
 pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
+mod capacity_table;
 pub mod chart;
 pub mod discover;
 pub mod error;

@@ -4,24 +4,14 @@
 //! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`) at each
 //! of whose values the time starts again. An empty field is NaN. A field that is no number is an error with its line.
 //!
-//! Files of the Battery Data Format, by their columns ([`BDF_COLUMNS`]), are read too. There, positive current is charge: the format
-//! does not state it, but counts its net capacity as charged minus discharged, and cyclers write it so. Time does not start again.
+//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]); their current and charge change their sign.
 
 use std::path::{Path, PathBuf};
 
 pub use crate::ident::MeasuredPart;
-use crate::io::table::{Header, PART_COLUMNS, Row, Table, TableError};
-
-/// Columns of the Battery Data Format: ours, the format's label, its name for machines; the first of several that is there counts.
-pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
-    ("time_s", "Test Time / s", "test_time_second"),
-    ("current_a", "Current / A", "current_ampere"),
-    ("voltage_v", "Voltage / V", "voltage_volt"),
-    ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
-    ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
-    // With the other sign, as the current.
-    ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
-];
+pub use crate::io::csv_log::BDF_COLUMNS;
+use crate::io::csv_log::SampleColumns;
+use crate::io::table::{Header, Row, Table, TableError};
 
 /// One measured file.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,37 +63,16 @@ impl MeasuredFile {
 
 impl Columns {
     fn find(header: &Header) -> Result<Self, TableError> {
-        let is_bdf = header.find("time_s").is_none() && bdf_column(header, "time_s").is_some();
-        if is_bdf { Self::find_bdf(header) } else { Self::find_ours(header) }
-    }
-
-    fn find_bdf(header: &Header) -> Result<Self, TableError> {
-        let required = |ours: &str| {
-            let names: Vec<&str> = BDF_COLUMNS.iter().filter(|of| of.0 == ours).map(|of| of.1).collect();
-            bdf_column(header, ours).map_or_else(|| header.required(&names), Ok)
-        };
+        let columns = SampleColumns::new(header, None);
         Ok(Self {
-            time: required("time_s")?,
-            current: required("current_a")?,
-            voltage: required("voltage_v")?,
-            temperature: bdf_column(header, "temperature_c"),
-            discharged: bdf_column(header, "discharged_ah"),
-            part: None,
-            kind: None,
-            sign: -1.0,
-        })
-    }
-
-    fn find_ours(header: &Header) -> Result<Self, TableError> {
-        Ok(Self {
-            time: header.required(&["time_s"])?,
-            current: header.required(&["current_a"])?,
-            voltage: header.required(&["voltage_v"])?,
-            temperature: header.find("temperature_c"),
-            discharged: header.find("discharged_ah"),
-            part: header.find_any(&PART_COLUMNS),
+            time: columns.required("time", "time_s")?,
+            current: columns.required("current", "current_a")?,
+            voltage: columns.required("voltage", "voltage_v")?,
+            temperature: columns.optional("temperature", "temperature_c")?,
+            discharged: columns.optional("charge", "discharged_ah")?,
+            part: columns.part()?,
             kind: header.find("type"),
-            sign: 1.0,
+            sign: if columns.is_bdf { -1.0 } else { 1.0 },
         })
     }
 
@@ -129,12 +98,6 @@ impl Columns {
         part.push(time_s, current_a, voltage_v, temperature_c, discharged_ah);
         Ok(())
     }
-}
-
-/// The column of the Battery Data Format that stands for one of ours.
-fn bdf_column(header: &Header, ours: &str) -> Option<usize> {
-    let names = BDF_COLUMNS.iter().filter(|of| of.0 == ours);
-    names.into_iter().find_map(|(_, label, name)| header.find_any(&[label, name]))
 }
 
 #[cfg(test)]
@@ -169,7 +132,10 @@ mod tests {
             read("test_time_second,voltage_volt,current_ampere,net_capacity_ah\n0,3.5,-2,-0.25\n").expect("reads");
         assert_eq!((file.parts[0].current_a[0], file.parts[0].discharged_ah[0]), (2.0, 0.25));
         let found = read("Test Time / s,Voltage / V\n0,3.5\n");
-        assert_eq!(found, Err("cell.csv:1: no column Current / A, found Test Time / s,Voltage / V".into()));
+        assert_eq!(
+            found,
+            Err("cell.csv:1: no column Current / A or current_ampere, found Test Time / s,Voltage / V".into())
+        );
     }
 
     #[test]

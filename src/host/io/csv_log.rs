@@ -1,6 +1,7 @@
 //! CSV logs: one row per sample, columns found by name, values in the program's units.
 //!
-//! Positive current is discharge unless [`CsvOptions::charge_positive`]. An empty field is no reading. A row with a
+//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]). Positive current is discharge unless
+//! [`CsvOptions::charge_positive`] or the Battery Data Format says otherwise. An empty field is no reading. A row with a
 //! field that is no finite number, or that lacks a field, is a bad row. Where a section column exists (`cycle`,
 //! `segment` or `ref` unless named), time starts again at each of its values: with a table of start times the
 //! stamps become absolute, without one the gap between sections is unknown.
@@ -67,12 +68,12 @@ impl CsvLog {
     /// The source cannot be read, a column is missing, or the table of start times is faulty.
     pub fn open(source: Box<dyn Read>, name: &str, options: &CsvOptions) -> Result<Self, TableError> {
         let table = Table::new(source, name.to_owned(), Quotes::Literal)?;
-        let columns = Columns { header: table.header(), options };
-        let time_column = columns.required("time", "time_s")?;
-        let sections = columns.sections()?;
-        let channels = columns.channels()?;
+        let columns = Columns { named: SampleColumns::new(table.header(), Some(&options.columns)), options };
+        let time_column = columns.named.required("time", "time_s")?;
+        let (sections, channels) = (columns.sections()?, columns.channels()?);
+        let charge_positive = options.charge_positive || columns.named.is_bdf;
         let values = Vec::with_capacity(channels.len());
-        Ok(Self { table, time_column, channels, charge_positive: options.charge_positive, sections, values })
+        Ok(Self { table, time_column, channels, charge_positive, sections, values })
     }
 
     /// Reads one row into [`values`](Self::values); `None` = the file has ended, an inner error = the row cannot be used.
@@ -116,43 +117,104 @@ impl Sections {
     }
 }
 
-/// Finds the columns of the roles in a header line.
-struct Columns<'a> {
+/// Columns of the Battery Data Format: ours, the format's label, its name for machines; the first of several that is there counts.
+pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
+    ("time_s", "Test Time / s", "test_time_second"),
+    ("current_a", "Current / A", "current_ampere"),
+    ("voltage_v", "Voltage / V", "voltage_volt"),
+    ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
+    ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
+    // With the other sign, as the current.
+    ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
+];
+
+/// Finds the columns of samples: those that the user maps, else ours, or those of the Battery Data Format.
+pub struct SampleColumns<'a> {
     header: &'a Header,
+    /// Role to column; `None` = the user cannot map columns.
+    mapping: Option<&'a [(String, String)]>,
+    /// Whether the file is of the Battery Data Format. Positive current is charge there: the format does not state it, but
+    /// counts its net capacity as charged minus discharged, and cyclers write it so.
+    pub is_bdf: bool,
+}
+
+impl<'a> SampleColumns<'a> {
+    /// Columns of a header line.
+    pub fn new(header: &'a Header, mapping: Option<&'a [(String, String)]>) -> Self {
+        let is_bdf = header.find("time_s").is_none() && header.find_any(&bdf_names("time_s")).is_some();
+        Self { header, mapping, is_bdf }
+    }
+
+    fn mapped(&self, role: &str) -> Option<&'a str> {
+        self.mapping?.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
+    }
+
+    fn usual(&self, ours: &'a str) -> Vec<&'a str> {
+        if self.is_bdf { bdf_names(ours) } else { vec![ours] }
+    }
+
+    fn find(&self, role: &str, names: &[&str]) -> Result<usize, TableError> {
+        let missing = || {
+            let (name, found) = (names.join(" or "), self.header.names().join(","));
+            let (of, hint) = match self.mapping {
+                Some(_) => (format!(" for {role}"), format!(" (map it with --column {role}=NAME)")),
+                None => Default::default(),
+            };
+            self.header.fault(format_args!("no column {name}{of}, found {found}{hint}"))
+        };
+        self.header.find_any(names).ok_or_else(missing)
+    }
+
+    /// Number of the column of a role, `ours` where the user maps none.
+    ///
+    /// # Errors
+    /// The file does not have it.
+    pub fn required(&self, role: &str, ours: &'a str) -> Result<usize, TableError> {
+        self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
+    }
+
+    /// Number of the column of a role, `ours` where the user maps none; `None` = the file does not have it.
+    ///
+    /// # Errors
+    /// The file does not have the column that the user maps.
+    pub fn optional(&self, role: &str, ours: &'a str) -> Result<Option<usize>, TableError> {
+        match self.mapped(role) {
+            Some(column) => self.find(role, &[column]).map(Some),
+            None => Ok(self.header.find_any(&self.usual(ours))),
+        }
+    }
+
+    /// Number of the column at whose values time starts again.
+    ///
+    /// # Errors
+    /// The file does not have the column that the user maps.
+    pub fn part(&self) -> Result<Option<usize>, TableError> {
+        match self.mapped("section") {
+            Some("") => Ok(None),
+            Some(column) => self.find("section", &[column]).map(Some),
+            None => Ok(self.header.find_any(&PART_COLUMNS)),
+        }
+    }
+}
+
+/// Names in the Battery Data Format.
+fn bdf_names(ours: &str) -> Vec<&'static str> {
+    BDF_COLUMNS.iter().filter(|of| of.0 == ours).flat_map(|of| [of.1, of.2]).collect()
+}
+
+/// The columns of a log by its options.
+struct Columns<'a> {
+    named: SampleColumns<'a>,
     options: &'a CsvOptions,
 }
 
 impl Columns<'_> {
-    fn mapped(&self, role: &str) -> Option<&str> {
-        self.options.columns.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
-    }
-
-    fn find(&self, role: &str, column: &str) -> Result<usize, TableError> {
-        self.header.find(column).ok_or_else(|| self.missing(role, column))
-    }
-
-    fn missing(&self, role: &str, column: &str) -> TableError {
-        let found = self.header.names().join(",");
-        self.header
-            .fault(format_args!("no column {column} for {role}, found {found} (map it with --column {role}=NAME)"))
-    }
-
-    fn required(&self, role: &str, default: &str) -> Result<usize, TableError> {
-        self.find(role, self.mapped(role).unwrap_or(default))
-    }
-
     fn sections(&self) -> Result<Option<Sections>, TableError> {
-        let column = match self.mapped("section") {
-            Some("") => None,
-            Some(column) => Some(self.find("section", column)?),
-            None => self.header.find_any(&PART_COLUMNS),
-        };
+        let (column, header) = (self.named.part()?, self.named.header);
         let starts = match (&self.options.start_times, column) {
-            (Some(path), Some(column)) => Some(read_starts(path, &self.header.names()[column])?),
+            (Some(path), Some(column)) => Some(read_starts(path, &header.names()[column])?),
             (Some(path), None) => {
-                return Err(self
-                    .header
-                    .fault(format_args!("no section column for the start times of {}", path.display())));
+                return Err(header.fault(format_args!("no section column for the start times of {}", path.display())));
             }
             (None, _) => None,
         };
@@ -160,7 +222,7 @@ impl Columns<'_> {
     }
 
     fn channels(&self) -> Result<Vec<(Channel, usize)>, TableError> {
-        let mut channels = vec![(Channel::Current, self.required("current", "current_a")?)];
+        let mut channels = vec![(Channel::Current, self.named.required("current", "current_a")?)];
         self.temperatures(&mut channels)?;
         self.voltages(&mut channels)?;
         channels.sort_by_key(|&(channel, _)| channel);
@@ -169,31 +231,28 @@ impl Columns<'_> {
 
     /// One column for the first sensor, or a pattern with as many as the file has; none is allowed.
     fn temperatures(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
-        if let Some(pattern) = self.mapped("temperature{n}") {
-            let found = (0..u16::MAX).map_while(|n| Some((n, self.header.find(&numbered(pattern, n))?)));
-            let before = channels.len();
+        if let Some(pattern) = self.named.mapped("temperature{n}") {
+            self.named.find("temperature{n}", &[&numbered(pattern, 0)])?;
+            let found = (0..u16::MAX).map_while(|n| Some((n, self.named.header.find(&numbered(pattern, n))?)));
             channels.extend(found.map(|(n, column)| (Channel::Temperature(SensorIndex(n)), column)));
-            return if channels.len() > before { Ok(()) } else { Err(self.missing("temperature{n}", pattern)) };
+            return Ok(());
         }
-        let column = match self.mapped("temperature") {
-            Some(column) => Some(self.find("temperature", column)?),
-            None => self.header.find("temperature_c"),
-        };
+        let column = self.named.optional("temperature", "temperature_c")?;
         channels.extend(column.map(|c| (Channel::Temperature(SensorIndex(0)), c)));
         Ok(())
     }
 
     fn voltages(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
         let cells = self.options.cells;
-        let pattern = self.mapped("voltage{n}");
+        let pattern = self.named.mapped("voltage{n}");
         if self.options.pack_total {
-            channels.push((Channel::PackVoltage, self.required("voltage", "voltage_v")?));
+            channels.push((Channel::PackVoltage, self.named.required("voltage", "voltage_v")?));
         } else if cells == 1 && pattern.is_none() {
-            channels.push((Channel::CellVoltage(CellIndex(0)), self.required("voltage", "voltage_v")?));
+            channels.push((Channel::CellVoltage(CellIndex(0)), self.named.required("voltage", "voltage_v")?));
         } else {
             let pattern = pattern.unwrap_or("voltage{n}_v");
             for n in 0..cells {
-                let column = self.find("voltage{n}", &numbered(pattern, n))?;
+                let column = self.named.find("voltage{n}", &[&numbered(pattern, n)])?;
                 channels.push((Channel::CellVoltage(CellIndex(n)), column));
             }
         }

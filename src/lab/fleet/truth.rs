@@ -1,8 +1,7 @@
 //! The true capacities of a log, from a CSV next to it.
 //!
-//! Two forms are known by their columns: `time_s`, `cell`, `capacity_ah` as `simulate --truth` writes it (the capacity
-//! between the open-circuit voltages, of every cell), and `start`, `type`, `capacity_ah_source` as `score --cycles` takes
-//! it (published capacities of discharges of one cell, at the load they were measured with). Next to `NAME.log`,
+//! Two forms are known by their columns: with `cell`, as `simulate --truth` writes it (the capacity between the open-circuit
+//! voltages, of every cell), and with `cycle` and `type`, as `score --cycles` takes it (published capacities of discharges of one cell, at the load they were measured with). Next to `NAME.log`,
 //! `NAME.csv`, ... the search finds `NAME.truth.csv`, `NAME_truth.csv`, `NAME_cycles.csv`, and `truth.csv` where the log is the only one
 //! given of its folder; each also `.gz` and `.zst`.
 
@@ -11,12 +10,11 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::io::table::{Table, TableError};
+use crate::capacity_table::CapacityTable;
+use crate::io::table::TableError;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
 
-/// Smallest relative change of the capacity that is stored.
-const KEPT_CHANGE: f64 = 2e-4;
 /// Endings of the names looked for.
 const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
@@ -67,16 +65,8 @@ impl Truth {
     /// # Errors
     /// It cannot be read, is of neither form, or a field is wrong: file, line, found, allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let table = Table::open(path)?;
-        let header = table.header();
-        match ["time_s", "cell", "capacity_ah", "capacity_ah_source"].map(|name| header.find(name)) {
-            [Some(time), Some(cell), Some(capacity), _] => read_simulated(table, [time, cell, capacity]),
-            [.., Some(_)] => Self::of_table(path),
-            _ => Err(header.fault(format_args!(
-                "columns {}, must have time_s, cell, capacity_ah or type, start, capacity_ah_source",
-                header.names().join(",")
-            ))),
-        }
+        let table = CapacityTable::open_in_order(path)?;
+        if table.header().find("cell").is_some() { read_simulated(table) } else { Self::of_table(path) }
     }
 
     fn of_table(path: &Path) -> Result<Self, TableError> {
@@ -108,24 +98,21 @@ impl Truth {
     }
 }
 
-fn read_simulated(mut table: Table, [time, cell, capacity]: [usize; 3]) -> Result<Truth, TableError> {
+/// Keeps the rows at which a capacity has changed by more than 0.02 %.
+fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     let (mut cells, mut span): (BTreeMap<CellIndex, Vec<(Timestamp, f64)>>, _) = (BTreeMap::new(), None);
     while let Some(row) = table.next_row()? {
-        let now = row.stamp(time)?;
-        let index = row.text(cell).parse().map(CellIndex).map_err(|_| row.fault(cell, "a cell from 0"))?;
-        const ALLOWED: &str = "0 Ah or more";
-        let ah = row.number_in(capacity, 0.0..=f64::MAX, ALLOWED)?.ok_or_else(|| row.fault(capacity, ALLOWED))?;
-        let (first, last) = span.unwrap_or((now, now));
-        if now < last {
-            return Err(row.fault(time, "no earlier than the row before"));
-        }
-        span = Some((first, now));
-        let points = cells.entry(index).or_default();
-        if points.last().is_none_or(|(_, kept)| (ah - kept).abs() > KEPT_CHANGE * kept) {
-            points.push((now, ah));
+        let (first, _) = span.unwrap_or((row.time, row.time));
+        span = Some((first, row.time));
+        let (Some(cell), Some(ah)) = (row.cell, row.capacity_ah) else { continue };
+        let points = cells.entry(cell).or_default();
+        if points.last().is_none_or(|(_, kept)| (ah - kept).abs() > 2e-4 * kept) {
+            points.push((row.time, ah));
         }
     }
-    let span = span.ok_or_else(|| table.header().file_fault("no row, must have one per time and cell"))?;
+    let span = span.filter(|_| !cells.is_empty());
+    let span =
+        span.ok_or_else(|| table.header().file_fault("no row with a capacity, must have one per time and cell"))?;
     Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
@@ -201,13 +188,17 @@ mod tests {
     fn a_fault_names_its_line() {
         assert_eq!(
             read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"),
-            "t.csv:2: column capacity_ah: found \"x\", must be 0 Ah or more"
+            "t.csv:2: column capacity_ah: found \"x\", must be Ah above 0 or nothing"
         );
         assert_eq!(
             read("time_s,cell,capacity_ah\n5,0,2\n4,0,2\n").expect_err("bad"),
             "t.csv:3: column time_s: found \"4\", must be no earlier than the row before"
         );
-        assert!(read("a,b\n1,2\n").expect_err("bad").starts_with("t.csv:1: columns a,b, must have"));
+        assert!(
+            read("a,b\n1,2\n")
+                .expect_err("bad")
+                .starts_with("t.csv:1: no column capacity_ah or capacity_ah_source or soc, found a,b")
+        );
         assert!(read("time_s,cell,capacity_ah\n").expect_err("bad").contains("no row"));
     }
 

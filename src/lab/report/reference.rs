@@ -1,18 +1,9 @@
 //! Measured or true capacities and SOC from a CSV, to be drawn next to the estimates.
 
-use std::ops::RangeInclusive;
 use std::path::Path;
 
-use crate::io::table::{Header, Row, Table, TableError};
-
-/// Names a column of capacities may have, Ah.
-const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
-/// Names a column of SOC may have, fraction.
-const SOC: [&str; 1] = ["soc"];
-/// Names a column of moments may have.
-const TIME: [&str; 4] = ["time_s", "start", "date", "time"];
-/// Smallest relative change of the capacity that gets a point of its own.
-const KEPT_CHANGE: f64 = 2e-4;
+use crate::capacity_table::CapacityTable;
+use crate::io::table::TableError;
 
 /// Measured or true values; times in s on the data's clock.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -25,78 +16,45 @@ pub struct Reference {
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Numbers of the columns.
-struct Columns {
-    time: usize,
-    capacity: Option<usize>,
-    soc: Option<usize>,
-    has_cells: bool,
-}
-
-/// Reads a table with a capacity (`capacity_ah` or `capacity_ah_source`, Ah), an SOC (`soc`, fraction), or both, and a
-/// moment (`time_s`, s; `start`, `date` or `time`, s or like 2008-04-02T13:08:17). An empty field is skipped. With a
-/// column `cell`, rows of one moment are joined to the weakest cell's capacity and the lowest and highest SOC.
+/// Reads a [`CapacityTable`]. With a column `cell`, rows of one moment are joined to the weakest cell's capacity and the lowest
+/// and highest SOC.
 ///
 /// # Errors
 /// The file cannot be read, a column is missing, or a value is no number or out of range; names file and line.
 pub fn read(path: &Path) -> Result<Reference, TableError> {
-    let mut table = Table::open(path)?;
-    let columns = Columns::find(table.header())?;
-    let mut reference = Reference { is_loaded: !columns.has_cells, ..Reference::default() };
+    let mut table = CapacityTable::open(path)?;
+    let has_cells = table.header().find("cell").is_some();
+    let mut reference = Reference { is_loaded: !has_cells, ..Reference::default() };
     while let Some(row) = table.next_row()? {
-        reference.add_row(&row, &columns)?;
+        let time_s = row.time.secs();
+        if let Some(ah) = row.capacity_ah {
+            match reference.capacities.last_mut().filter(|last| has_cells && last.0 == time_s) {
+                Some(last) => last.1 = last.1.min(ah),
+                None => reference.capacities.push((time_s, ah)),
+            }
+        }
+        if let Some(soc) = row.soc {
+            match reference.socs.last_mut().filter(|last| has_cells && last.0 == time_s) {
+                Some(last) => (last.1, last.2) = (last.1.min(soc), last.2.max(soc)),
+                None => reference.socs.push((time_s, soc, soc)),
+            }
+        }
     }
     reference.capacities.sort_by(|a, b| a.0.total_cmp(&b.0));
     reference.socs.sort_by(|a, b| a.0.total_cmp(&b.0));
-    if columns.has_cells {
+    if has_cells {
         thin(&mut reference.capacities);
     }
     Ok(reference)
 }
 
-impl Columns {
-    fn find(header: &Header) -> Result<Self, TableError> {
-        header.required(&[&CAPACITY[..], &SOC].concat())?;
-        let (capacity, soc) = (header.find_any(&CAPACITY), header.find_any(&SOC));
-        Ok(Self { time: header.required(&TIME)?, capacity, soc, has_cells: header.find("cell").is_some() })
-    }
-}
-
-impl Reference {
-    fn add_row(&mut self, row: &Row<'_>, columns: &Columns) -> Result<(), TableError> {
-        let number = |column: Option<usize>, range: RangeInclusive<f64>, allowed: &str| {
-            column.map_or(Ok(None), |column| row.number_in(column, range, allowed))
-        };
-        let capacity = number(columns.capacity, 0.0..=f64::MAX, "a number, 0 or more")?;
-        // A little beyond full and empty an SOC may be; 0 to 100 would be percent.
-        let soc = number(columns.soc, -0.5..=1.5, "a fraction, 0 to 1")?;
-        if capacity.is_none() && soc.is_none() {
-            return Ok(());
-        }
-        let time_s = row.stamp(columns.time)?.secs();
-        if let Some(ah) = capacity {
-            match self.capacities.last_mut().filter(|last| columns.has_cells && last.0 == time_s) {
-                Some(last) => last.1 = last.1.min(ah),
-                None => self.capacities.push((time_s, ah)),
-            }
-        }
-        if let Some(soc) = soc {
-            match self.socs.last_mut().filter(|last| columns.has_cells && last.0 == time_s) {
-                Some(last) => (last.1, last.2) = (last.1.min(soc), last.2.max(soc)),
-                None => self.socs.push((time_s, soc, soc)),
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Keeps the points at which the capacity has changed, and the last.
+/// Keeps the points at which the capacity has changed by more than 0.02 %, and the last.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;
     points.retain(|(_, ah)| {
         // The first is infinitely far from what was kept before it.
-        let is_kept = (ah - kept_ah).abs() > KEPT_CHANGE * ah;
+        let is_kept = (ah - kept_ah).abs() > 2e-4 * ah;
         kept_ah = if is_kept { *ah } else { kept_ah };
         is_kept
     });

@@ -1,19 +1,14 @@
-//! Capacity histories: CSV (plain, gzip or zstd), columns by name.
+//! Capacity histories: a [`CapacityTable`] in order of time.
 //!
-//! * `date` or `start`: when the reading began, ISO 8601 or seconds, in order of time.
-//! * `capacity_ah` or `capacity_ah_source`: Ah above 0; empty = not measured.
-//! * `type`, where it exists: only `discharge` rows are readings, and each of them counts as a full cycle. Without it the
-//!   file holds no use, and days count.
-//! * `duration_s`, where it exists in addition to `type`: time of use between two readings; the remaining time was rest.
+//! Where it has `type`, only discharges are readings, and each of them counts as a full cycle; without it the file holds no use, and
+//! days count. `duration_s` is time of use between two readings; the remaining time was rest.
 
 use std::path::Path;
 
+use crate::capacity_table::{CapacityRow, CapacityTable};
 use crate::health::{Axis, Usage};
-use crate::io::table::{Header, Row, Table, TableError};
+use crate::io::table::TableError;
 use crate::quantity::Timestamp;
-
-/// Seconds in a day.
-const DAY_S: f64 = 86_400.0;
 
 /// A reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -39,13 +34,6 @@ pub struct History {
     pub axis: Axis,
     /// In order of time, at least one.
     pub rows: Vec<MeasuredCapacity>,
-}
-
-struct Columns {
-    time: usize,
-    capacity: usize,
-    kind: Option<usize>,
-    duration: Option<usize>,
 }
 
 /// Use counted over the lines read so far.
@@ -77,17 +65,15 @@ impl History {
     /// # Errors
     /// It cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let mut table = Table::open(path)?;
-        let columns = Columns::find(table.header())?;
+        let mut table = CapacityTable::open_in_order(path)?;
+        let axis = if table.header().find("type").is_some() { Axis::Cycles } else { Axis::Days };
         let (mut counter, mut rows) = (UseCounter::default(), Vec::new());
         while let Some(row) = table.next_row()? {
-            rows.extend(counter.add_row(&columns, &row)?);
+            rows.extend(counter.add_row(axis, &row));
         }
         if rows.is_empty() {
-            let column = &table.header().names()[columns.capacity];
-            return Err(table.header().file_fault(format_args!("no row with a {column}, needs at least one")));
+            return Err(table.header().file_fault("no row with a capacity, needs at least one"));
         }
-        let axis = if columns.kind.is_some() { Axis::Cycles } else { Axis::Days };
         Ok(Self { axis, rows })
     }
 
@@ -97,54 +83,34 @@ impl History {
     }
 }
 
-impl Columns {
-    fn find(header: &Header) -> Result<Self, TableError> {
-        Ok(Self {
-            time: header.required(&["date", "start"])?,
-            capacity: header.required(&["capacity_ah", "capacity_ah_source"])?,
-            kind: header.find("type"),
-            duration: header.find("duration_s"),
-        })
-    }
-}
-
 impl UseCounter {
     /// Counts a line; returns its reading, if it has one.
-    fn add_row(&mut self, columns: &Columns, row: &Row<'_>) -> Result<Option<MeasuredCapacity>, TableError> {
-        let time = row.stamp(columns.time)?;
-        if self.last.is_some_and(|last| time < last) {
-            return Err(row.fault(columns.time, "no earlier than the line before"));
-        }
-        let capacity = row.number_in(columns.capacity, f64::MIN_POSITIVE..=f64::MAX, "Ah above 0 or nothing")?;
-        let duration = |column| row.number_in(column, 0.0..=f64::MAX, "seconds of 0 or more, or nothing");
-        let duration_s = columns.duration.map_or(Ok(None), duration)?;
-        self.pass(time);
-        let is_discharge = columns.kind.is_none_or(|kind| row.text(kind) == "discharge");
-        let counts_cycles = columns.kind.is_some();
-        let reading = capacity.filter(|_| is_discharge);
-        let reading = reading.map(|ah| MeasuredCapacity { line: row.line, ..self.reading(counts_cycles, time, ah) });
-        if is_discharge {
+    fn add_row(&mut self, axis: Axis, row: &CapacityRow<'_>) -> Option<MeasuredCapacity> {
+        self.pass(row.time);
+        let capacity_ah = row.capacity_ah.filter(|_| row.is_discharge);
+        let reading = capacity_ah.map(|ah| MeasuredCapacity { line: row.line, ..self.reading(axis, row.time, ah) });
+        if row.is_discharge {
             self.discharges += 1.0;
         }
-        self.used_days = duration_s.unwrap_or(0.0) / DAY_S;
-        Ok(reading)
+        self.used_days = row.duration_s.unwrap_or(0.0) / 86_400.0;
+        reading
     }
 
     /// Counts the time since the line before: time that the line before did not use was rest.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
-            self.rest_days += (time.since(last) / DAY_S - self.used_days).max(0.0);
+            self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);
         }
         self.last = Some(time);
     }
 
-    fn reading(&mut self, counts_cycles: bool, time: Timestamp, capacity_ah: f64) -> MeasuredCapacity {
+    fn reading(&mut self, axis: Axis, time: Timestamp, capacity_ah: f64) -> MeasuredCapacity {
         if self.first.is_none() {
             (self.first, self.before, self.rest_days) = (Some(time), self.discharges, 0.0);
         }
-        let days = self.first.map_or(0.0, |first| time.since(first) / DAY_S);
-        let cycles = if counts_cycles { self.discharges - self.before } else { 0.0 };
-        let used = if counts_cycles { cycles } else { days };
+        let days = self.first.map_or(0.0, |first| time.since(first) / 86_400.0);
+        let cycles = if axis == Axis::Cycles { self.discharges - self.before } else { 0.0 };
+        let used = if axis == Axis::Cycles { cycles } else { days };
         MeasuredCapacity { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
     }
 }
@@ -188,14 +154,14 @@ mod tests {
             ("0,-1\n", "cell.csv:2: column capacity_ah: found \"-1\", must be Ah above 0 or nothing"),
             ("0,nan\n", "cell.csv:2: column capacity_ah: found \"nan\", must be Ah above 0 or nothing"),
             ("soon,1\n", "cell.csv:2: column date: found \"soon\", must be like 2008-04-02T13:08:17.921 or seconds"),
-            ("5,2\n4,2\n", "cell.csv:3: column date: found \"4\", must be no earlier than the line before"),
-            ("0,\n", "cell.csv: no row with a capacity_ah, needs at least one"),
+            ("5,2\n4,2\n", "cell.csv:3: column date: found \"4\", must be no earlier than the row before"),
+            ("0,\n", "cell.csv: no row with a capacity, needs at least one"),
         ] {
             assert_eq!(read(&format!("{head}{rows}")), Err(fault.to_owned()));
         }
         assert_eq!(
             read("date,ah\n"),
-            Err("cell.csv:1: no column capacity_ah or capacity_ah_source, found date,ah".into())
+            Err("cell.csv:1: no column capacity_ah or capacity_ah_source or soc, found date,ah".into())
         );
     }
 }

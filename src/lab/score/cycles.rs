@@ -1,9 +1,10 @@
-//! Tables of published capacities: CSV with `cycle`, `type`, `start` and `capacity_ah_source`, a line per cycle.
+//! Tables of published capacities: a [`CapacityTable`] with `cycle` and `type`, a line per cycle.
 
 use std::collections::HashMap;
 use std::path::Path;
 
-use crate::io::table::{Table, TableError};
+use crate::capacity_table::CapacityTable;
+use crate::io::table::TableError;
 use crate::measured::MeasuredPart;
 use crate::quantity::Timestamp;
 
@@ -30,22 +31,20 @@ impl CycleTable {
     /// # Errors
     /// It cannot be read, a column is missing or a field is wrong, with file and line; it names no discharge.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let mut file = Table::open(path)?;
-        let column = |name: &str| file.header().required(&[name]);
-        let [cycle, kind, start, capacity] =
-            [column("cycle")?, column("type")?, column("start")?, column("capacity_ah_source")?];
+        let mut file = CapacityTable::open(path)?;
+        for name in ["cycle", "type"] {
+            file.header().required(&[name])?;
+        }
         let mut table = Self { starts: HashMap::new(), discharges: Vec::new() };
         while let Some(row) = file.next_row()? {
-            let start = row.stamp(start)?;
-            let capacity_ah = row.number_in(capacity, f64::MIN_POSITIVE..=f64::MAX, "a number above 0 or nothing")?;
-            table.starts.insert(row.text(cycle).into_owned(), start);
-            if row.text(kind) == "discharge" {
-                table.discharges.push(Discharge { start, capacity_ah });
+            table.starts.insert(row.cycle.into_owned(), row.time);
+            if row.is_discharge {
+                table.discharges.push(Discharge { start: row.time, capacity_ah: row.capacity_ah });
             }
         }
         table.discharges.sort_by_key(|discharge| discharge.start);
         if table.discharges.iter().all(|discharge| discharge.capacity_ah.is_none()) {
-            return Err(file.header().file_fault("no discharge with a capacity_ah_source"));
+            return Err(file.header().file_fault("no discharge with a capacity"));
         }
         Ok(table)
     }
@@ -125,11 +124,14 @@ mod tests {
         let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,1,-1\n");
         assert_eq!(
             fault,
-            Err("cycles.csv:2: column capacity_ah_source: found \"-1\", must be a number above 0 or nothing".into())
+            Err("cycles.csv:2: column capacity_ah_source: found \"-1\", must be Ah above 0 or nothing".into())
         );
         let fault = read("cycle,type,start\n1,discharge,1\n");
-        assert_eq!(fault, Err("cycles.csv:1: no column capacity_ah_source, found cycle,type,start".into()));
+        assert_eq!(
+            fault,
+            Err("cycles.csv:1: no column capacity_ah or capacity_ah_source or soc, found cycle,type,start".into())
+        );
         let fault = read("cycle,type,start,capacity_ah_source\n1,charge,1,\n");
-        assert_eq!(fault, Err("cycles.csv: no discharge with a capacity_ah_source".into()));
+        assert_eq!(fault, Err("cycles.csv: no discharge with a capacity".into()));
     }
 }

@@ -1,0 +1,108 @@
+//! Tables of capacities over a life: CSV (plain, gzip or zstd), columns by name.
+//!
+//! | column | value |
+//! | --- | --- |
+//! | `time_s`, `start`, `date` or `time` | moment: seconds, or like 2008-04-02T13:08:17 |
+//! | `capacity_ah` or `capacity_ah_source` | Ah, above 0; empty = not measured |
+//! | `soc` | fraction; empty = not measured |
+//! | `cell` | number of the cell, from 0 |
+//! | `cycle`, `type`, `duration_s` | part of a measured file, its kind (`discharge` or another), time of use, s |
+
+use std::borrow::Cow;
+use std::path::Path;
+
+use crate::io::table::{Header, Row, Table, TableError};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// A table being read.
+pub(crate) struct CapacityTable {
+    table: Table,
+    time: usize,
+    capacity: Option<usize>,
+    soc: Option<usize>,
+    cell: Option<usize>,
+    cycle: Option<usize>,
+    kind: Option<usize>,
+    duration: Option<usize>,
+    /// Time of the last row, where rows must be in order.
+    last: Option<Timestamp>,
+}
+
+/// A row of the table; `None` = not stated.
+pub(crate) struct CapacityRow<'t> {
+    pub(crate) line: u64,
+    pub(crate) time: Timestamp,
+    pub(crate) capacity_ah: Option<f64>,
+    pub(crate) soc: Option<f64>,
+    pub(crate) cell: Option<CellIndex>,
+    pub(crate) cycle: Cow<'t, str>,
+    /// Whether it is of a discharge, as is every row of a table without types.
+    pub(crate) is_discharge: bool,
+    pub(crate) duration_s: Option<f64>,
+}
+
+impl CapacityTable {
+    /// Opens a table whose rows may have any order.
+    ///
+    /// # Errors
+    /// The file cannot be read, or lacks a moment, or both capacity and SOC.
+    pub(crate) fn open(path: &Path) -> Result<Self, TableError> {
+        let table = Table::open(path)?;
+        let header = table.header();
+        header.required(&["capacity_ah", "capacity_ah_source", "soc"])?;
+        Ok(Self {
+            time: header.required(&["time_s", "start", "date", "time"])?,
+            capacity: header.find_any(&["capacity_ah", "capacity_ah_source"]),
+            soc: header.find("soc"),
+            cell: header.find("cell"),
+            cycle: header.find("cycle"),
+            kind: header.find("type"),
+            duration: header.find("duration_s"),
+            last: None,
+            table,
+        })
+    }
+
+    /// The same; a row before the row above it is a fault.
+    pub(crate) fn open_in_order(path: &Path) -> Result<Self, TableError> {
+        Ok(Self { last: Some(Timestamp::from_nanos(i64::MIN)), ..Self::open(path)? })
+    }
+
+    /// Name of the file and columns.
+    pub(crate) fn header(&self) -> &Header {
+        self.table.header()
+    }
+
+    /// The next row; `None` at the end.
+    ///
+    /// # Errors
+    /// The file fails, or a field is wrong: file, line, column, found, allowed.
+    pub(crate) fn next_row(&mut self) -> Result<Option<CapacityRow<'_>>, TableError> {
+        let Some(row) = self.table.next_row()? else { return Ok(None) };
+        let time = row.stamp(self.time)?;
+        if let Some(last) = &mut self.last {
+            if time < *last {
+                return Err(row.fault(self.time, "no earlier than the row before"));
+            }
+            *last = time;
+        }
+        let number = |column: Option<usize>, low: f64, high: f64, allowed: &str| {
+            column.map_or(Ok(None), |column| row.number_in(column, low..=high, allowed))
+        };
+        Ok(Some(CapacityRow {
+            line: row.line,
+            time,
+            capacity_ah: number(self.capacity, f64::MIN_POSITIVE, f64::MAX, "Ah above 0 or nothing")?,
+            // A little beyond full and empty an SOC may be; 0 to 100 would be percent.
+            soc: number(self.soc, -0.5, 1.5, "a fraction, 0 to 1")?,
+            cell: self.cell.map(|column| cell(&row, column)).transpose()?,
+            cycle: self.cycle.map_or_else(Cow::default, |column| row.text(column)),
+            is_discharge: self.kind.is_none_or(|column| row.text(column) == "discharge"),
+            duration_s: number(self.duration, 0.0, f64::MAX, "seconds of 0 or more, or nothing")?,
+        }))
+    }
+}
+
+fn cell(row: &Row<'_>, column: usize) -> Result<CellIndex, TableError> {
+    row.text(column).parse().map(CellIndex).map_err(|_| row.fault(column, "a cell from 0"))
+}
