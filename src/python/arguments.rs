@@ -4,25 +4,25 @@ use std::path::{Path, PathBuf};
 
 use packwatch_host::config::{self, Config, ConfigFiles};
 use packwatch_lab::single_cell::{CellSource, LabelKeys};
+use pyo3::conversion::FromPyObjectOwned;
 use pyo3::prelude::*;
 
 use crate::error;
 
-/// One path, or several.
-#[derive(FromPyObject)]
-pub(crate) enum Paths {
-    One(PathBuf),
-    Several(Vec<PathBuf>),
+/// One value, or several.
+pub(crate) struct List<T>(pub(crate) Vec<T>);
+
+impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
+    type Error = PyErr;
+
+    fn extract(value: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        value.extract().map(|one| Self(vec![one])).or_else(|_| value.extract().map(Self))
+    }
 }
 
-impl Paths {
-    /// As a list.
-    pub(crate) fn list(self) -> Vec<PathBuf> {
-        match self {
-            Self::One(path) => vec![path],
-            Self::Several(paths) => paths,
-        }
-    }
+/// A JSON text as Python's objects.
+pub(crate) fn of_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
+    py.import("json")?.call_method1("loads", (text,))
 }
 
 /// Loads a configuration from its text; the files it names are in `folder`.

@@ -6,7 +6,7 @@ use std::time::Instant;
 use packwatch_lab::fit::{self as lab_fit, FitOutcome, FitProgress, FitRequest};
 use pyo3::prelude::*;
 
-use crate::arguments::Paths;
+use crate::arguments::{List, of_json};
 use crate::cell_model::write;
 use crate::error::of_library;
 use crate::work::{self, Progress};
@@ -34,8 +34,7 @@ impl Fit {
     /// The document that `fit --json` prints, as a dictionary.
     #[getter]
     fn document<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let document = lab_fit::document(&self.outcome, self.seconds).to_string();
-        py.import("json")?.call_method1("loads", (document,))
+        of_json(py, &lab_fit::document(&self.outcome, self.seconds).to_string())
     }
 
     #[getter]
@@ -73,9 +72,9 @@ impl Fit {
 #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
 pub(crate) fn fit(
     py: Python<'_>,
-    files: Paths,
+    files: List<PathBuf>,
     name: String,
-    ocv: Option<Paths>,
+    ocv: Option<List<PathBuf>>,
     capacity_ah: Option<f64>,
     rated_ah: Option<f64>,
     voltage_min_v: Option<f64>,
@@ -95,13 +94,13 @@ pub(crate) fn fit(
         voltage_min_v,
         voltage_max_v,
         ageing_shift,
-        ocv: ocv.map_or_else(Vec::new, Paths::list),
+        ocv: ocv.map_or_else(Vec::new, |tests| tests.0),
         branches,
         tau_s,
         temperature_c: temperatures_c,
         soc: soc_nodes,
         first_cycles,
-        files: files.list(),
+        files: files.0,
     };
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };

@@ -11,7 +11,7 @@ use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, Repla
 use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
-use crate::arguments::{Paths, bytes};
+use crate::arguments::{List, bytes, of_json};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
 use crate::work::{self, Progress, Work};
@@ -39,7 +39,7 @@ impl Replay {
     /// The summary as a dictionary.
     #[getter]
     fn summary<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        py.import("json")?.call_method1("loads", (&self.json,))
+        of_json(py, &self.json)
     }
 
     #[getter]
@@ -66,7 +66,7 @@ impl Replay {
 pub(crate) fn replay(
     py: Python<'_>,
     config: PathBuf,
-    logs: Paths,
+    logs: List<PathBuf>,
     columns: Option<std::collections::BTreeMap<String, String>>,
     csv_sign: &str,
     start_times: Option<PathBuf>,
@@ -86,7 +86,7 @@ pub(crate) fn replay(
     let wanted = Wanted::new(estimates_period_s)?;
     let columns = columns.unwrap_or_default().into_iter().collect();
     let reading = LogReading { strict, columns, charge_positive, start_times };
-    let logs = logs.list();
+    let logs = logs.0;
     if logs.is_empty() {
         return Err(data("no logs, must be one or more"));
     }

@@ -7,7 +7,7 @@ use packwatch_lab::error::LabError;
 use packwatch_lab::rul::{self as lab_rul, History, Threshold};
 use pyo3::prelude::*;
 
-use crate::arguments::Paths;
+use crate::arguments::{List, of_json};
 use crate::error::{data, of_library};
 use crate::work::{self, Progress, Work};
 
@@ -18,29 +18,18 @@ pub(crate) enum End {
     Text(String),
 }
 
-/// One or several.
-#[derive(FromPyObject)]
-pub(crate) enum Ends {
-    One(End),
-    Several(Vec<End>),
-}
-
 /// Forecasts the remaining life at the end of histories, or at parts of the life.
 #[pyfunction]
 #[pyo3(signature = (files, end_of_life, *, at=None, alpha=0.2))]
 pub(crate) fn rul<'py>(
     py: Python<'py>,
-    files: Paths,
-    end_of_life: Ends,
+    files: List<PathBuf>,
+    end_of_life: List<End>,
     at: Option<Vec<f64>>,
     alpha: f64,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let files = files.list();
-    let ends = match end_of_life {
-        Ends::One(end) => vec![end],
-        Ends::Several(ends) => ends,
-    };
-    let thresholds = ends.into_iter().map(End::threshold).collect::<PyResult<Vec<Threshold>>>()?;
+    let files = files.0;
+    let thresholds = end_of_life.0.into_iter().map(End::threshold).collect::<PyResult<Vec<Threshold>>>()?;
     if let Some(part) = at.iter().flatten().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
         return Err(data(format!("at and alpha: found {part}, must be above 0 and below 1")));
     }
@@ -56,7 +45,7 @@ pub(crate) fn rul<'py>(
     check_distinct(&files).map_err(data)?;
     let document = work::run(py, Progress::hidden(), |work| document(&files, &thresholds, at.as_deref(), alpha, work))?;
     let document = document.map_err(of_library)?;
-    py.import("json")?.call_method1("loads", (document,))
+    of_json(py, &document)
 }
 
 /// The document: forecasts at the end, or judged ones at parts of the life.

@@ -5,30 +5,9 @@ use std::path::PathBuf;
 use packwatch_lab::score::{ScoreReport, ScoreRequest, Start};
 use pyo3::prelude::*;
 
-use crate::arguments::{Paths, bytes, cell_source};
+use crate::arguments::{List, bytes, cell_source, of_json};
 use crate::error::{data, of_library, of_request};
 use crate::work::{self, Progress};
-
-/// Numbers, or one of them.
-#[derive(FromPyObject)]
-pub(crate) enum Numbers {
-    One(f64),
-    Several(Vec<f64>),
-}
-
-/// Errors of the initial SOC, points; None: no SOC is given.
-#[derive(FromPyObject)]
-pub(crate) enum SocErrors {
-    One(Option<f64>),
-    Several(Vec<Option<f64>>),
-}
-
-/// One start or several.
-#[derive(FromPyObject)]
-pub(crate) enum Starts {
-    One(String),
-    Several(Vec<String>),
-}
 
 /// Scores of files in cases.
 #[pyclass(frozen, module = "packwatch")]
@@ -49,7 +28,7 @@ impl Score {
     /// The document as a dictionary.
     #[getter]
     fn document<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        py.import("json")?.call_method1("loads", (self.json()?,))
+        of_json(py, &self.json()?)
     }
 
     /// One dictionary per file and case.
@@ -73,25 +52,25 @@ impl Score {
 #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
 pub(crate) fn score(
     py: Python<'_>,
-    files: Paths,
+    files: List<PathBuf>,
     config: Option<PathBuf>,
     cell: Option<PathBuf>,
     chemistry: Option<String>,
     rated_ah: Option<f64>,
     voltage_min_v: Option<f64>,
     voltage_max_v: Option<f64>,
-    learn: Option<Paths>,
-    start: Option<Starts>,
+    learn: Option<List<PathBuf>>,
+    start: Option<List<String>>,
     remove: Option<f64>,
-    soc_error_points: Option<SocErrors>,
+    soc_error_points: Option<List<Option<f64>>>,
     soc_std_points: Option<f64>,
-    capacity_error_percent: Option<Numbers>,
+    capacity_error_percent: Option<List<f64>>,
     capacity_std_percent: Option<f64>,
-    current_offset_a: Option<Numbers>,
+    current_offset_a: Option<List<f64>>,
     settle_s: Option<f64>,
     truth_capacity_ah: Option<f64>,
     sleep_gap_s: Option<f64>,
-    cycles: Option<Paths>,
+    cycles: Option<List<PathBuf>>,
     load: Option<[f64; 3]>,
     threshold_ah: Option<f64>,
     skip_cycles: Option<usize>,
@@ -104,22 +83,21 @@ pub(crate) fn score(
         return Err(data("seeds must be given together with window"));
     }
     let usual = ScoreRequest::default();
-    let numbers = |given: Option<Numbers>, usual: Vec<f64>| given.map_or(usual, Numbers::list);
     let request = ScoreRequest {
-        files: files.list(),
+        files: files.0,
         source: cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?,
-        learn: learn.map_or_else(Vec::new, Paths::list),
-        start: start.map_or(Ok(usual.start), Starts::list)?,
+        learn: learn.map_or_else(Vec::new, |files| files.0),
+        start: start.map_or(Ok(usual.start), |names| names.0.into_iter().map(self::start).collect())?,
         remove: remove.unwrap_or(usual.remove),
-        soc_error_points: soc_error_points.map_or(usual.soc_error_points, SocErrors::list),
+        soc_error_points: soc_error_points.map_or(usual.soc_error_points, |points| points.0),
         soc_std_points,
-        capacity_error_percent: numbers(capacity_error_percent, usual.capacity_error_percent),
+        capacity_error_percent: capacity_error_percent.map_or(usual.capacity_error_percent, |percent| percent.0),
         capacity_std_percent,
-        current_offset_a: numbers(current_offset_a, usual.current_offset_a),
+        current_offset_a: current_offset_a.map_or(usual.current_offset_a, |ampere| ampere.0),
         settle_s: settle_s.unwrap_or(usual.settle_s),
         truth_capacity_ah,
         sleep_gap_s: sleep_gap_s.unwrap_or(usual.sleep_gap_s),
-        cycles: cycles.map_or_else(Vec::new, Paths::list),
+        cycles: cycles.map_or_else(Vec::new, |tables| tables.0),
         load,
         threshold_ah: threshold_ah.unwrap_or(usual.threshold_ah),
         skip_cycles: skip_cycles.unwrap_or(usual.skip_cycles),
@@ -141,35 +119,10 @@ fn run(py: Python<'_>, request: &ScoreRequest, is_shown: bool) -> PyResult<Score
     report.map(Score).map_err(of_library)
 }
 
-impl Numbers {
-    pub(crate) fn list(self) -> Vec<f64> {
-        match self {
-            Self::One(number) => vec![number],
-            Self::Several(numbers) => numbers,
-        }
-    }
-}
-
-impl SocErrors {
-    fn list(self) -> Vec<Option<f64>> {
-        match self {
-            Self::One(points) => vec![points],
-            Self::Several(points) => points,
-        }
-    }
-}
-
-impl Starts {
-    fn list(self) -> PyResult<Vec<Start>> {
-        let names = match self {
-            Self::One(name) => vec![name],
-            Self::Several(names) => names,
-        };
-        let start = |name: &String| match name.as_str() {
-            "full" => Ok(Start::Full),
-            "middle" => Ok(Start::Middle),
-            other => Err(data(format!("start {other:?}, must be full or middle"))),
-        };
-        names.iter().map(start).collect()
+fn start(name: String) -> PyResult<Start> {
+    match name.as_str() {
+        "full" => Ok(Start::Full),
+        "middle" => Ok(Start::Middle),
+        other => Err(data(format!("start {other:?}, must be full or middle"))),
     }
 }
