@@ -20,7 +20,7 @@
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | `src/host` | [`config`] | TOML to checked settings, all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, files of results and events |
-//! | | [`store`] | learned state and history in SQLite |
+//! | | [`store`] | learned state in two files, history in SQLite |
 //! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`wiring_check`] | loops that are no service: recorded logs, the doctor |
@@ -67,8 +67,9 @@
 //! | an entity of MQTT; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
 //! | a signal of VSS or of its overlay | `uplink/kuksa/signals/standard.rs`, `own.rs` (the page: `packwatch vss --reference`) |
 //! | when a question of the databroker is answered; what is sent in which order | `uplink/kuksa/questions.rs`; `uplink/kuksa/outgoing.rs` |
-//! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
-//! | what is saved of a damaged database | `host/store/carve.rs` (rows by their layout), `host/store/salvage.rs` (checks, order) |
+//! | a history table or column | `host/store/rows.rs`; tables of packs, moments and segments: `host/store/database.rs` |
+//! | the files of the stored state; when a checkpoint is due | `host/store/state_files.rs`; `host/store/checkpoint.rs` |
+//! | how the history is verified, and how long it is kept | `host/store/segments.rs` |
 //! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |

@@ -40,7 +40,7 @@ pub(crate) struct Args {
 enum HistoryCommand {
     /// Write rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over capacities, loss modes, remaining lives, cell models, alarms and resets; names the first row that was changed
+    /// Check the hash chain over all rows; names the first segment (the rows of a day) that was changed
     Verify(VerifyArgs),
 }
 
@@ -259,7 +259,7 @@ fn is_broken_pipe(error: &csv::Error) -> bool {
 fn record(entry: &HistoryEntry, columns: &[&str]) -> Vec<String> {
     let own = [
         entry.kind.name().to_owned(),
-        entry.seq.map(|seq| seq.to_string()).unwrap_or_default(),
+        entry.seq.to_string(),
         entry.wall_ns.to_string(),
         stamp::format_utc(Timestamp::from_nanos(entry.wall_ns)),
         entry.time_ns.to_string(),
@@ -290,18 +290,15 @@ fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
     match &verdict.broken {
         None if args.json => Ok(()),
         None => {
-            let thinned = match verdict.thinned_rows {
+            let deleted = match verdict.deleted_rows {
                 0 => String::new(),
-                rows => format!(" {rows} of them thinned out,"),
+                rows => format!(" {rows} of them deleted because of their number or age,"),
             };
-            print(&format!("{} rows,{thinned} none changed; the hash of the last is {}\n", verdict.rows, verdict.head))
+            print(&format!("{} rows,{deleted} none changed; the hash of the last is {}\n", verdict.rows, verdict.head))
         }
-        Some(broken) => {
-            let place = if broken.table.is_empty() { String::new() } else { format!(" ({})", broken.table) };
-            Err(Failure::new(format!(
-                "row {}{place} was changed: expected {}, found {}; {} rows before it are good",
-                broken.row, broken.expected, broken.found, verdict.good_rows
-            )))
-        }
+        Some(broken) => Err(Failure::new(format!(
+            "{}: expected {}, found {}; {} rows before them are good",
+            broken, broken.expected, broken.found, verdict.good_rows
+        ))),
     }
 }

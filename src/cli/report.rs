@@ -120,13 +120,13 @@ fn of_store(folder: &Path) -> Result<Parts, Failure> {
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
     if let Some(broken) = &verdict.broken {
-        data.doubt(format!("the history was changed: row {} is not as it was written", broken.row));
+        data.doubt(format!("the history was changed: {broken}"));
     }
     let chain = match &verdict.broken {
         None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
         Some(broken) => format!(
-            "row {} is not as it was written: expected {}, found {}; {} rows before it are good",
-            broken.row, broken.expected, broken.found, verdict.good_rows
+            "{broken}: expected {}, found {}; {} rows before them are good",
+            broken.expected, broken.found, verdict.good_rows
         ),
     };
     let provenance = vec![("History".to_owned(), folder.display().to_string()), ("Hash chain".to_owned(), chain)];

@@ -1,45 +1,35 @@
-//! State and history that survive a restart and a power cut, in one SQLite database.
+//! State and history that survive a restart and a power cut: two state files and a database of the history, in one folder.
 //!
-//! * Learned results and changes of alarms are committed together with the state at that moment, before they are
-//!   announced; an announcement waits at most 200 ms for that ([`commit_barrier`]). So a restored state contains
-//!   everything that was announced.
-//! * The state is also checkpointed every `[store] checkpoint_s` and on stop, and every second in the runtime folder,
-//!   which is in memory.
-//! * The state has two copies, written in turn (`state_slots`). Without a good one, the capacities in the history are
-//!   used (`learned`). Damage of the file is healed from its pages (`carve`).
+//! * Learned results and changes of alarms are on the disk with the state of that moment before they are announced; an
+//!   announcement waits at most 200 ms for that ([`commit_barrier`]). The rows are committed first, then the state
+//!   (`writer`). So after a power cut all that was announced is in both. A cut between the two leaves rows that were not
+//!   announced: the restored state is the one before them, so what still holds is learned or raised again and gets a row of
+//!   its own. A change of the pack between the two is not undone: the history says that the pack of the state is closed, and
+//!   the state is not restored.
+//! * The state is also checkpointed (`checkpoint`), written on stop, and every second to the runtime folder, which is in memory.
+//! * The state is written to two files in turn (`state_files`), and does not depend on the database. Without a good one, the
+//!   capacities in the history are used (`learned`).
+//! * A damaged database is set aside, and a new one begins (`folder`).
 //! * On a full disk a reserve makes room for learned results and alarms (`reserve`).
 //! * The loop never touches the disk: a separate thread does (`writer`).
 //! * The daemon keeps running whatever is wrong with disk, folder or file, and reports it to the core (`store_failed`).
 
 mod backlog;
-mod carve;
-mod chain;
-mod chain_retention;
+mod checkpoint;
 pub mod commit_barrier;
 mod database;
-mod delta_encoder;
-mod document;
 mod folder;
 mod history_filter;
 mod learned;
-mod meta;
-mod packed;
-mod pages;
-mod parts;
 mod reader;
 mod recorder;
 mod replace;
 mod reserve;
-mod retention;
-mod row_sql;
 mod rows;
 mod runtime;
-mod salvage;
-mod schema;
+mod segments;
 mod stamp;
-mod state_slots;
-mod verify;
-mod wal;
+mod state_files;
 mod writer;
 
 use std::path::{Path, PathBuf};
@@ -53,22 +43,22 @@ use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
 use crate::monitor::{Command, Downtime, Event, EventKind, LearnedCell, Monitor, Snapshot};
 use crate::quantity::Timestamp;
-use database::OpenError;
-use document::StateDocument;
-use folder::{Folder, OpenedDatabase, SET_ASIDE};
+use checkpoint::CheckpointSchedule;
+use database::Database;
+use folder::Folder;
 use history_filter::HistoryFilter;
-use reader::MAX_DAEMON_COPY_BYTES;
 use reserve::Reserve;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
 use stamp::{BootId, Stamp, WallClock};
+use state_files::{FORMAT, FoundStates, SET_ASIDE, StateDocument, StateFiles};
 use writer::{Retry, WriteQueue, Writer};
 
 pub use reader::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
 pub use rows::HistoryTable;
-pub use verify::{BrokenRow, ChainReport, NotedHead};
+pub use segments::{BrokenSegment, ChainReport, NotedHead};
 pub use writer::StoreProgress;
 
 /// State folder of the service.
@@ -95,8 +85,8 @@ pub fn daemon_folder() -> (PathBuf, bool) {
     (own.map_or_else(|| PathBuf::from(STANDARD_FOLDER), |folder| folder.join("packwatch")), false)
 }
 
-/// Source of the state that the next checkpoint overwrites.
-pub const DATABASE_SOURCE: &str = "database";
+/// Source of the newest stored state.
+pub const STATE_SOURCE: &str = "state file";
 
 /// Source of a state that begins with the capacities in the history.
 pub const HISTORY_SOURCE: &str = "learned values in the history";
@@ -117,7 +107,7 @@ pub struct StateCandidate {
 pub struct StoredStates {
     /// Stored states, the newest first.
     pub states: Vec<StateCandidate>,
-    /// What the history knows of the cells of the connected pack, when the database has no good state.
+    /// What the history knows of the cells of the connected pack, when there is no good state.
     pub learned: Vec<LearnedCell>,
     /// Whether the store could be read and can be written.
     pub works: bool,
@@ -133,8 +123,7 @@ pub struct Store {
     history_filter: HistoryFilter,
     boot: BootId,
     folder: PathBuf,
-    checkpoint_s: f64,
-    checkpointed: Option<Timestamp>,
+    schedule: CheckpointSchedule,
     runtime_written: Option<Timestamp>,
 }
 
@@ -151,7 +140,7 @@ impl Store {
         let none = |works| (None, StoredStates { states: Vec::new(), learned: Vec::new(), works });
         let Some((path, is_needed)) = setting.resolve(daemon_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
-        let mut folder = Folder::new(path.clone(), config.into());
+        let mut folder = Folder::new(path.clone());
         match folder.lock() {
             Ok(()) => {}
             Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {
@@ -165,83 +154,42 @@ impl Store {
             }
             Err(_) => {} // logged below, and retried
         }
-        let now = Stamp::now(Timestamp::ZERO, BootId::current());
-        let opening = match folder.open(&now) {
-            Ok(opening) => Some(opening),
-            Err(error @ OpenError::Newer { .. }) => {
-                tracing::error!(folder = shown, %error, "the database is not used: nothing is stored");
-                return Ok(none(false));
-            }
-            Err(error) => {
-                tracing::error!(folder = shown, %error, "the database cannot be used now; packwatch retries");
-                None
-            }
-        };
-        Self::start(folder, opening, (config, vehicle), &now).map_err(|error| format!("{shown}: {error}"))
+        Self::start(folder, config, vehicle).map_err(|error| format!("{shown}: {error}"))
     }
 
     fn start(
-        folder: Folder,
-        opening: Option<OpenedDatabase>,
-        (config, vehicle): (&StoreConfig, &VehicleIdentity),
-        now: &Stamp,
+        mut folder: Folder,
+        config: &StoreConfig,
+        vehicle: &VehicleIdentity,
     ) -> std::io::Result<(Option<Self>, StoredStates)> {
+        let now = Stamp::now(Timestamp::ZERO, BootId::current());
         let path = folder.path().to_owned();
         let runtime_file = first_folder("RUNTIME_DIRECTORY").map(|folder| folder.join(runtime::FILE_NAME));
-        let mut retry = Retry::default();
-        let works = opening.as_ref().is_some_and(|opening| opening.is_sound);
-        let mut found = StoredStates { states: Vec::new(), learned: Vec::new(), works };
-        let mut reset_ns = None;
-        let (database, rows, state, aside, is_unreadable) = match opening {
-            Some(OpenedDatabase { database, rows, state, aside, learned, is_unreadable, .. }) => {
-                found.learned = learned;
-                let counts = database.counts();
-                tracing::info!(
-                    folder = %path.display(),
-                    learned_rows = counts.chained,
-                    half_cycles = counts.half_cycles,
-                    pack = counts.packs,
-                    "history open"
-                );
-                reset_ns = database.last_reset_ns(now.boot).unwrap_or_default();
-                (Some(database), rows, state, aside, is_unreadable)
-            }
-            None => {
-                retry.after_failure();
-                // A disk that cannot be written may be readable.
-                (None, Vec::new(), unwritable_state(&path), None, false)
-            }
-        };
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
-        let running = running.filter(|running| {
-            running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
-        });
-        let wall = WallClock::assess(now);
-        found.states = candidates(running, state, now, wall);
-        found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
+        let OpenedFolder { state_files, database, rows, pack, found } = OpenedFolder::open(&mut folder, running, &now);
+        let mut retry = Retry::default();
+        if database.is_none() {
+            retry.after_failure();
+        }
         let (sender, progress) =
-            watch::channel(StoreProgress { works: found.works, has_room: true, ..StoreProgress::default() });
+            watch::channel(StoreProgress { works: found.works, has_room: true, pack, ..StoreProgress::default() });
         let write_queue = Arc::new(WriteQueue::default());
         if !rows.is_empty() {
             // They are written with the first state.
-            write_queue.keep(RowBatch { stamp: *now, rows });
+            write_queue.keep(RowBatch { stamp: now, rows });
         }
-        let knows_state = database.is_some() || !found.states.is_empty();
         let writer = Writer {
             write_queue: Arc::clone(&write_queue),
             vehicle: vehicle.clone(),
-            is_vehicle_noted: false,
+            limits: config.into(),
             reserve: Reserve::new(&path),
             head_day: None,
-            keep_years: config.keep_years,
             folder,
+            state_files,
+            knows_state: database.is_some() || !found.states.is_empty(),
             database,
             progress: sender,
             retry,
-            commits: 0,
-            failures: 0,
-            knows_state,
-            sets_aside: is_unreadable,
         };
         let writer = std::thread::Builder::new().name("store".to_owned()).spawn(move || writer.run())?;
         let store = Self {
@@ -252,8 +200,7 @@ impl Store {
             history_filter: HistoryFilter::default(),
             boot: now.boot,
             folder: path,
-            checkpoint_s: config.checkpoint_s,
-            checkpointed: None,
+            schedule: CheckpointSchedule::new(config.checkpoint_s),
             runtime_written: None,
         };
         Ok((Some(store), found))
@@ -280,46 +227,41 @@ impl Store {
     /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = match self.history_filter.take(events) {
+        let rows = match self.history_filter.take(events, self.schedule.has_room(now)) {
             Some(rows) => rows,
             // Its sender gets an answer when it is stored.
             None if events.iter().any(|event| is_command_with_effect(&event.kind)) => self.history_filter.deferred(),
             None => return None,
         };
-        self.checkpointed = Some(now);
-        Some(self.submit(rows, monitor, now, false))
+        Some(self.submit(rows, monitor, now))
     }
 
     /// Writes the state of the second, and the checkpoint when it is due. `is_fresh`: frames have come since the last
     /// checkpoint. Returns whether it made a checkpoint.
     pub fn tick(&mut self, monitor: &Monitor, now: Timestamp, is_fresh: bool) -> bool {
-        let due = |last: Option<Timestamp>, period_s: f64| last.is_none_or(|last| now.since(last) >= period_s);
+        let last = self.runtime_written;
         if let Some(runtime) = &self.runtime
-            && due(self.runtime_written, RUNTIME_PERIOD_S)
+            && last.is_none_or(|last| now.since(last) >= RUNTIME_PERIOD_S)
         {
             runtime.put(self.document(monitor, now));
             self.runtime_written = Some(now);
         }
-        let period_s = if is_fresh { self.checkpoint_s } else { self.checkpoint_s.max(QUIET_PERIOD_S) };
-        // The first is a period after the start: the restored state is in the database already.
-        let checkpointed = *self.checkpointed.get_or_insert(now);
-        if now.since(checkpointed) < period_s {
+        if !self.schedule.is_due(now, if is_fresh { 0.0 } else { QUIET_PERIOD_S }) {
             return false;
         }
-        self.checkpointed = Some(now);
         let waiting = self.history_filter.for_checkpoint(now);
-        self.submit(waiting, monitor, now, false);
+        self.submit(waiting, monitor, now);
         true
     }
 
-    /// Writes the last state, unrounded; waits a bounded time until it is on the disk.
+    /// Writes the last state; waits a bounded time until it is on the disk.
     pub fn finish(mut self, monitor: &Monitor, now: Timestamp) {
         // On a disk that fails it is lost; then only the runtime folder has the last second.
         if let Some(runtime) = &self.runtime {
             runtime.put(self.document(monitor, now));
         }
         let waiting = self.history_filter.deferred();
-        self.submit(waiting, monitor, now, true);
+        self.submit(waiting, monitor, now);
         self.write_queue.stop();
         let Some(writer) = self.writer.take() else { return };
         if !ends_in_time(&writer) {
@@ -333,16 +275,24 @@ impl Store {
     }
 
     /// Queues rows and the state for the writer; returns the ticket.
-    fn submit(&self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp, exact: bool) -> u64 {
+    fn submit(&mut self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);
+        self.schedule.note_written(now, self.progress.borrow().state_bytes);
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp: state.stamp, rows });
-        self.write_queue.submit(batch, state, exact)
+        self.write_queue.submit(batch, state)
     }
 
     fn document(&self, monitor: &Monitor, now: Timestamp) -> StateDocument {
-        let stamp = Stamp::now(now, self.boot);
-        let folder = self.folder.to_string_lossy().into_owned();
-        StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot().for_restart()) }
+        StateDocument {
+            format: FORMAT,
+            // The writer counts.
+            number: 0,
+            folder: self.folder.to_string_lossy().into_owned(),
+            pack: self.progress.borrow().pack,
+            history_rows: 0,
+            stamp: Stamp::now(now, self.boot),
+            snapshot: Box::new(monitor.snapshot().for_restart()),
+        }
     }
 }
 
@@ -351,15 +301,66 @@ fn is_command_with_effect(kind: &EventKind) -> bool {
     matches!(kind, EventKind::Command { command: Command::Acknowledge(_) | Command::Clear(_), changed: 1.., .. })
 }
 
-/// Reads the state of a folder that cannot be written.
-fn unwritable_state(folder: &Path) -> Option<StateDocument> {
-    match HistoryReader::open_within(folder, MAX_DAEMON_COPY_BYTES) {
-        Ok(reader) => reader.state(),
-        Err(error) => {
-            tracing::warn!(error, "the stored state cannot be read");
-            None
-        }
+/// What a folder holds at the start.
+#[derive(Debug)]
+struct OpenedFolder {
+    state_files: StateFiles,
+    /// `None` = it cannot be used now.
+    database: Option<Database>,
+    /// Rows about the opening, for the history.
+    rows: Vec<HistoryRow>,
+    /// Number of the connected pack; 0 = not known.
+    pack: i64,
+    found: StoredStates,
+}
+
+impl OpenedFolder {
+    /// Reads the states and opens the database; `running` is the state in the runtime folder.
+    fn open(folder: &mut Folder, running: Option<StateDocument>, now: &Stamp) -> Self {
+        let (state_files, FoundStates { newest, aside, faults: mut rows }) = StateFiles::open(folder.path());
+        let database = match folder.open(now, newest.as_ref().map_or(0, |state| state.pack)) {
+            Ok((database, about)) => {
+                rows.extend(about.into_iter().chain(newest.as_ref().and_then(|state| lost_rows(state, &database))));
+                tracing::info!(%folder, rows = database.rows(), pack = database.pack(), "history open");
+                Some(database)
+            }
+            Err(error) => {
+                tracing::error!(%folder, %error, "the database cannot be used now; packwatch retries");
+                None
+            }
+        };
+        let mut states = candidates([running.filter(|running| running.stamp.same_boot(now)), newest, aside]);
+        let newest_pack = states.iter().map(|(state, _)| state.pack).max().unwrap_or(0);
+        // A state of a pack that was replaced must not come back.
+        states.retain(|(state, _)| {
+            let is_closed = |database: &Database| database.is_closed(state.pack).unwrap_or(false);
+            state.pack == 0 || (state.pack == newest_pack && !database.as_ref().is_some_and(is_closed))
+        });
+        let wall = WallClock::assess(now);
+        let candidate = |(state, source): (StateDocument, _)| StateCandidate {
+            downtime: state.stamp.age(now, wall),
+            snapshot: *state.snapshot,
+            source,
+        };
+        let learned = database.as_ref().filter(|_| states.is_empty()).map(Database::learned).transpose();
+        let found = StoredStates {
+            learned: learned
+                .inspect_err(|error| tracing::error!(%error, "the history cannot be read"))
+                .unwrap_or_default()
+                .unwrap_or_default(),
+            works: database.is_some() && rows.is_empty(),
+            states: states.into_iter().map(candidate).collect(),
+        };
+        let pack = database.as_ref().map_or(newest_pack, Database::pack);
+        Self { state_files, database, rows, pack, found }
     }
+}
+
+/// A row for the history if the newest rows that the state knows are missing: damage of SQLite's log shows in no other way.
+fn lost_rows(state: &StateDocument, database: &Database) -> Option<HistoryRow> {
+    let (known, found) = (state.history_rows, database.rows());
+    let detail = format!("the history ends with row {found}, the stored state knew {known}");
+    (0 < found && found < known).then_some(HistoryRow::Own { reason: "history_cut", detail })
 }
 
 /// Reads the state of the last second of a killed daemon, if it kept its state in this folder.
@@ -375,34 +376,24 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
     match StateDocument::parse(&json) {
         Ok(document) if Path::new(&document.folder) == folder => Some(document),
         Ok(_) => None,
-        Err(error) => {
-            tracing::warn!(file = %file.display(), error, "state of the last second not used");
+        Err(fault) => {
+            tracing::warn!(file = %file.display(), ?fault, "state of the last second not used");
             None
         }
     }
 }
 
-/// Both states, the newer first.
-fn candidates(
-    running: Option<StateDocument>,
-    stored: Option<StateDocument>,
-    now: &Stamp,
-    wall: WallClock,
-) -> Vec<StateCandidate> {
+/// The states that there are, with their sources: of the running and the stored one the newer first, then the one set aside.
+fn candidates([running, stored, aside]: [Option<StateDocument>; 3]) -> Vec<(StateDocument, &'static str)> {
     let is_older = |running: &StateDocument, stored: &StateDocument| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };
     let stored_first = matches!((&running, &stored), (Some(running), Some(stored)) if is_older(running, stored));
-    let mut both = [(running, "runtime folder"), (stored, DATABASE_SOURCE)];
+    let mut all = [(running, "runtime folder"), (stored, STATE_SOURCE), (aside, "state set aside earlier")];
     if stored_first {
-        both.reverse();
+        all.swap(0, 1);
     }
-    both.into_iter().filter_map(|(document, source)| Some(candidate(document?, source, now, wall))).collect()
-}
-
-fn candidate(document: StateDocument, source: &'static str, now: &Stamp, wall: WallClock) -> StateCandidate {
-    let downtime = document.stamp.age(now, wall);
-    StateCandidate { snapshot: *document.snapshot, downtime, source }
+    all.into_iter().filter_map(|(document, source)| Some((document?, source))).collect()
 }
 
 #[cfg(test)]

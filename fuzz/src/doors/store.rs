@@ -1,4 +1,4 @@
-//! The store: a database with changed bytes is opened, or the reason is reported; afterwards it is written and read again.
+//! The store: a database or a state file with changed bytes is opened, or the reason is reported; afterwards it is written and read again.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -17,13 +17,17 @@ use super::world;
 /// Bytes of a drive with a half-cycle.
 const DRIVE: &[u8] = &[7, 0xE8, 3, 6, 31, 6, 31, 7, 0x18, 0xFC, 6, 31, 6, 31, 7, 0xE8, 3, 6, 31];
 
-/// The database of a daemon that has learned something.
-fn database() -> &'static [u8] {
-    static DATABASE: OnceLock<Vec<u8>> = OnceLock::new();
-    DATABASE.get_or_init(|| {
+/// The files of a store.
+const FILES: [&str; 3] = ["packwatch.db", "state-a.json.zst", "state-b.json.zst"];
+
+/// The files of a daemon that has learned something.
+fn stored() -> &'static [Vec<u8>; 3] {
+    static STORED: OnceLock<[Vec<u8>; 3]> = OnceLock::new();
+    STORED.get_or_init(|| {
         let folder = folder();
-        write(folder.path());
-        std::fs::read(folder.path().join("packwatch.db")).expect("a database")
+        // Twice: for both states.
+        (0..2).for_each(|_| write(folder.path()));
+        FILES.map(|name| std::fs::read(folder.path().join(name)).expect("a file"))
     })
 }
 
@@ -50,7 +54,8 @@ fn write(path: &Path) {
 /// See the module.
 pub fn store(data: &[u8]) {
     let mut source = Source::new(data);
-    let mut bytes = database().to_vec();
+    let mut files = stored().clone();
+    let bytes = &mut files[usize::from(source.byte()) % FILES.len()];
     for _ in 0..=source.byte() % 8 {
         let (at, length) =
             (usize::from(source.u16()) | usize::from(source.byte()) << 16, 1 + usize::from(source.byte() % 8));
@@ -62,7 +67,9 @@ pub fn store(data: &[u8]) {
         bytes.truncate(usize::from(source.u16()));
     }
     let folder = folder();
-    std::fs::write(folder.path().join("packwatch.db"), &bytes).expect("written");
+    for (name, bytes) in FILES.iter().zip(&files) {
+        std::fs::write(folder.path().join(name), bytes).expect("written");
+    }
     if let Ok(reader) = HistoryReader::open(folder.path()) {
         let _ = (reader.verify(), reader.snapshot(), reader.entries(&HistoryQuery::default()));
     }

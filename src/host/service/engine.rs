@@ -22,7 +22,7 @@ use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{DATABASE_SOURCE, HISTORY_SOURCE, StateCandidate, Store, StoreProgress};
+use crate::store::{HISTORY_SOURCE, STATE_SOURCE, StateCandidate, Store, StoreProgress};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]
@@ -321,7 +321,7 @@ fn restore_first_valid(
             }
             Err(error) => {
                 tracing::error!(source, %error, "a stored state does not fit and is not used");
-                unfit = unfit.or_else(|| (source == DATABASE_SOURCE).then(|| error.to_string()));
+                unfit = unfit.or_else(|| (source == STATE_SOURCE).then(|| error.to_string()));
             }
         }
     }

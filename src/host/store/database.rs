@@ -1,33 +1,42 @@
-//! The database: checked when it is opened, written in transactions that hold rows together with their state.
+//! The database of the history: checked when it is opened, written in transactions.
+//!
+//! | table | a row is | kept |
+//! | --- | --- | --- |
+//! | `pack` | a pack that was or is connected | always |
+//! | `moment` | a time of writing: wall clock, inputs' clock, boot, pack | as long as its segment |
+//! | `half_cycle`, `capacity`, `loss_modes`, `remaining_life`, `model`, `alarm`, `reset` | a charge or discharge of one cell, a learned capacity, what a cell has lost, a forecast, a change of the cell model, a change of an alarm, a reset; numbered across the tables | the oldest segments are deleted |
+//! | `segment` | rows of a day, with the end of their hash chain (`segments`) | always |
+//! | `meta` | one row: the number of segments, the vehicle | |
+//!
+//! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
 //! * One file in write-ahead mode with `synchronous=FULL`: a commit that returned survives a power cut, a commit that did
 //!   not return leaves no trace.
-//! * A damaged file, a file of a newer program and a file that cannot be reached are three different errors.
+//! * A damaged file and a file that cannot be reached are different errors. A file of another format counts as damaged.
 
 use std::fs::File;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use rusqlite::{Connection, ErrorCode, MAIN_DB, OpenFlags, OptionalExtension, TransactionBehavior};
+use rusqlite::types::Value;
+use rusqlite::{
+    Connection, ErrorCode, MAIN_DB, OpenFlags, OptionalExtension, Transaction, TransactionBehavior, params,
+};
 
-use super::chain::hex;
-use super::chain_retention::ChainSweep;
-use super::document::StateDocument;
 use super::learned;
-use super::meta::{self, Meta};
-use super::retention::{self, RowLimits};
-use super::row_sql::write_batch;
-use super::rows::{HistoryRow, RowBatch};
-use super::schema::{self, MIGRATIONS};
-use super::stamp::{BootId, Stamp};
-use super::state_slots::{self, StateCopies, StateRecord, StoredState, read_aside, read_state};
-use crate::config::VehicleIdentity;
+use super::rows::{HistoryRow, HistoryTable, RowBatch};
+use super::segments::{self, Segment, hex};
+use super::stamp::Stamp;
+use crate::config::{StoreConfig, VehicleIdentity};
 use crate::monitor::{EventKind, LearnedCell};
 
-/// Bytes of a page: a checkpoint changes few bytes, and whole pages are written.
-pub(super) const PAGE_BYTES: u32 = 1024;
-/// Pages in the write-ahead log after which SQLite copies them into the main file: half a megabyte, some seventy
-/// checkpoints of a pack of 96 cells, which change a dozen pages of the main file.
+/// "pkwt": marks the file for file(1).
+const APPLICATION_ID: i32 = 0x706B_7774;
+/// The format that this program reads and writes.
+pub(super) const FORMAT: i32 = 1;
+/// Bytes of a page: a commit changes few bytes, and whole pages are written.
+const PAGE_BYTES: u32 = 1024;
+/// Pages in the write-ahead log after which SQLite copies them into the main file: half a megabyte, some fifty commits.
 const AUTOCHECKPOINT_PAGES: u32 = 512;
 /// SQLite truncates a larger log to this, bytes.
 const MAX_LOG_BYTES: u32 = 1 << 20;
@@ -40,18 +49,40 @@ const MAX_CHECK: Duration = Duration::from_secs(2);
 /// Virtual machine steps between two readings of the clock during that check.
 const CHECK_STEPS: i32 = 10_000;
 
+/// The tables other than those of [`HistoryTable`].
+const TABLES: &str = "
+CREATE TABLE meta (id INTEGER PRIMARY KEY CHECK (id = 1), segments INTEGER NOT NULL, vehicle TEXT) STRICT;
+INSERT INTO meta VALUES (1, 0, NULL);
+CREATE TABLE pack (
+    id INTEGER PRIMARY KEY,
+    opened_ns INTEGER NOT NULL,
+    closed_ns INTEGER,
+    reason TEXT,
+    identity TEXT
+) STRICT;
+CREATE TABLE moment (
+    id INTEGER PRIMARY KEY,
+    wall_ns INTEGER NOT NULL,
+    time_ns INTEGER NOT NULL,
+    boot BLOB NOT NULL,
+    pack INTEGER NOT NULL
+) STRICT;
+CREATE TABLE segment (
+    id INTEGER PRIMARY KEY,
+    day INTEGER NOT NULL,
+    first INTEGER NOT NULL,
+    last INTEGER NOT NULL,
+    last_moment INTEGER NOT NULL,
+    half_cycles INTEGER NOT NULL,
+    deleted INTEGER NOT NULL,
+    hash BLOB NOT NULL
+) STRICT;
+";
+
 /// Why the database cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum OpenError {
-    /// A newer program wrote it.
-    #[error("layout version {found}, this program reads up to {known}; the file is left as it is")]
-    Newer {
-        /// In the file.
-        found: i32,
-        /// Readable here.
-        known: i32,
-    },
-    /// The file is no longer a database.
+    /// The file is not a history, or not any longer.
     #[error("damaged: {0}")]
     Damaged(String),
     /// The disk, the folder or the permissions prevent it.
@@ -96,190 +127,132 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
 #[derive(Debug)]
 pub(super) struct Database {
     connection: Connection,
-    meta: Meta,
-    copies: StateCopies,
-    limits: RowLimits,
-    sweep: ChainSweep,
-    /// Half-cycles before this wall clock are deleted, ns since 1970; `None` = none.
-    horizon_ns: Option<i64>,
+    /// The newest segment.
+    segment: Segment,
+    /// Number of the connected pack.
+    pack: i64,
 }
 
-/// Rows in the history.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Counts {
-    /// Capacities, loss modes, remaining lives, cell models, alarms and resets that were written.
-    pub chained: i64,
-    /// Half-cycles.
-    pub half_cycles: i64,
-    /// Packs.
-    pub packs: i64,
+/// Bounds of the history: beyond them the oldest segments are deleted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct RowLimits {
+    /// Rows that are kept.
+    max_rows: i64,
+    /// Greatest age, years; `None` = any.
+    keep_years: Option<f64>,
+}
+
+impl From<&StoreConfig> for RowLimits {
+    fn from(config: &StoreConfig) -> Self {
+        Self { max_rows: config.max_rows.into(), keep_years: config.keep_years }
+    }
 }
 
 impl Database {
-    /// Opens the file; creates it or brings its layout up to date where needed.
-    pub(super) fn open(path: &Path, now: &Stamp, limits: RowLimits) -> Result<Self, OpenError> {
-        Self::open_with(path, now, limits, MIGRATIONS)
-    }
-
-    pub(super) fn open_with(
-        path: &Path,
-        now: &Stamp,
-        limits: RowLimits,
-        migrations: &[&str],
-    ) -> Result<Self, OpenError> {
-        let is_new = std::fs::metadata(path).map_or(true, |file| file.len() == 0);
+    /// Opens the file; creates it where it is missing, for the pack of number `pack`, which the stored state knows (0 = not known).
+    pub(super) fn open(path: &Path, now: &Stamp, pack: i64) -> Result<Self, OpenError> {
         let mut connection = Connection::open_with_flags(
             path,
             OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE | OpenFlags::SQLITE_OPEN_NO_MUTEX,
         )?;
         connection.busy_timeout(BUSY_TIMEOUT)?;
-        let version = schema::version(&connection)?;
-        let known = schema::known(migrations);
-        if !schema::is_confirmed(&connection, version) {
-            return Err(OpenError::Damaged(format!("layout version {version}, not the one noted in the table meta")));
-        }
-        if version > known {
-            return Err(OpenError::Newer { found: version, known });
-        }
         if connection.is_readonly(MAIN_DB)? && File::options().write(true).open(path).is_ok() {
             return Err(OpenError::Damaged("the file is marked as read-only".to_owned()));
         }
-        if version == 0 && !is_new && has_tables(&connection)? {
-            return Err(OpenError::Damaged("a database, but not one of packwatch".to_owned()));
-        }
-        prepare(&connection)?;
-        if !is_new {
+        // A power cut right after the creation leaves a file without tables.
+        let has_tables =
+            connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| Ok(row.get::<_, i64>(0)? > 0))?;
+        if has_tables {
+            let found = format(&connection)?;
+            if found != FORMAT {
+                return Err(OpenError::Damaged(format!("format {found}, not {FORMAT}")));
+            }
             check(&mut connection)?;
         }
-        schema::migrate(&mut connection, version, migrations)?;
-        let mut meta = open_pack(&connection, now)?;
-        if let Some(fault) = meta.fault(&connection, known)? {
-            return Err(OpenError::Damaged(fault));
+        prepare(&connection)?;
+        if !has_tables {
+            create(&mut connection)?;
         }
-        // A damaged record is reported by [`Self::state`].
-        let copies = StateCopies::read(&connection, known)?;
-        let sweep = ChainSweep::begin(meta.head.count);
-        Ok(Self { connection, meta, copies, limits, sweep, horizon_ns: None })
+        let segment = Segment::newest(&connection)?;
+        let last: i64 = connection.query_row("SELECT coalesce(max(id), 0) FROM pack", [], |row| row.get(0))?;
+        let pack = pack.max(last).max(1);
+        if last < pack {
+            connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![pack, now.wall_ns])?;
+        }
+        Ok(Self { connection, segment, pack })
     }
 
     /// Rows so far.
-    pub(super) fn counts(&self) -> Counts {
-        let Meta { head, half_cycles, pack, .. } = self.meta;
-        Counts { chained: head.count, half_cycles, packs: pack }
+    pub(super) fn rows(&self) -> i64 {
+        self.segment.last
+    }
+
+    /// Number of the connected pack.
+    pub(super) fn pack(&self) -> i64 {
+        self.pack
     }
 
     /// The chain's end: number of rows, hash of the last.
     pub(super) fn head(&self) -> (i64, String) {
-        (self.meta.head.count, hex(&self.meta.head.hash))
+        (self.segment.last, hex(&self.segment.hash))
     }
 
-    /// Sets the wall clock before which checkpoints delete half-cycles, ns since 1970; `None` = they delete none.
-    pub(super) fn set_horizon_ns(&mut self, horizon_ns: Option<i64>) {
-        self.horizon_ns = horizon_ns;
+    /// Whether another pack was connected after this one. Two values say so: one flipped bit must not make a state look old.
+    pub(super) fn is_closed(&self, pack: i64) -> rusqlite::Result<bool> {
+        let sql = "SELECT 1 FROM pack WHERE id = ?1 AND closed_ns IS NOT NULL";
+        Ok(pack < self.pack && self.connection.prepare(sql)?.exists([pack])?)
     }
 
     /// Notes which vehicle the history is of, if it is not noted yet.
-    pub(super) fn set_vehicle(&self, vehicle: &VehicleIdentity) -> rusqlite::Result<()> {
-        if meta::vehicle(&self.connection)? == *vehicle {
+    pub(super) fn set_vehicle(&self, of: &VehicleIdentity) -> rusqlite::Result<()> {
+        if vehicle(&self.connection)? == *of {
             return Ok(());
         }
-        meta::set_vehicle(&self.connection, vehicle)
+        let text = serde_json::to_string(of).ok().filter(|_| of.is_stated());
+        self.connection.execute("UPDATE meta SET vehicle = ?1 WHERE id = 1", [text]).map(drop)
     }
 
-    /// Writes rows and state, all or nothing; durable when it returns.
-    pub(super) fn commit(&mut self, batches: &[RowBatch], state: Option<StateRecord>) -> rusqlite::Result<()> {
+    /// Writes rows, all or nothing; durable when it returns.
+    pub(super) fn commit(&mut self, batches: &[RowBatch]) -> rusqlite::Result<()> {
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
-        let mut meta = self.meta;
+        let (mut segment, mut pack) = (self.segment, self.pack);
         for batch in batches {
-            write_batch(&transaction, &mut meta, batch)?;
-        }
-        let mut sweep = self.sweep;
-        if batches.is_empty() {
-            sweep.thin(&transaction, &mut meta, self.limits.chained_rows)?;
-            retention::thin(&transaction, &mut meta, self.limits.half_cycles)?;
-            if let Some(horizon_ns) = self.horizon_ns {
-                retention::expire(&transaction, &mut meta, horizon_ns)?;
-            }
-        }
-        let written = match state {
-            None => None,
-            Some(StateRecord { parts, exact, sets_aside }) => {
-                if sets_aside {
-                    self.copies.set_aside(&transaction)?;
-                }
-                Some(self.copies.write(&transaction, parts, exact)?)
-            }
-        };
-        if meta != self.meta {
-            meta.write(&transaction)?;
+            write_batch(&transaction, &mut segment, &mut pack, batch)?;
         }
         transaction.commit()?;
-        (self.meta, self.sweep) = (meta, sweep);
-        written.into_iter().for_each(|written| self.copies.note_stored(written));
+        (self.segment, self.pack) = (segment, pack);
         Ok(())
     }
 
-    /// The latest state, as [`read_state`] reads it.
-    pub(super) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-        read_state(&self.connection)
-    }
-
-    /// The state that was set aside; `None` = there is no good one.
-    pub(super) fn state_aside(&self) -> Option<StateDocument> {
-        read_aside(&self.connection)
+    /// Deletes the oldest segment if the history is beyond its limits.
+    pub(super) fn apply(&mut self, limits: &RowLimits, now: &Stamp) -> rusqlite::Result<()> {
+        let horizon_ns = limits.keep_years.and_then(|years| now.years_ago_ns(years));
+        let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+        segments::delete_oldest(&transaction, &self.segment, limits.max_rows, horizon_ns)?;
+        transaction.commit()
     }
 
     /// What the history knows of the cells of the connected pack.
     pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
-        learned::read(&self.connection, self.meta.pack)
+        learned::read(&self.connection, self.pack)
     }
 
-    /// Boot time at which another pack was connected last in this boot, ns.
-    pub(super) fn last_reset_ns(&self, boot: BootId) -> rusqlite::Result<Option<i64>> {
-        self.connection.query_row(
-            "SELECT max(m.boottime_ns) FROM reset r JOIN moment m ON m.id = r.moment WHERE r.reason = 'pack_replaced' AND \
-             m.boot = ?1",
-            [boot.0],
-            |row| row.get(0),
-        )
-    }
-
-    /// Closes the history of the pack with the last capacity of its weakest cell, opens that of the next pack and forgets
-    /// the state. Returns the number of the new pack.
+    /// Closes the history of the pack with the last capacity of its weakest cell and opens that of the next pack. Returns the
+    /// number of the new pack.
     pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
-        let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
-        let mut meta = self.meta;
-        let learned = transaction
+        let learned = self
+            .connection
             .query_row(
                 "SELECT capacity_ah, capacity_std_ah FROM capacity WHERE seq IN (SELECT max(r.seq) FROM capacity r JOIN \
                  moment m ON m.id = r.moment WHERE m.pack = ?1 GROUP BY r.cell) ORDER BY capacity_ah LIMIT 1",
-                [meta.pack],
+                [self.pack],
                 |row| Ok((row.get(0)?, row.get(1)?)),
             )
             .optional()?;
         let (capacity_ah, capacity_std_ah) = learned.unwrap_or_default();
         let row = HistoryRow::Event(EventKind::PackReplaced { capacity_ah, capacity_std_ah });
-        write_batch(&transaction, &mut meta, &RowBatch { stamp: *now, rows: vec![row] })?;
-        state_slots::forget_all(&transaction)?;
-        meta.write(&transaction)?;
-        transaction.commit()?;
-        self.meta = meta;
-        self.copies = StateCopies::default();
-        Ok(meta.pack)
-    }
-
-    /// Connection and meta, for rows copied from a damaged database.
-    pub(super) fn parts_mut(&mut self) -> (&mut Connection, &mut Meta) {
-        (&mut self.connection, &mut self.meta)
-    }
-
-    /// Closes it with all contents in the main file.
-    pub(super) fn close(self) -> rusqlite::Result<()> {
-        let is_busy: bool = self.connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |row| row.get(0))?;
-        if is_busy {
-            return Err(rusqlite::Error::SqliteFailure(rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_BUSY), None));
-        }
-        self.connection.close().map_err(|(_, error)| error)
+        self.commit(&[RowBatch { stamp: *now, rows: vec![row] }])?;
+        Ok(self.pack)
     }
 
     /// The connection, for tests.
@@ -289,8 +262,31 @@ impl Database {
     }
 }
 
-fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
-    connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| Ok(row.get::<_, i64>(0)? > 0))
+/// The format of an open database.
+pub(super) fn format(connection: &Connection) -> rusqlite::Result<i32> {
+    connection.query_row("PRAGMA user_version", [], |row| row.get(0))
+}
+
+/// The vehicle that the history is of. A text that cannot be read states none.
+pub(super) fn vehicle(connection: &Connection) -> rusqlite::Result<VehicleIdentity> {
+    let text: Option<String> = connection.query_row("SELECT vehicle FROM meta WHERE id = 1", [], |row| row.get(0))?;
+    Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
+}
+
+/// Creates the tables, all or none.
+fn create(connection: &mut Connection) -> rusqlite::Result<()> {
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    transaction.execute_batch(TABLES)?;
+    for table in HistoryTable::ALL {
+        let columns: String =
+            table.columns().iter().map(|column| format!(", {column} {}", HistoryTable::sql_type(column))).collect();
+        let sql =
+            format!("CREATE TABLE {} (seq INTEGER PRIMARY KEY, moment INTEGER NOT NULL{columns}) STRICT", table.name());
+        transaction.execute(&sql, [])?;
+    }
+    transaction.pragma_update(None, "application_id", APPLICATION_ID)?;
+    transaction.pragma_update(None, "user_version", FORMAT)?;
+    transaction.commit()
 }
 
 /// Settings of the connection, and of the file while it is new.
@@ -305,8 +301,6 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "cache_size", -i64::from(CACHE_KIB))?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    // What is deleted is overwritten: a salvage must not find it.
-    connection.query_row("PRAGMA secure_delete = ON", [], |_| Ok(()))?;
     connection.query_row(&format!("PRAGMA journal_size_limit = {MAX_LOG_BYTES}"), [], |_| Ok(()))?;
     connection.query_row(&format!("PRAGMA wal_autocheckpoint = {AUTOCHECKPOINT_PAGES}"), [], |_| Ok(()))
 }
@@ -328,14 +322,47 @@ fn check(connection: &mut Connection) -> Result<(), OpenError> {
     }
 }
 
-/// Reads `meta`; opens the history of the first pack in a new file.
-fn open_pack(connection: &Connection, now: &Stamp) -> rusqlite::Result<Meta> {
-    let mut meta = Meta::read(connection)?;
-    if meta.pack == 0 {
-        meta.pack = 1;
-        connection.execute("INSERT INTO pack (id, opened_ns) VALUES (1, ?1)", [now.wall_ns])?;
+/// Writes the rows of one moment, and what they change in `pack`.
+fn write_batch(
+    transaction: &Transaction<'_>,
+    segment: &mut Segment,
+    pack: &mut i64,
+    batch: &RowBatch,
+) -> rusqlite::Result<()> {
+    let rows: Vec<_> = batch.rows.iter().filter_map(|row| Some((row, row.values()?))).collect();
+    if rows.is_empty() {
+        return Ok(());
     }
-    Ok(meta)
+    let Stamp { wall_ns, time, boot, .. } = batch.stamp;
+    *segment = segment.at(transaction, &batch.stamp)?;
+    let values = params![wall_ns, time.nanos(), boot.0, *pack];
+    transaction
+        .prepare_cached("INSERT INTO moment (wall_ns, time_ns, boot, pack) VALUES (?1, ?2, ?3, ?4)")?
+        .execute(values)?;
+    segment.last_moment = transaction.last_insert_rowid();
+    let moment = [
+        Value::Integer(segment.last_moment),
+        Value::Integer(wall_ns),
+        Value::Integer(time.nanos()),
+        Value::Blob(boot.0.to_vec()),
+        Value::Integer(*pack),
+    ];
+    for (row, (table, values)) in rows {
+        segment.write_row(transaction, table, &moment, &values)?;
+        if row.replaces_pack() {
+            transaction.execute(
+                "UPDATE pack SET closed_ns = ?2, reason = 'pack_replaced' WHERE id = ?1",
+                params![*pack, wall_ns],
+            )?;
+            *pack = pack.saturating_add(1);
+            transaction.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![*pack, wall_ns])?;
+        }
+        if let Some(identity) = row.pack_identity() {
+            let values = params![*pack, identity.to_string()];
+            transaction.execute("UPDATE pack SET identity = ?2 WHERE id = ?1", values)?;
+        }
+    }
+    segment.write(transaction)
 }
 
 #[cfg(test)]

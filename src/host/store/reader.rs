@@ -6,22 +6,17 @@ use std::path::{Path, PathBuf};
 use rusqlite::types::Value;
 use rusqlite::{Connection, OpenFlags};
 
-use super::chain::hex;
-use super::document::StateDocument;
+use super::database;
 use super::folder::DATABASE;
-use super::meta;
 use super::rows::HistoryTable;
-use super::schema;
-use super::state_slots::read_document;
-use super::verify::{self, ChainReport, NotedHead};
+use super::segments::{self, ChainReport, NotedHead, hex};
+use super::state_files::{StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
-/// The same for the daemon at its start: the temporary folder may count as its memory.
-pub(super) const MAX_DAEMON_COPY_BYTES: u64 = 8 << 20;
 
 /// A store, open for reading.
 #[derive(Debug)]
@@ -59,10 +54,8 @@ impl HistoryQuery {
 pub struct HistoryEntry {
     /// Its table.
     pub kind: HistoryTable,
-    /// Number in the chain; `None` for half-cycles, which are not chained.
-    pub seq: Option<i64>,
-    /// Number of the moment at which it was written, the order of the rows.
-    pub moment: i64,
+    /// Its number, counted across the tables.
+    pub seq: i64,
     /// Wall clock at that moment, ns since 1970.
     pub wall_ns: i64,
     /// The inputs' clock, ns.
@@ -82,7 +75,7 @@ pub struct HistoryExtent {
     pub pack: i64,
     /// Half-cycles, of any pack, that the store has.
     pub half_cycles: i64,
-    /// Half-cycles, of any pack, that were deleted: thinned out, or too old.
+    /// Half-cycles, of any pack, that the store has deleted because of their number or age.
     pub deleted_half_cycles: i64,
     /// Half-cycles, of any pack, that were written, as the store itself counts them.
     pub written_half_cycles: i64,
@@ -94,24 +87,17 @@ impl HistoryReader {
     /// # Errors
     /// When there is none, or it cannot be read; names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
-        Self::open_within(folder, MAX_COPY_BYTES)
-    }
-
-    /// As [`HistoryReader::open`], with another limit to the size of a copy.
-    pub(super) fn open_within(folder: &Path, max_copy_bytes: u64) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
         if !path.exists() {
             return Err(named("no history there; name the folder of the daemon with --state".to_owned()));
         }
-        let (connection, copy) = open_read_only(&path, max_copy_bytes).map_err(named)?;
-        let reader = Self { connection, path: path.clone(), _copy: copy };
-        let version = schema::version(&reader.connection).map_err(|error| named(error.to_string()))?;
-        let known = schema::known(schema::MIGRATIONS);
-        if version > known || version == 0 {
-            return Err(named(format!("layout version {version}, this program reads 1 to {known}")));
+        let (connection, copy) = open_read_only(&path, MAX_COPY_BYTES).map_err(named)?;
+        match database::format(&connection) {
+            Ok(database::FORMAT) => Ok(Self { connection, path, _copy: copy }),
+            Ok(format) => Err(named(format!("format {format}, this program reads {}", database::FORMAT))),
+            Err(error) => Err(named(error.to_string())),
         }
-        Ok(reader)
     }
 
     fn named(&self, error: &rusqlite::Error) -> String {
@@ -123,11 +109,7 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read.
     pub fn vehicle(&self) -> Result<VehicleIdentity, String> {
-        let version = schema::version(&self.connection).map_err(|error| self.named(&error))?;
-        if version < schema::VERSION_WITH_VEHICLE {
-            return Ok(VehicleIdentity::default());
-        }
-        meta::vehicle(&self.connection).map_err(|error| self.named(&error))
+        database::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
 
     /// How much of the half-cycles the store holds.
@@ -136,8 +118,8 @@ impl HistoryReader {
     /// When the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
         // One statement, which a daemon that writes cannot come between.
-        let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), thinned, half_cycles + thinned \
-                   FROM meta WHERE id = 1";
+        let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), coalesce(sum(half_cycles * \
+                   deleted), 0), coalesce(sum(half_cycles), 0) FROM segment";
         let extent = self.connection.query_row(sql, [], |row| {
             Ok(HistoryExtent {
                 pack: row.get(0)?,
@@ -154,7 +136,7 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read to the end.
     pub fn verify(&self) -> Result<ChainReport, String> {
-        verify::verify(&self.connection).map_err(|error| self.named(&error))
+        segments::verify(&self.connection).map_err(|error| self.named(&error))
     }
 
     /// What contradicts the chain's end as it was noted elsewhere; `None` = nothing.
@@ -162,7 +144,7 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
-        verify::contradiction(&self.connection, noted).map_err(|error| self.named(&error))
+        segments::contradiction(&self.connection, noted).map_err(|error| self.named(&error))
     }
 
     /// The stored snapshot; `None` = there is none, or it is damaged.
@@ -175,9 +157,9 @@ impl HistoryReader {
         self.state().map(|document| (document.stamp.wall_ns, *document.snapshot))
     }
 
-    /// The stored state, if it is good.
+    /// The newest good state next to the database.
     pub(super) fn state(&self) -> Option<StateDocument> {
-        read_document(&self.connection)
+        StateFiles::open(self.path.parent()?).1.newest
     }
 
     /// The selected rows in the order in which they were written.
@@ -189,7 +171,7 @@ impl HistoryReader {
         for kind in filter.wanted_kinds() {
             self.read(kind, filter, "DESC", &mut |entry| entries.push(entry)).map_err(|error| self.named(&error))?;
         }
-        entries.sort_by_key(|entry| (entry.moment, entry.seq.unwrap_or(0)));
+        entries.sort_by_key(|entry| entry.seq);
         if let Some(limit) = filter.limit {
             let surplus = entries.len().saturating_sub(usize::try_from(limit).unwrap_or(usize::MAX));
             entries.drain(..surplus);
@@ -217,35 +199,26 @@ impl HistoryReader {
         order: &str,
         take: &mut dyn FnMut(HistoryEntry),
     ) -> rusqlite::Result<()> {
-        if !kind.is_in(schema::version(&self.connection)?) {
-            return Ok(());
-        }
-        let (seq, by) = match kind {
-            HistoryTable::HalfCycle => ("NULL", format!("r.moment {order}, r.cell {order}")),
-            _ => ("r.seq", format!("r.seq {order}")),
-        };
-        let columns: Vec<String> = kind.columns().iter().map(|column| format!("r.{column}")).collect();
         let sql = format!(
-            "SELECT {seq}, r.moment, m.wall_ns, m.time_ns, m.boot, m.pack, {} FROM {} r JOIN moment m ON m.id = r.moment \
-             WHERE (?1 IS NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) \
-             ORDER BY {by} LIMIT ?4",
-            columns.join(", "),
+            "SELECT r.seq, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r JOIN moment m ON m.id = r.moment WHERE (?1 IS \
+             NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) ORDER BY r.seq {order} \
+             LIMIT ?4",
+            kind.columns().join(", r."),
             kind.name()
         );
         let limit = filter.limit.map_or(-1, i64::from);
         let mut statement = self.connection.prepare(&sql)?;
         let mut rows = statement.query((filter.cell, filter.since_ns, filter.until_ns, limit))?;
         while let Some(row) = rows.next()? {
-            let boot: Vec<u8> = row.get(4)?;
+            let boot: Vec<u8> = row.get(3)?;
             take(HistoryEntry {
                 kind,
                 seq: row.get(0)?,
-                moment: row.get(1)?,
-                wall_ns: row.get(2)?,
-                time_ns: row.get(3)?,
+                wall_ns: row.get(1)?,
+                time_ns: row.get(2)?,
                 boot: hex(&boot),
-                pack: row.get(5)?,
-                values: (6..6 + columns.len())
+                pack: row.get(4)?,
+                values: (5..5 + kind.columns().len())
                     .map(|index| row.get(index).map(json))
                     .collect::<rusqlite::Result<_>>()?,
             });

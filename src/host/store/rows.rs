@@ -17,7 +17,7 @@ pub(super) enum HistoryRow {
     Event(EventKind),
     /// An event of the store itself.
     Own {
-        /// Its name: `damaged`, `rows_lost`.
+        /// Its name: `damaged`, `state_damaged`, `rows_lost`.
         reason: &'static str,
         /// Details for the reader.
         detail: String,
@@ -36,19 +36,19 @@ pub(super) struct RowBatch {
 /// A table of the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum HistoryTable {
-    /// Charges and discharges; the oldest are thinned.
+    /// Charges and discharges.
     HalfCycle,
-    /// Learned capacities; chained.
+    /// Learned capacities.
     Capacity,
-    /// Lithium and active material that cells have lost; chained.
+    /// Lithium and active material that cells have lost.
     LossModes,
-    /// Remaining life of the cell whose life ends first; chained.
+    /// Remaining life of the cell whose life ends first.
     RemainingLife,
-    /// Changes of the cell model that is learned on board; chained.
+    /// Changes of the cell model that is learned on board.
     Model,
-    /// Alarms; chained.
+    /// Alarms.
     Alarm,
-    /// Resets, other packs, damages; chained.
+    /// Resets, other packs, damages.
     Reset,
 }
 
@@ -56,19 +56,13 @@ impl HistoryTable {
     /// All tables, in the order in which they are shown.
     pub const ALL: [Self; 7] =
         [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
-    /// The tables whose rows are chained by hash.
-    pub(super) const CHAINED: [Self; 6] =
-        [Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
-
-    /// Whether a database of this layout version has it.
-    pub(super) const fn is_in(self, version: i32) -> bool {
-        version
-            >= match self {
-                Self::HalfCycle | Self::Capacity | Self::Alarm | Self::Reset => 1,
-                Self::RemainingLife => 2,
-                Self::LossModes => 3,
-                Self::Model => 7,
-            }
+    /// Type of a column in the database.
+    pub(super) fn sql_type(column: &str) -> &'static str {
+        match column {
+            "mode" | "state" | "chemistry" | "rule" | "severity" | "change" | "reason" | "detail" => "TEXT",
+            "cell" | "taken_back" | "active" | "occurrences" | "acknowledged" => "INTEGER",
+            _ => "REAL",
+        }
     }
 
     /// Its name in the database, in JSON and in CSV.
@@ -230,7 +224,11 @@ impl EventSubject {
 fn sql_value(field: &serde_json::Value) -> Value {
     match field {
         serde_json::Value::Bool(flag) => Value::Integer(i64::from(*flag)),
-        serde_json::Value::Number(number) => number.as_i64().map_or_else(|| number.as_f64().into(), Value::Integer),
+        serde_json::Value::Number(number) => match number.as_i64() {
+            Some(whole) => Value::Integer(whole),
+            // SQLite stores no sign of a zero, which the hash would miss.
+            None => number.as_f64().map(|real| real + 0.0).into(),
+        },
         serde_json::Value::String(text) => Value::Text(text.clone()),
         _ => Value::Null,
     }

@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use super::document::StateDocument;
+use super::state_files::StateDocument;
 
 /// Name of the file.
 pub(super) const FILE_NAME: &str = "state.json";
@@ -51,7 +51,7 @@ fn write_all(path: &Path, latest: &Mutex<Option<StateDocument>>, woken: &Receive
     let mut failing = false;
     for () in woken {
         let document = latest.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let written = document.map_or(Ok(()), |document| document.write(path));
+        let written = document.map_or(Ok(()), |document| document.write_json(path));
         if let Err(error) = &written
             && !failing
         {

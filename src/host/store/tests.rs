@@ -4,15 +4,11 @@ mod flips;
 mod healing;
 mod rounding;
 
-use super::retention::RowLimits;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use super::database::Database;
 use super::folder::DATABASE;
-use super::parts::JsonParts;
-use super::state_slots::StateRecord;
 use super::*;
 
 use crate::can::encode::{InputEncoder, InputProtector};
@@ -78,33 +74,24 @@ fn restored(snapshot: Snapshot) -> Monitor {
     monitor
 }
 
-#[test]
-fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
-    let parts = |snapshot: &Snapshot| JsonParts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
-    let (early, late) = (snapshot(Some(1500), None), snapshot(Some(5000), None));
-    let full = packed::read_full(&packed::full(&parts(&late), 1), 1).unwrap();
-    assert_eq!(full.join(), serde_json::to_vec(&late).unwrap());
-    let delta = packed::delta(&parts(&late), &parts(&early), 1, 2);
-    let read = packed::read_delta(&delta, &parts(&early), 1, 2).unwrap().join();
-    let near = restored(serde_json::from_slice(&read).unwrap());
-    let exact = restored(late);
-    let (near, exact) = (near.capacity(CellIndex(0)), exact.capacity(CellIndex(0)));
-    assert!((near.mean - exact.mean).abs() < 1e-5 && (near.std() - exact.std()).abs() < 1e-5, "{near:?} {exact:?}");
+/// The newest state in a folder.
+fn stored(folder: &Path) -> StateDocument {
+    StateFiles::open(folder).1.newest.unwrap()
 }
 
 #[test]
-fn the_database_holds_the_state_in_which_the_replay_ended() {
+fn a_replay_leaves_the_state_in_which_it_ended() {
     let folder = tempfile::tempdir().unwrap();
     let state = folder.path().join("state");
     let end = snapshot(None, Some(Recorder::create(&state, &config().store, &VehicleIdentity::default()).unwrap()));
     let now = Stamp::replayed(end.time.plus_secs(60.0));
-    let database = Database::open(&state.join(DATABASE), &now, RowLimits::SMALL).unwrap();
-    let counts = database.counts();
-    assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
-    let stored = StateDocument::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
+    let rows = Database::open(&state.join(DATABASE), &now, 0).unwrap().rows();
+    let stored = stored(&state);
+    assert!(rows >= 8 && stored.history_rows == rows && stored.pack == 1, "{rows}, {}", stored.history_rows);
     assert_eq!(stored.stamp.age(&now, WallClock::Reliable), Downtime::Seconds(60.0));
-    assert_eq!(serde_json::to_vec(&stored.snapshot).unwrap(), serde_json::to_vec(&end.for_restart()).unwrap());
-    restored(*stored.snapshot);
+    let (near, exact) = (restored(*stored.snapshot), restored(end.for_restart()));
+    let (near, exact) = (near.capacity(CellIndex(0)), exact.capacity(CellIndex(0)));
+    assert!((near.mean - exact.mean).abs() < 1e-8 && (near.std() - exact.std()).abs() < 1e-8, "{near:?} {exact:?}");
 }
 
 /// A document of a state taken at `boottime_s` of boot `boot`.
@@ -113,26 +100,84 @@ pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument 
     let time = Timestamp::from_secs(1.0);
     let stamp = Stamp { wall_ns: wall_s * 1_000_000_000, time, boottime_ns: boottime_s * 1_000_000_000, boot };
     let monitor = Monitor::new(config().monitor);
-    StateDocument { folder: String::new(), stamp, snapshot: Box::new(monitor.snapshot()) }
+    StateDocument {
+        format: FORMAT,
+        number: 0,
+        folder: String::new(),
+        pack: 1,
+        history_rows: 0,
+        stamp,
+        snapshot: Box::new(monitor.snapshot()),
+    }
 }
 
 #[test]
 fn the_newer_of_the_two_states_comes_first_with_its_age() {
-    const WALL_S: i64 = 1_800_000_000;
-    let now = document(1, 100, WALL_S).stamp;
-    let of = |running: Option<StateDocument>, stored: Option<StateDocument>| -> Vec<(&str, Downtime)> {
-        candidates(running, stored, &now, WallClock::Reliable)
-            .into_iter()
-            .map(|candidate| (candidate.source, candidate.downtime))
-            .collect()
+    let of = |running: Option<StateDocument>, stored: Option<StateDocument>| -> Vec<(&str, i64)> {
+        let found = candidates([running, stored, None]);
+        found.into_iter().map(|(state, source)| (source, state.stamp.boottime_ns / 1_000_000_000)).collect()
     };
-    let (running, stored) = (|at| Some(document(1, at, 0)), |at| Some(document(1, at, 0)));
-    let both = |first, second| [(first, Downtime::Seconds(2.0)), (second, Downtime::Seconds(50.0))];
-    assert_eq!(of(running(98), stored(50)), both("runtime folder", "database"));
-    assert_eq!(of(running(50), stored(98)), both("database", "runtime folder"));
-    assert_eq!(of(None, Some(document(2, 500, WALL_S - 600))), [("database", Downtime::Seconds(600.0))]);
-    assert_eq!(of(None, Some(document(2, 500, WALL_S + 600))), [("database", Downtime::Unknown)]);
+    let at = |boottime_s| Some(document(1, boottime_s, 0));
+    assert_eq!(of(at(98), at(50)), [("runtime folder", 98), (STATE_SOURCE, 50)]);
+    assert_eq!(of(at(50), at(98)), [(STATE_SOURCE, 98), ("runtime folder", 50)]);
+    assert_eq!(of(None, at(50)), [(STATE_SOURCE, 50)]);
     assert_eq!(of(None, None), []);
+}
+
+#[test]
+fn a_state_of_a_replaced_pack_is_not_restored() {
+    let place = tempfile::tempdir().unwrap();
+    let now = document(1, 100, 1_800_000_000);
+    let open = |running: Option<i64>| {
+        let running = running.map(|pack| StateDocument { pack, ..now.clone() });
+        let opened = OpenedFolder::open(&mut Folder::new(place.path().to_owned()), running, &now.stamp);
+        (opened.found.states.iter().map(|state| state.source).collect::<Vec<_>>(), opened)
+    };
+    let (none, mut opened) = open(None);
+    assert_eq!(none.len(), 0);
+    opened.state_files.write(now.clone()).unwrap();
+    drop(opened);
+    assert_eq!(open(None).0, [STATE_SOURCE]);
+    // The power is cut after the row of the exchange, before the state.
+    open(None).1.database.unwrap().replace_pack(&now.stamp).unwrap();
+    assert_eq!(open(None).0.len(), 0);
+    assert_eq!(open(Some(1)).0.len(), 0, "nor is the state of the last second");
+    assert_eq!(open(Some(2)).0, ["runtime folder"]);
+    // A history that was lost does not bring it back either.
+    std::fs::remove_file(place.path().join(DATABASE)).unwrap();
+    assert_eq!(open(Some(2)).0, ["runtime folder"]);
+    assert_eq!(open(Some(0)).0, ["runtime folder", STATE_SOURCE], "a pack that is not known");
+}
+
+#[test]
+fn rows_that_the_history_has_lost_are_reported() {
+    let place = tempfile::tempdir().unwrap();
+    let state = document(1, 100, 1_800_000_000);
+    let open = || OpenedFolder::open(&mut Folder::new(place.path().to_owned()), None, &state.stamp);
+    let mut opened = open();
+    let rows = vec![HistoryRow::Event(rows::tests::capacity(0, Some(2.0), 1.9))];
+    opened.database.unwrap().commit(&[RowBatch { stamp: state.stamp, rows }]).unwrap();
+    opened.state_files.write(StateDocument { history_rows: 3, ..state.clone() }).unwrap();
+    let opened = open();
+    assert!(matches!(&opened.rows[..], [HistoryRow::Own { reason: "history_cut", .. }]), "{:?}", opened.rows);
+    assert!(!opened.found.works && opened.found.states.len() == 1);
+}
+
+/// The writer of a folder, without its thread.
+fn writer(folder: &Path) -> Writer {
+    Writer {
+        write_queue: Arc::default(),
+        vehicle: VehicleIdentity::default(),
+        limits: (&StoreConfig { checkpoint_s: 60.0, max_rows: 10_000, keep_years: None }).into(),
+        reserve: Reserve::new(folder),
+        head_day: None,
+        folder: Folder::new(folder.to_owned()),
+        state_files: StateFiles::open(folder).0,
+        database: None,
+        progress: watch::channel(StoreProgress::default()).0,
+        retry: Retry::default(),
+        knows_state: true,
+    }
 }
 
 /// Waits for the writer's answer to a ticket.
@@ -197,7 +242,7 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
     // Tickets answered meanwhile cause no attempt.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
-        let ticket = write_queue.submit(None, document(1, 1, 1), false);
+        let ticket = write_queue.submit(None, document(1, 1, 1));
         assert_eq!(answer(&store, ticket).failures, 1);
     }
     std::fs::remove_file(&state).unwrap();
@@ -237,6 +282,7 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     let mut store = store.unwrap();
     // Cached pages may not have been read again: then the start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
+    assert_eq!(found.states.len(), 1, "the state does not depend on it");
     let ticket = learn(&mut store, 10.0);
     assert!(answer(&store, ticket).works);
     store.finish(&monitor, Timestamp::from_secs(11.0));
@@ -280,7 +326,7 @@ fn reasons(folder: &Path) -> Vec<String> {
 
 #[test]
 fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
-    const ASIDE: &str = "database, set aside earlier";
+    const ASIDE: &str = "state set aside earlier";
     let place = tempfile::tempdir().unwrap();
     let open = || {
         let (store, found) =
@@ -291,43 +337,24 @@ fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
     let finish = |store: Store, seconds: f64| store.finish(&at(seconds), Timestamp::from_secs(seconds));
     finish(open().0, 1.0);
     let (store, found) = open();
-    assert_eq!(states(&found), [(DATABASE_SOURCE, 1.0)]);
+    assert_eq!(states(&found), [(STATE_SOURCE, 1.0)]);
     store.set_state_aside("snapshot is of 4 cells", Timestamp::from_secs(2.0));
     finish(store, 2.0);
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
-    assert_eq!(states(&found), [(DATABASE_SOURCE, 2.0), (ASIDE, 1.0)]);
+    assert_eq!(states(&found), [(STATE_SOURCE, 2.0), (ASIDE, 1.0)]);
     // It stays, whatever the number of later states.
     finish(store, 3.0);
     let (store, found) = open();
-    assert_eq!(states(&found), [(DATABASE_SOURCE, 3.0), (ASIDE, 1.0)]);
+    assert_eq!(states(&found), [(STATE_SOURCE, 3.0), (ASIDE, 1.0)]);
     // The edit was undone: they change places.
     store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
     finish(store, 4.0);
     let (store, found) = open();
-    assert_eq!(states(&found), [(DATABASE_SOURCE, 4.0), (ASIDE, 3.0)]);
+    assert_eq!(states(&found), [(STATE_SOURCE, 4.0), (ASIDE, 3.0)]);
     drop(found);
     finish(store, 5.0);
     // It belongs to the pack.
     replace_pack(place.path()).unwrap();
     assert_eq!(states(&open().1), []);
-}
-
-#[test]
-fn a_state_of_another_version_is_reported_and_not_overwritten() {
-    let place = tempfile::tempdir().unwrap();
-    let path = place.path().join(DATABASE);
-    let now = document(1, 1, 1).stamp;
-    let mut database = Database::open(&path, &now, RowLimits::SMALL).unwrap();
-    let parts = JsonParts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
-    database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
-    drop(database);
-    let (store, found) =
-        Store::open(&PlaceSetting::At(place.path().to_owned()), &config().store, &VehicleIdentity::default()).unwrap();
-    assert!(!found.works && found.states.is_empty());
-    store.unwrap().finish(&at(1.0), Timestamp::from_secs(1.0));
-    assert_eq!(reasons(place.path()), ["state_unfit"]);
-    let database = Database::open(&path, &now, RowLimits::SMALL).unwrap();
-    let kept = "SELECT count(*) FROM state WHERE slot IN (0, 10)";
-    assert_eq!(database.connection().query_row(kept, [], |row| row.get::<_, i64>(0)).unwrap(), 2);
 }

@@ -1,8 +1,8 @@
-//! The thread that writes the database, and what it shares with the loop.
+//! The thread that writes the disk, and what it shares with the loop.
 //!
-//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits it in one
-//! transaction and reports up to which ticket everything is on the disk. It retries a failing disk with a growing pause;
-//! until then every ticket is answered at once, as failed.
+//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits the rows, then writes the
+//! state, and reports up to which ticket everything is on the disk. It retries a failing disk with a growing pause; until then
+//! every ticket is answered at once, as failed. A database that fails does not keep the state from being written.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,20 +10,18 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 use super::backlog::Backlog;
-use super::database::{Database, is_damage};
-use super::document::StateDocument;
-use super::folder::{Folder, OpenedDatabase};
+use super::database::{Database, RowLimits, is_damage};
+use super::folder::Folder;
 use super::reserve::Reserve;
 use super::rows::{HistoryRow, RowBatch};
+use super::segments::NS_PER_DAY;
 use super::stamp::{BootId, Stamp};
-use super::state_slots::StateRecord;
+use super::state_files::{StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Nanoseconds in a day.
-const NS_PER_DAY: i64 = 86_400_000_000_000;
 /// Longest pause: a working disk is found within this.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
@@ -42,6 +40,10 @@ pub struct StoreProgress {
     pub commits: u64,
     /// Attempts that failed.
     pub failures: u64,
+    /// Size of the state that was written last, bytes.
+    pub state_bytes: u64,
+    /// Number of the connected pack in the history; 0 = not known.
+    pub pack: i64,
 }
 
 /// Rows and state on their way from the loop to the writer.
@@ -55,7 +57,6 @@ pub(super) struct WriteQueue {
 struct QueueState {
     backlog: Backlog,
     state: Option<StateDocument>,
-    exact: bool,
     /// The next state must not overwrite the stored one.
     sets_aside: bool,
     ticket: u64,
@@ -68,7 +69,6 @@ struct QueueState {
 struct PendingWrite {
     batches: Vec<RowBatch>,
     state: Option<StateDocument>,
-    exact: bool,
     sets_aside: bool,
     ticket: u64,
     stop: bool,
@@ -80,12 +80,11 @@ impl WriteQueue {
     }
 
     /// Queues rows and their state; returns the ticket of the commit that will contain both.
-    pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument, exact: bool) -> u64 {
+    pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
         // A later state contains the earlier ones.
         queue.state = Some(state);
-        queue.exact |= exact;
         queue.ticket += 1;
         queue.wanted = true;
         self.wake.notify_one();
@@ -128,8 +127,8 @@ impl WriteQueue {
         let state = queue.state.take();
         // Rows are written with their state.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
-        let (exact, sets_aside) = (std::mem::take(&mut queue.exact), std::mem::take(&mut queue.sets_aside));
-        PendingWrite { batches, state, exact, sets_aside, ticket: queue.ticket, stop: queue.stop }
+        let sets_aside = std::mem::take(&mut queue.sets_aside);
+        PendingWrite { batches, state, sets_aside, ticket: queue.ticket, stop: queue.stop }
     }
 
     fn put_back(&self, batches: Vec<RowBatch>, state: Option<StateDocument>) {
@@ -145,11 +144,9 @@ pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
     /// Which vehicle the history is of.
     pub(super) vehicle: VehicleIdentity,
-    /// Half-cycles older than this are deleted, years.
-    pub(super) keep_years: Option<f64>,
-    /// The open database has the vehicle.
-    pub(super) is_vehicle_noted: bool,
+    pub(super) limits: RowLimits,
     pub(super) folder: Folder,
+    pub(super) state_files: StateFiles,
     /// Space for a full disk.
     pub(super) reserve: Reserve,
     /// The day, UTC since 1970, for which the chain's end is in the log.
@@ -158,14 +155,8 @@ pub(super) struct Writer {
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<StoreProgress>,
     pub(super) retry: Retry,
-    /// Commits done.
-    pub(super) commits: u64,
-    /// Attempts that failed.
-    pub(super) failures: u64,
-    /// The daemon started with the state of the database, or the database had none.
+    /// The daemon has read the folder's states.
     pub(super) knows_state: bool,
-    /// The next state must not overwrite the stored one.
-    pub(super) sets_aside: bool,
 }
 
 /// The time of the next attempt after a failure.
@@ -193,21 +184,20 @@ impl Writer {
         self.reserve.make();
         loop {
             let work = self.write_queue.take(self.retry.at);
-            let PendingWrite { batches, state, exact, sets_aside, ticket, stop } = work;
-            self.sets_aside |= sets_aside;
+            let PendingWrite { batches, state, sets_aside, ticket, stop } = work;
+            if sets_aside {
+                self.state_files.set_aside();
+            }
             // The last attempt before the end does not wait for the pause, nor does one that the reserve may help.
             let is_urgent = stop || (!batches.is_empty() && self.reserve.is_usable());
-            let works = if self.retry.is_due() || is_urgent {
-                self.write(batches, state, exact)
+            let mut progress = *self.progress.borrow();
+            progress.works = if self.retry.is_due() || is_urgent {
+                self.write(batches, state, &mut progress)
             } else {
                 self.write_queue.put_back(batches, state);
                 false
             };
-            let before = self.progress.borrow().file_bytes;
-            let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let has_room = self.reserve.is_whole();
-            let (commits, failures) = (self.commits, self.failures);
-            let progress = StoreProgress { ticket, works, has_room, file_bytes, commits, failures };
+            (progress.ticket, progress.has_room) = (ticket, self.reserve.is_whole());
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
@@ -215,33 +205,31 @@ impl Writer {
         }
     }
 
-    /// Writes one transaction; on failure everything waits for the next. Without a state there is nothing to write, but a
+    /// Writes rows and state; what fails waits for the next attempt. Without a state there is nothing to write, but a
     /// database that could not be opened is opened again.
-    fn write(&mut self, batches: Vec<RowBatch>, state: Option<StateDocument>, exact: bool) -> bool {
+    fn write(
+        &mut self,
+        mut batches: Vec<RowBatch>,
+        state: Option<StateDocument>,
+        progress: &mut StoreProgress,
+    ) -> bool {
         let begun = Instant::now();
+        let is_learned = !batches.is_empty();
         let written = match &state {
-            Some(document) => self.commit(&batches, document, exact).or_else(|error| {
-                if batches.is_empty() {
-                    return Err(error);
-                }
-                // What is learned is tried again at once: with the reserve's space, or because space has come back.
-                self.reserve.release_if_full();
-                self.commit(&batches, document, exact)
-            }),
+            Some(document) => self.commit_urgently(&mut batches, document).map(|bytes| progress.state_bytes = bytes),
             None if self.retry.pause.is_none() => return true,
-            None => self.reopen(&Stamp::now(Timestamp::ZERO, BootId::current())).map(|database| {
-                self.database = Some(database);
-            }),
+            None => self.open(&Stamp::now(Timestamp::ZERO, BootId::current())).map(drop),
         };
         match written {
             Ok(()) => {
-                tracing::debug!(took = ?begun.elapsed(), batches = batches.len(), "state stored");
+                tracing::debug!(took = ?begun.elapsed(), is_learned, "state stored");
                 if self.retry.pause.is_some() {
                     tracing::info!(folder = %self.folder, "state and history are written again");
                 }
                 self.retry = Retry::default();
-                self.commits += u64::from(state.is_some());
-                self.write_queue.lock().backlog.commit();
+                progress.commits += u64::from(state.is_some());
+                progress.file_bytes = self.folder.database_bytes();
+                progress.pack = self.database.as_ref().map_or(progress.pack, Database::pack);
                 self.reserve.restore();
                 true
             }
@@ -249,7 +237,7 @@ impl Writer {
                 if self.retry.pause.is_none() {
                     tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
                 }
-                self.failures += 1;
+                progress.failures += 1;
                 self.retry.after_failure();
                 self.write_queue.put_back(batches, state);
                 false
@@ -257,43 +245,60 @@ impl Writer {
         }
     }
 
-    pub(super) fn commit(&mut self, batches: &[RowBatch], document: &StateDocument, exact: bool) -> Result<(), String> {
-        let record = StateRecord::new(document, exact, self.sets_aside)?;
-        let mut database = match self.database.take() {
-            Some(database) => database,
-            None => self.reopen(&document.stamp)?,
-        };
-        if !self.is_vehicle_noted {
-            database.set_vehicle(&self.vehicle).map_err(|error| error.to_string())?;
-            self.is_vehicle_noted = true;
-        }
-        if batches.is_empty() {
-            database.set_horizon_ns(self.keep_years.and_then(|years| document.stamp.years_ago_ns(years)));
-        }
-        // Opening it may have found a state to set aside.
-        let record = StateRecord { sets_aside: self.sets_aside, ..record };
-        match database.commit(batches, Some(record)) {
-            Ok(()) => {
-                self.sets_aside = false;
-                self.log_head(&database, &document.stamp);
-                self.database = Some(database);
-                Ok(())
+    /// As [`Writer::commit`]; what is learned is tried again at once, as often as the reserve gives space, and once without it:
+    /// space may have come back, and a damaged database is set aside at the second attempt.
+    fn commit_urgently(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
+        let is_learned = !batches.is_empty();
+        let mut is_first = true;
+        loop {
+            let written = self.commit(batches, document);
+            let may_help = is_learned && (self.reserve.release_if_full() || std::mem::take(&mut is_first));
+            if written.is_ok() || !may_help {
+                return written;
             }
-            Err(error) if is_damage(&error) => {
-                drop(database);
-                // The next attempt replaces it.
-                self.folder.mark_damaged(&error.to_string());
-                Err(format!("database damaged: {error}"))
-            }
-            // A connection that failed is opened again: its file may have been deleted.
-            Err(error) => Err(error.to_string()),
         }
     }
 
+    /// Commits the rows, which then leave `batches`, and writes the state. Returns the size of the state.
+    pub(super) fn commit(&mut self, batches: &mut Vec<RowBatch>, document: &StateDocument) -> Result<u64, String> {
+        let rows = self.commit_rows(batches, &document.stamp);
+        if rows.is_ok() {
+            batches.clear();
+            self.write_queue.lock().backlog.commit();
+        } else if !self.knows_state {
+            // The folder may hold a state that nobody has read.
+            return rows.map(|()| 0);
+        }
+        let mut document = document.clone();
+        if let Some(database) = &self.database {
+            (document.pack, document.history_rows) = (database.pack(), database.rows());
+        }
+        let bytes = self.state_files.write(document);
+        rows.and(bytes)
+    }
+
+    fn commit_rows(&mut self, batches: &[RowBatch], now: &Stamp) -> Result<(), String> {
+        let limits = self.limits;
+        let database = self.open(now)?;
+        let written = if batches.is_empty() { database.apply(&limits, now) } else { database.commit(batches) };
+        if let Err(error) = written {
+            // A connection that failed is opened again: its file may have been deleted.
+            self.database = None;
+            if is_damage(&error) {
+                self.folder.mark_damaged(&error.to_string());
+            }
+            return Err(error.to_string());
+        }
+        self.log_head(now);
+        Ok(())
+    }
+
     /// Logs the chain's end with each day's first commit: a chain that was written again does not fit it.
-    fn log_head(&mut self, database: &Database, now: &Stamp) {
+    fn log_head(&mut self, now: &Stamp) {
         let day = now.wall_ns.div_euclid(NS_PER_DAY);
-        if self.head_day.replace(day) != Some(day) {
+        if let Some(database) = &self.database
+            && self.head_day.replace(day) != Some(day)
+        {
             let (rows, hash) = database.head();
             tracing::info!(
                 rows,
@@ -303,22 +308,34 @@ impl Writer {
         }
     }
 
+    /// The database, opened where it is not open.
+    fn open(&mut self, now: &Stamp) -> Result<&mut Database, String> {
+        let database = match self.database.take() {
+            Some(database) => database,
+            None => self.reopen(now)?,
+        };
+        Ok(self.database.insert(database))
+    }
+
     fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
-        self.is_vehicle_noted = false;
-        let opening = self.folder.open(now).map_err(|error| error.to_string())?;
-        let OpenedDatabase { mut database, mut rows, state, is_unreadable, .. } = opening;
-        self.sets_aside |= is_unreadable;
-        if !self.knows_state && state.is_some() {
-            // The daemon started without it because the disk came too late. It is kept for the user.
-            self.sets_aside = true;
-            tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
-            rows.push(HistoryRow::Own { reason: "state_too_late", detail: "set aside".to_owned() });
+        let pack = self.progress.borrow().pack;
+        let (mut database, mut rows) = self.folder.open(now, pack).map_err(|error| error.to_string())?;
+        if !self.knows_state {
+            let (files, found) = StateFiles::open(self.folder.path());
+            self.state_files = files;
+            rows.extend(found.faults);
+            if found.newest.is_some() {
+                // The daemon started without it because the disk came too late. It is kept for the user.
+                self.state_files.set_aside();
+                tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
+                rows.push(HistoryRow::Own { reason: "state_too_late", detail: "set aside".to_owned() });
+            }
         }
+        database
+            .set_vehicle(&self.vehicle)
+            .and_then(|()| database.commit(&[RowBatch { stamp: *now, rows }]))
+            .map_err(|error| error.to_string())?;
         self.knows_state = true;
-        if !rows.is_empty() {
-            let batch = RowBatch { stamp: *now, rows };
-            database.commit(&[batch], None).map_err(|error| error.to_string())?;
-        }
         Ok(database)
     }
 }

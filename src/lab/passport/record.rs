@@ -90,10 +90,7 @@ impl Record {
     /// When the file cannot be read, or its chained rows were changed.
     pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         if let Some(broken) = reader.verify()?.broken {
-            return Err(format!(
-                "the history was changed: row {} is not as it was written, no passport is made of it",
-                broken.row
-            ));
+            return Err(format!("the history was changed: {broken}, no passport is made of it"));
         }
         // The state before the rows: a daemon may add some in between.
         let state = reader.dated_snapshot().map(|(at, state)| (at, Box::new(state)));
@@ -110,7 +107,7 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles of a store with what was counted when they were written. They are not in the hash chain.
+    /// Compares the half-cycles of a store with what was counted when they were written.
     /// The state's own sums stand for rows that the store deleted, if the state is as old as the rows.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
@@ -129,7 +126,7 @@ impl Record {
         match self.snapshot().and_then(Snapshot::throughputs).filter(|_| is_whole) {
             Some(sums) => sums.into_iter().enumerate().for_each(|(index, sum)| self.cell(index).moved = sum),
             None => self.note_gap(format!(
-                "{deleted} half-cycles were deleted from the store (store.max_half_cycles, store.keep_years)"
+                "{deleted} half-cycles were deleted from the store (store.max_rows, store.keep_years)"
             )),
         }
     }

@@ -41,13 +41,11 @@ impl Config {
 /// How state and history are kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoreConfig {
-    /// Period of the state's checkpoints, s.
+    /// Least period of the state's checkpoints, s.
     pub checkpoint_s: f64,
-    /// Half-cycles kept, one row per cell each; beyond, the oldest are thinned.
-    pub max_half_cycles: u32,
-    /// Capacities, loss modes, remaining lives, cell models, alarms and resets kept; beyond, the oldest are thinned.
-    pub max_chained_rows: u32,
-    /// Half-cycles older than this are deleted, years; `None` = whatever their age, they are kept.
+    /// Rows of the history kept; beyond, the oldest segments are deleted.
+    pub max_rows: u32,
+    /// Rows older than this are deleted, years; `None` = whatever their age, they are kept.
     pub keep_years: Option<f64>,
 }
 

@@ -114,12 +114,8 @@ fn read_config<T>(
     };
     let monitor = monitor::monitor(&raw, model?, modules, &ranges, traffic)?;
     let store = raw.store.as_ref()?;
-    let store = StoreConfig {
-        checkpoint_s: store.checkpoint_s,
-        max_half_cycles: store.max_half_cycles,
-        max_chained_rows: store.max_chained_rows,
-        keep_years: store.keep_years,
-    };
+    let store =
+        StoreConfig { checkpoint_s: store.checkpoint_s, max_rows: store.max_rows, keep_years: store.keep_years };
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?;
     let vehicle = VehicleIdentity { name: vehicle.name.clone(), id: vehicle.id.clone(), pack: vehicle.pack.clone() };

@@ -1,7 +1,6 @@
 //! What is left of a store whose states are lost, and what must not come back.
 
 use super::folder::Folder;
-use super::retention::RowLimits;
 use super::rows::tests::{alarm, capacity};
 use super::*;
 use crate::alarm::{Change, Selector};
@@ -15,9 +14,11 @@ fn replayed_store() -> (tempfile::TempDir, Snapshot) {
     (place, end)
 }
 
-fn change(place: &Path, sql: &str) {
-    let connection = rusqlite::Connection::open(place.join("state").join(DATABASE)).unwrap();
-    assert!(connection.execute(sql, []).unwrap() > 0, "{sql}");
+/// Damages both states.
+fn without_states(place: &Path) {
+    for name in state_files::FILES {
+        std::fs::write(place.join("state").join(name), "nothing").unwrap();
+    }
 }
 
 fn open(place: &Path) -> (Store, StoredStates) {
@@ -29,9 +30,7 @@ fn open(place: &Path) -> (Store, StoredStates) {
 #[test]
 fn without_a_good_state_a_start_continues_from_the_capacities_in_the_history() {
     let (place, end) = replayed_store();
-    for table in state_slots::COPIES {
-        change(place.path(), &format!("UPDATE {table} SET bytes = zeroblob(length)"));
-    }
+    without_states(place.path());
     let (_store, found) = open(place.path());
     assert!(found.states.is_empty() && !found.works);
     assert_eq!(found.learned.len(), 1);
@@ -46,19 +45,19 @@ fn without_a_good_state_a_start_continues_from_the_capacities_in_the_history() {
 }
 
 #[test]
-fn a_damaged_row_of_the_history_is_not_learned_from() {
+fn a_damaged_day_of_the_history_is_not_learned_from() {
     let (place, _) = replayed_store();
-    for table in state_slots::COPIES {
-        change(place.path(), &format!("DELETE FROM {table}"));
-    }
-    let learned = || {
-        let mut folder = Folder::new(place.path().join("state"), RowLimits::SMALL);
-        folder.open(&document(1, 1, 1).stamp).unwrap().learned[0]
-    };
-    let good = learned();
-    change(place.path(), "UPDATE capacity SET capacity_ah = 9.9 WHERE seq = (SELECT max(seq) FROM capacity)");
-    let earlier = learned();
-    assert!(earlier.capacity.mean < 9.0 && earlier != good, "{earlier:?}");
+    without_states(place.path());
+    let mut folder = Folder::new(place.path().join("state"));
+    let mut database = folder.open(&document(1, 1, 1).stamp, 0).unwrap().0;
+    let good = database.learned().unwrap();
+    assert_eq!(good.len(), 1);
+    let rows = vec![HistoryRow::Event(capacity(0, Some(9.0), 9.0))];
+    database.commit(&[RowBatch { stamp: document(1, 1, 1_800_000_000).stamp, rows }]).unwrap();
+    assert_ne!(database.learned().unwrap(), good);
+    let change = "UPDATE capacity SET capacity_ah = 9.9 WHERE seq = (SELECT max(seq) FROM capacity)";
+    database.connection().execute(change, []).unwrap();
+    assert_eq!(database.learned().unwrap(), good);
 }
 
 #[test]
@@ -78,15 +77,13 @@ fn learned_values_of_other_cells_or_impossible_ones_change_nothing() {
 }
 
 #[test]
-fn the_state_of_the_old_pack_does_not_come_back_with_a_salvage() {
+fn the_state_of_the_old_pack_does_not_come_back_with_a_lost_history() {
     let (place, _) = replayed_store();
     let state = place.path().join("state");
     assert_eq!(replace_pack(&state).unwrap(), 2);
-    let mut folder = Folder::new(state, RowLimits::SMALL);
-    folder.mark_damaged("for the test");
-    let opening = folder.open(&document(1, 1, 1).stamp).unwrap();
-    assert!(opening.state.is_none() && opening.learned.is_empty());
-    assert_eq!(opening.database.counts().packs, 2);
+    std::fs::write(state.join(DATABASE), "nothing").unwrap();
+    let (_store, found) = open(place.path());
+    assert!(found.states.is_empty() && found.learned.is_empty());
 }
 
 #[test]
@@ -114,57 +111,11 @@ fn a_command_is_committed_although_its_alarm_flickers() {
 }
 
 #[test]
-fn a_history_that_was_written_again_does_not_fit_what_was_noted() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(DATABASE);
-    let write = |ah: f64, rows: usize| {
-        let _ = std::fs::remove_file(&path);
-        let mut database = Database::open(&path, &document(1, 1, 1).stamp, RowLimits::SMALL).unwrap();
-        for _ in 0..rows {
-            let rows = vec![HistoryRow::Event(capacity(0, Some(2.0), ah))];
-            database.commit(&[RowBatch { stamp: document(1, 1, 1).stamp, rows }], None).unwrap();
-        }
-        let (rows, hash) = database.head();
-        NotedHead { rows, hash }
-    };
-    let contradiction = |noted: &NotedHead| HistoryReader::open(folder.path()).unwrap().contradiction(noted).unwrap();
-    let noted = write(1.9, 3);
-    assert_eq!(format!("{}:{}", noted.rows, noted.hash).parse(), Ok(noted.clone()));
-    assert_eq!(contradiction(&noted), None);
-    write(1.9, 5);
-    assert_eq!(contradiction(&noted), None, "it has grown");
-    write(1.8, 5);
-    assert!(HistoryReader::open(folder.path()).unwrap().verify().unwrap().broken.is_none());
-    assert!(contradiction(&noted).unwrap().contains("written again"));
-    write(1.9, 2);
-    assert!(contradiction(&noted).unwrap().contains("no row 3"));
-    for text in ["", "3", "3:12", ":", "-1:00", &format!("x:{}", noted.hash)] {
-        assert!(text.parse::<NotedHead>().is_err(), "{text}");
-    }
-}
-
-#[test]
 fn the_end_of_the_chain_is_logged_with_the_first_commit_of_each_day() {
     // 2027-01-15T00:00:00Z.
     const MIDNIGHT_S: i64 = 1_799_971_200;
     let place = tempfile::tempdir().unwrap();
-    let (progress, _) = watch::channel(StoreProgress::default());
-    let mut writer = Writer {
-        write_queue: Arc::default(),
-        vehicle: VehicleIdentity::default(),
-        is_vehicle_noted: false,
-        reserve: Reserve::new(place.path()),
-        head_day: None,
-        keep_years: None,
-        folder: Folder::new(place.path().to_owned(), RowLimits::SMALL),
-        database: None,
-        progress,
-        retry: Retry::default(),
-        commits: 0,
-        failures: 0,
-        knows_state: true,
-        sets_aside: false,
-    };
+    let mut writer = writer(place.path());
     let log = place.path().join("log");
     let file = Arc::new(std::fs::File::create(&log).unwrap());
     let subscriber = tracing_subscriber::fmt().with_writer(file).with_ansi(false).finish();
@@ -172,7 +123,9 @@ fn the_end_of_the_chain_is_logged_with_the_first_commit_of_each_day() {
     let mut logged = |from_midnight_s: i64| {
         let state = document(1, 100_000 + from_midnight_s, MIDNIGHT_S + from_midnight_s);
         let batch = RowBatch { stamp: state.stamp, rows: vec![HistoryRow::Event(capacity(0, Some(2.0), 1.9))] };
-        writer.commit(&[batch], &state, true).unwrap();
+        let mut batches = vec![batch];
+        writer.commit(&mut batches, &state).unwrap();
+        assert!(batches.is_empty());
         let text = std::fs::read_to_string(&log).unwrap();
         text[std::mem::replace(&mut seen, text.len())..].to_owned()
     };

@@ -117,13 +117,11 @@ section! {
 section! {
     /// State and history on disk (`run --state`). Learned values are stored when they are announced, whatever is set here.
     Store at "store" {
-        /// Period of the checkpoints of the running state: a power cut loses at most this much of it (a restart of the service loses a second). Each writes 5 to 9 kB for a pack of 96 cells.
+        /// Least period of the checkpoints of the running state: a power cut loses at most this much of it (a restart of the service loses a second). Each writes the whole state, some 70 kB for a pack of 96 cells; the period is longer where more than 15 MB a day would be written, 7 minutes for such a pack.
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
-        /// Half-cycles kept, one per cell each. Beyond this number every second transition of the older half is deleted, as often as needed. The default holds a year of ten half-cycles a day of 50 cells, in some 15 MB.
-        max_half_cycles: u32, "", Between(1000.0, 1e8), Default("200000");
-        /// Capacities, loss modes, remaining lives, cell models, alarms and resets kept: at most one of each kind per cell and hour, and changes of the cell model and of alarms. Beyond this number rows before the latest half are thinned: of those just before it one of four stays, of those before twice as many one of sixteen, and so on. The first and the last row of every cell and pack stay, the first hundred occurrences of an alarm and changes of the cell model, and all resets but those of filters, also where these are more than the number. The default holds ten years of a car of 96 cells in some 80 MB.
-        max_chained_rows: u32, "", Between(10_000.0, 1e8), Default("500000");
-        /// Half-cycles older than this are deleted, a few at each checkpoint; capacities, cell models, alarms and resets are kept, whatever their age. The age is that on the computer's clock, and nothing is deleted while no hardware clock or time server confirms that clock. Without it: only `max_half_cycles` bounds them.
+        /// Rows of the history kept: half-cycles, capacities, loss modes, remaining lives, cell models, alarms and resets. Beyond this number the oldest segment, a day or some 10000 rows, is deleted at a checkpoint. The default holds a year of ten half-cycles a day of 96 cells, in some 100 MB.
+        max_rows: u32, "", Between(10_000.0, 1e8), Default("1000000");
+        /// Rows of the history older than this are deleted, a segment at a checkpoint. The age is that on the computer's clock, and nothing is deleted while no hardware clock or time server confirms that clock. Without it: only `max_rows` bounds them.
         keep_years: Option<f64>, "years", Between(0.1, 100.0), Optional;
     }
 }

@@ -1,0 +1,86 @@
+//! Decides when the next checkpoint of the state is due: a checkpoint writes the whole state, and flash wears.
+//!
+//! In: the bytes of every state that is written, with its time. Every state counts, so alarms that are committed put off the
+//! checkpoints. A pack of 96 cells (70 kB) gets a checkpoint every 7 minutes, one of 12 cells every minute.
+
+use crate::quantity::Timestamp;
+
+/// States written in a day, bytes: of the 20 MB that may be written, the history and the file system take the rest.
+const BYTES_PER_DAY: f64 = 15e6;
+/// Written beyond that at once, bytes, when alarms change often after a quiet time.
+const MAX_AHEAD_BYTES: f64 = 3e6;
+
+/// See the module.
+#[derive(Debug)]
+pub(super) struct CheckpointSchedule {
+    /// Least period, s.
+    period_s: f64,
+    /// Time of the last state.
+    last: Option<Timestamp>,
+    /// Bytes written beyond the daily rate, at that time.
+    ahead_bytes: f64,
+}
+
+impl CheckpointSchedule {
+    /// One of this least period, s.
+    pub(super) fn new(period_s: f64) -> Self {
+        Self { period_s, last: None, ahead_bytes: 0.0 }
+    }
+
+    /// Whether a checkpoint is due, with a least period of `period_s` where that is longer. The first is a period after the start.
+    pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
+        now.since(*self.last.get_or_insert(now)) >= self.period_s.max(period_s) && self.ahead_at(now) <= 0.0
+    }
+
+    /// Whether alarms that change often may be committed at once.
+    pub(super) fn has_room(&self, now: Timestamp) -> bool {
+        self.ahead_at(now) < MAX_AHEAD_BYTES
+    }
+
+    /// Notes a state of this size.
+    pub(super) fn note_written(&mut self, now: Timestamp, bytes: u64) {
+        self.ahead_bytes = self.ahead_at(now) + bytes as f64;
+        self.last = Some(now);
+    }
+
+    fn ahead_at(&self, now: Timestamp) -> f64 {
+        let elapsed_s = self.last.map_or(0.0, |last| now.since(last).max(0.0));
+        (self.ahead_bytes - elapsed_s * BYTES_PER_DAY / 86_400.0).max(0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Checkpoints and bytes of a day in which states of this size are committed every so many seconds as well.
+    fn day(bytes: u64, commit_every_s: Option<u32>) -> (u32, u64) {
+        let (mut schedule, mut checkpoints, mut written) = (CheckpointSchedule::new(60.0), 0, 0);
+        for second in 0..86_400_u32 {
+            let now = Timestamp::from_secs(f64::from(second));
+            let is_due = schedule.is_due(now, 0.0);
+            checkpoints += u32::from(is_due);
+            if is_due || commit_every_s.is_some_and(|every_s| second % every_s == 0 && schedule.has_room(now)) {
+                schedule.note_written(now, bytes);
+                written += bytes;
+            }
+        }
+        (checkpoints, written)
+    }
+
+    #[test]
+    fn a_large_state_is_written_less_often() {
+        assert_eq!(day(9_000, None).0, 1439);
+        let (checkpoints, written) = day(70_000, None);
+        assert!((205..=215).contains(&checkpoints) && written <= 15_100_000, "{checkpoints}, {written} bytes");
+    }
+
+    #[test]
+    fn commits_of_learned_values_count_and_put_checkpoints_off() {
+        let (checkpoints, written) = day(70_000, Some(3600));
+        assert!((180..=190).contains(&checkpoints) && written <= 15_100_000, "{checkpoints}, {written} bytes");
+        // Alarms that flicker.
+        let (checkpoints, written) = day(70_000, Some(1));
+        assert!(checkpoints == 0 && written <= 18_100_000, "{checkpoints}, {written} bytes");
+    }
+}

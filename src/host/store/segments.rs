@@ -1,0 +1,367 @@
+//! Segments of the history: the rows of a day, or some 10,000 rows, chained by hash.
+//!
+//! Every row has a number, counted across the tables. The hash of a segment is the SHA-256 chain over its rows, which begins with
+//! the hash of the segment before. It shows a row that was changed, removed, inserted or moved; the number of segments, stored
+//! separately, shows segments that were cut off at the end. The oldest segments are deleted whole, and keep their hashes, so the
+//! rest still verifies. A person who can write the file can recompute the whole chain; a copy of its end kept elsewhere shows that
+//! too ([`contradiction`]).
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use rusqlite::types::Value;
+use rusqlite::{Connection, OptionalExtension, Row, params};
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+
+use super::backlog;
+use super::rows::HistoryTable;
+use super::stamp::{BootId, SANE_WALL_NS, Stamp};
+
+/// A SHA-256.
+pub(super) type Hash = [u8; 32];
+
+/// Nanoseconds in a day.
+pub(super) const NS_PER_DAY: i64 = 86_400_000_000_000;
+/// Rows after which a segment ends, with the batch that reaches them: deleting so many takes some 0.1 s.
+const MAX_ROWS: i64 = 10_000;
+
+/// A segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Segment {
+    /// Its number, from 1; 0 = before the first.
+    pub id: i64,
+    /// Its day on the wall clock, since 1970.
+    pub day: i64,
+    /// Number of its first row.
+    pub first: i64,
+    /// Number of its last row.
+    pub last: i64,
+    /// The moment of its last row.
+    pub last_moment: i64,
+    /// Half-cycles among its rows.
+    pub half_cycles: i64,
+    /// Whether its rows were deleted because of their number or age.
+    pub is_deleted: bool,
+    /// Hash of its last row.
+    pub hash: Hash,
+}
+
+/// Columns of a segment, in the order of [`Segment::of_row`].
+const COLUMNS: &str = "id, day, first, last, last_moment, half_cycles, deleted, hash";
+
+impl Segment {
+    /// What the first segment continues.
+    const START: Self =
+        Self { id: 0, day: 0, first: 1, last: 0, last_moment: 0, half_cycles: 0, is_deleted: false, hash: [0; 32] };
+
+    fn of_row(row: &Row<'_>) -> rusqlite::Result<Self> {
+        Ok(Self {
+            id: row.get(0)?,
+            day: row.get(1)?,
+            first: row.get(2)?,
+            last: row.get(3)?,
+            last_moment: row.get(4)?,
+            half_cycles: row.get(5)?,
+            is_deleted: row.get(6)?,
+            hash: row.get(7)?,
+        })
+    }
+
+    /// The newest segment.
+    pub(super) fn newest(connection: &Connection) -> rusqlite::Result<Self> {
+        let sql = format!("SELECT {COLUMNS} FROM segment ORDER BY id DESC LIMIT 1");
+        Ok(connection.query_row(&sql, [], Self::of_row).optional()?.unwrap_or(Self::START))
+    }
+
+    /// The segment for rows of this moment: this one, or a new one after it.
+    pub(super) fn at(self, connection: &Connection, stamp: &Stamp) -> rusqlite::Result<Self> {
+        let day = stamp.wall_ns.div_euclid(NS_PER_DAY);
+        if self.id > 0 && self.day == day && self.last < self.first + MAX_ROWS - 1 {
+            return Ok(self);
+        }
+        let next = Self { id: self.id + 1, day, first: self.last + 1, half_cycles: 0, is_deleted: false, ..self };
+        connection.execute("UPDATE meta SET segments = ?1", [next.id])?;
+        Ok(next)
+    }
+
+    /// Writes a row and appends it to the segment.
+    pub(super) fn write_row(
+        &mut self,
+        connection: &Connection,
+        table: HistoryTable,
+        moment: &[Value],
+        values: &[Value],
+    ) -> rusqlite::Result<()> {
+        self.last += 1;
+        self.hash = link(&self.hash, table, self.last, moment.iter().chain(values));
+        self.half_cycles += i64::from(table == HistoryTable::HalfCycle);
+        let places: String = (0..values.len()).map(|_| ", ?").collect();
+        let sql =
+            format!("INSERT INTO {} (seq, moment, {}) VALUES (?, ?{places})", table.name(), table.columns().join(", "));
+        let seq = Value::Integer(self.last);
+        let bound = std::iter::once(&seq).chain(moment.first()).chain(values);
+        connection.prepare_cached(&sql)?.execute(rusqlite::params_from_iter(bound)).map(drop)
+    }
+
+    /// Writes the segment itself, after its rows.
+    pub(super) fn write(&self, connection: &Connection) -> rusqlite::Result<()> {
+        let Self { id, day, first, last, last_moment, half_cycles, is_deleted, hash } = self;
+        connection
+            .prepare_cached(&format!("INSERT OR REPLACE INTO segment ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"))?
+            .execute(params![id, day, first, last, last_moment, half_cycles, is_deleted, hash])
+            .map(drop)
+    }
+
+    /// The hash of its row `last`, over the rows as they are stored.
+    fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
+        let mut rows: BTreeMap<(i64, HistoryTable), Vec<Value>> = BTreeMap::new();
+        // A damaged number must not fill the memory.
+        let last = last.min(self.first + MAX_ROWS + backlog::MAX_ROWS as i64);
+        for table in HistoryTable::ALL {
+            let sql = format!(
+                "SELECT r.seq, m.id, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r LEFT JOIN moment m ON m.id = \
+                 r.moment WHERE r.seq BETWEEN ?1 AND ?2",
+                table.columns().join(", r."),
+                table.name()
+            );
+            let mut statement = connection.prepare_cached(&sql)?;
+            let columns = 6 + table.columns().len();
+            let mut found = statement.query([self.first, last])?;
+            while let Some(row) = found.next()? {
+                let values = (1..columns).map(|index| row.get(index)).collect::<rusqlite::Result<_>>()?;
+                rows.insert((row.get(0)?, table), values);
+            }
+        }
+        Ok(rows.iter().fold(*before, |hash, ((seq, table), values)| link(&hash, *table, *seq, values)))
+    }
+}
+
+/// Hash of a row: of the one before, the table, the number, and every value with its type and length.
+fn link<'v>(before: &Hash, table: HistoryTable, seq: i64, values: impl IntoIterator<Item = &'v Value>) -> Hash {
+    let mut hasher = Sha256::new();
+    hasher.update(before);
+    hasher.update(table.name().as_bytes());
+    hasher.update([0]);
+    hasher.update(seq.to_le_bytes());
+    for value in values {
+        match value {
+            Value::Null => hasher.update([0]),
+            Value::Integer(whole) => {
+                hasher.update([1]);
+                hasher.update(whole.to_le_bytes());
+            }
+            Value::Real(real) => {
+                hasher.update([2]);
+                hasher.update(real.to_bits().to_le_bytes());
+            }
+            Value::Text(text) => update_bytes(&mut hasher, 3, text.as_bytes()),
+            Value::Blob(blob) => update_bytes(&mut hasher, 4, blob),
+        }
+    }
+    hasher.finalize().into()
+}
+
+fn update_bytes(hasher: &mut Sha256, tag: u8, bytes: &[u8]) {
+    hasher.update([tag]);
+    hasher.update((bytes.len() as u64).to_le_bytes());
+    hasher.update(bytes);
+}
+
+/// A hash in hexadecimal digits.
+pub(super) fn hex(hash: &[u8]) -> String {
+    hash.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// All segments, oldest first, each after the one before it.
+fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
+    let (mut before, mut pairs) = (Segment::START, Vec::new());
+    let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
+    for segment in statement.query_map([], Segment::of_row)? {
+        let segment = segment?;
+        pairs.push((before, segment));
+        before = segment;
+    }
+    Ok(pairs)
+}
+
+/// Deletes the rows of the oldest segment that has some if there are more than `max_rows` in all, or if it ended before
+/// `horizon_ns` of the wall clock. A segment that was written while the clock was not set is at least as old as those after it.
+pub(super) fn delete_oldest(
+    connection: &Connection,
+    newest: &Segment,
+    max_rows: i64,
+    horizon_ns: Option<i64>,
+) -> rusqlite::Result<()> {
+    let sql = format!("SELECT {COLUMNS} FROM segment WHERE NOT deleted AND id < ?1 ORDER BY id LIMIT 1");
+    let Some(oldest) = connection.prepare_cached(&sql)?.query_row([newest.id], Segment::of_row).optional()? else {
+        return Ok(());
+    };
+    let is_old = |horizon_ns: i64| {
+        connection
+            .prepare_cached(
+                "SELECT 1 FROM segment s JOIN moment m ON m.id = s.last_moment WHERE NOT s.deleted AND s.id < ?1 AND m.wall_ns < ?2 \
+                 AND (m.wall_ns >= ?3 OR m.boot = ?4)",
+            )?
+            .exists(params![newest.id, horizon_ns, SANE_WALL_NS, BootId::REPLAY.0])
+    };
+    if newest.last - oldest.first < max_rows && !horizon_ns.map_or(Ok(false), is_old)? {
+        return Ok(());
+    }
+    for table in HistoryTable::ALL {
+        connection.execute(&format!("DELETE FROM {} WHERE seq <= ?1", table.name()), [oldest.last])?;
+    }
+    connection.execute("DELETE FROM moment WHERE id <= ?1", [oldest.last_moment])?;
+    Segment { is_deleted: true, ..oldest }.write(connection)
+}
+
+/// The result of a check.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ChainReport {
+    /// Rows found good before the first segment that is not.
+    pub good_rows: i64,
+    /// Rows that were written.
+    pub rows: i64,
+    /// Those of them that the store has deleted since.
+    pub deleted_rows: i64,
+    /// Hash of the last row, to be noted elsewhere.
+    pub head: String,
+    /// The first segment that was changed; `None` = none was.
+    pub broken: Option<BrokenSegment>,
+}
+
+/// A segment in which a row was changed, is missing or was inserted.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct BrokenSegment {
+    /// Its number.
+    pub segment: i64,
+    /// Numbers of its first and last row.
+    pub rows: [i64; 2],
+    /// The hash that its rows give.
+    pub expected: String,
+    /// What the store has in its place.
+    pub found: String,
+}
+
+impl fmt::Display for BrokenSegment {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { segment, rows: [first, last], .. } = self;
+        write!(f, "rows {first} to {last} (segment {segment}) were changed")
+    }
+}
+
+/// Checks the chain, segment by segment.
+pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
+    let noted: i64 = connection.query_row("SELECT segments FROM meta", [], |row| row.get(0))?;
+    let mut report = ChainReport { good_rows: 0, rows: 0, deleted_rows: 0, head: String::new(), broken: None };
+    let mut newest = Segment::START;
+    for (before, segment) in pairs(connection)? {
+        if report.broken.is_none() {
+            report.broken = judge(connection, &before, &segment)?;
+        }
+        let rows = segment.last - before.last;
+        if segment.is_deleted {
+            report.deleted_rows += rows;
+        } else if report.broken.is_none() {
+            report.good_rows += rows;
+        }
+        newest = segment;
+    }
+    (report.rows, report.head) = (newest.last, hex(&newest.hash));
+    if report.broken.is_none() {
+        report.broken = judge_number(connection, &newest, noted, report.good_rows)?;
+    }
+    Ok(report)
+}
+
+/// What is wrong with the segment after `before`; `None` = nothing.
+fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqlite::Result<Option<BrokenSegment>> {
+    let Segment { id, first, last, is_deleted, hash, .. } = *segment;
+    let broken = |expected, found| Some(BrokenSegment { segment: id, rows: [first, last], expected, found });
+    // Segments are deleted from the oldest on.
+    let is_continued = id == before.id + 1 && first == before.last + 1 && last >= first;
+    if !is_continued || (is_deleted && !before.is_deleted && before.id > 0) {
+        let expected = format!("segment {} from row {} on", before.id + 1, before.last + 1);
+        let state = if is_deleted { ", deleted" } else { "" };
+        return Ok(broken(expected, format!("segment {id} from row {first} to {last}{state}")));
+    }
+    if is_deleted {
+        return Ok(None);
+    }
+    let expected = segment.hash_to(connection, &before.hash, last)?;
+    Ok(if expected == hash { None } else { broken(hex(&expected), hex(&hash)) })
+}
+
+/// Compares the number of segments and rows with those in the chain.
+fn judge_number(
+    connection: &Connection,
+    newest: &Segment,
+    noted: i64,
+    rows: i64,
+) -> rusqlite::Result<Option<BrokenSegment>> {
+    let counts: Vec<String> =
+        HistoryTable::ALL.iter().map(|table| format!("(SELECT count(*) FROM {})", table.name())).collect();
+    let stored: i64 = connection.query_row(&format!("SELECT {}", counts.join(" + ")), [], |row| row.get(0))?;
+    let of = |segments: i64, rows: i64| format!("{segments} segments, {rows} rows");
+    Ok((noted != newest.id || stored != rows).then(|| BrokenSegment {
+        segment: newest.id + 1,
+        rows: [newest.last + 1; 2],
+        expected: of(noted, rows),
+        found: of(newest.id, stored),
+    }))
+}
+
+/// Segments whose rows are as they were written, the newest first, at most `limit`.
+pub(super) fn intact(connection: &Connection, limit: usize) -> rusqlite::Result<Vec<Segment>> {
+    let mut intact = Vec::new();
+    for (before, segment) in pairs(connection)?.iter().rev().filter(|(_, segment)| !segment.is_deleted).take(limit) {
+        intact.extend(judge(connection, before, segment)?.is_none().then_some(*segment));
+    }
+    Ok(intact)
+}
+
+/// The chain's end as it was noted elsewhere, written `ROWS:HASH`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NotedHead {
+    /// Rows at that time.
+    pub rows: i64,
+    /// Hash of the last, 64 hexadecimal digits.
+    pub hash: String,
+}
+
+impl FromStr for NotedHead {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts = text.split_once(':').and_then(|(rows, hash)| Some((rows.parse().ok()?, hash.to_ascii_lowercase())));
+        let is_hash = |hash: &str| hash.len() == 64 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
+        match parts {
+            Some((rows, hash)) if rows >= 0 && is_hash(&hash) => Ok(Self { rows, hash }),
+            _ => Err("must be ROWS:HASH, a number and 64 hexadecimal digits".to_owned()),
+        }
+    }
+}
+
+/// What contradicts the chain's end as it was noted; `None` = nothing.
+pub(super) fn contradiction(connection: &Connection, noted: &NotedHead) -> rusqlite::Result<Option<String>> {
+    let NotedHead { rows, hash } = noted;
+    let pairs = pairs(connection)?;
+    let Some((before, segment)) = pairs.iter().find(|(_, segment)| (segment.first..=segment.last).contains(rows))
+    else {
+        return Ok((*rows != 0)
+            .then(|| format!("there is no row {rows}, which was noted: the history was written again or cut off")));
+    };
+    if segment.is_deleted && segment.last != *rows {
+        return Ok(Some(format!(
+            "row {rows}, which was noted, was deleted since: it cannot be compared; note a newer end"
+        )));
+    }
+    let found = if segment.is_deleted { segment.hash } else { segment.hash_to(connection, &before.hash, *rows)? };
+    let found = hex(&found);
+    Ok((found != *hash)
+        .then(|| format!("row {rows} has the hash {found}, noted was {hash}: the history was written again")))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,259 @@
+//! The stored state: two files next to the database, written in turn, so that damage or a power cut costs at most the newer one.
+//!
+//! | file | contents |
+//! | --- | --- |
+//! | `state-a.json.zst`, `state-b.json.zst` | the latest state and the one before it |
+//! | `state-aside.json.zst` | a state that could not be restored, for the first start at which it fits |
+//!
+//! A file is one zstd frame of JSON and a skippable frame with its SHA-256, so `zstdcat` prints the JSON and every flipped bit is
+//! found. It is written to a temporary name, synced and renamed, and the folder is synced: a state whose write returned survives a
+//! power cut. The newest state is the good file of the highest number.
+//!
+//! Numbers are stored to nine digits and six decimals (see [`rounded`]), which halves the files: some 70 kB for a pack of 96 cells.
+
+use std::fs::{self, File};
+use std::io::{self, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::ser::{CompactFormatter, Formatter};
+use sha2::{Digest, Sha256};
+
+use super::rows::HistoryRow;
+use super::stamp::Stamp;
+use crate::monitor::Snapshot;
+
+/// The format that this program reads and writes.
+pub(super) const FORMAT: u32 = 1;
+/// Names of the files.
+pub(super) const FILES: [&str; 2] = ["state-a.json.zst", "state-b.json.zst"];
+/// Name of a state that was set aside.
+pub(super) const ASIDE: &str = "state-aside.json.zst";
+/// Name of a file while it is written.
+const PART: &str = "state.json.zst.part";
+/// Words for a state that is set aside.
+pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which it fits";
+/// Compression level: an announcement waits for it. Level 19 saves a sixth and takes fifty times as long.
+const LEVEL: i32 = 1;
+/// Longest JSON, bytes: ten times the state of the largest pack.
+const MAX_JSON_BYTES: u64 = 64 << 20;
+/// Head of the frame with the hash: the magic number of a frame that zstd skips, and its length.
+const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
+
+/// A state, when it was taken, and what it belongs to.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct StateDocument {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// Counts the states that were written.
+    pub number: i64,
+    /// State folder it belongs to: two daemons may share a runtime folder.
+    pub folder: String,
+    /// Number of the pack that was connected; 0 = not known.
+    pub pack: i64,
+    /// Rows that the history had.
+    pub history_rows: i64,
+    /// When it was taken.
+    pub stamp: Stamp,
+    /// The core's state.
+    pub snapshot: Box<Snapshot>,
+}
+
+/// Why a state cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum StateFault {
+    /// Its file is not as it was written.
+    Damaged(String),
+    /// Another version of the program wrote it.
+    Unfit(String),
+}
+
+impl StateDocument {
+    /// Reads JSON.
+    pub(super) fn parse(json: &[u8]) -> Result<Self, StateFault> {
+        #[derive(Deserialize)]
+        struct Head {
+            format: u32,
+        }
+        let unfit = |error: serde_json::Error| StateFault::Unfit(format!("not a state: {error}"));
+        let Head { format } = serde_json::from_slice(json).map_err(unfit)?;
+        if format != FORMAT {
+            return Err(StateFault::Unfit(format!("format {format}, this program reads {FORMAT}")));
+        }
+        serde_json::from_slice(json).map_err(unfit)
+    }
+
+    /// Writes JSON to a temporary name and renames it. Does not sync: the file lies in memory.
+    pub(super) fn write_json(&self, path: &Path) -> io::Result<()> {
+        let part = path.with_extension("json.part");
+        fs::write(&part, serde_json::to_vec(self)?)?;
+        fs::rename(&part, path)
+    }
+
+    /// The bytes of its file.
+    ///
+    /// # Errors
+    /// When it could not be read back: a number that is not finite is written as `null`.
+    fn encode(&self) -> Result<Vec<u8>, String> {
+        let mut json = Vec::new();
+        self.serialize(&mut serde_json::Serializer::with_formatter(&mut json, Rounding(CompactFormatter)))
+            .map_err(|error| error.to_string())?;
+        if let Err(StateFault::Damaged(why) | StateFault::Unfit(why)) = Self::parse(&json) {
+            return Err(why);
+        }
+        let mut file = zstd::bulk::compress(&json, LEVEL).map_err(|error| error.to_string())?;
+        let hash = Sha256::digest(&file);
+        file.extend_from_slice(&HASH_HEAD);
+        file.extend_from_slice(&hash);
+        Ok(file)
+    }
+
+    /// Reads the bytes of a file.
+    fn decode(file: &[u8]) -> Result<Self, StateFault> {
+        let damaged = |why: &str| StateFault::Damaged(why.to_owned());
+        let (frame, hash) = file
+            .split_last_chunk::<32>()
+            .and_then(|(rest, hash)| Some((rest.strip_suffix(&HASH_HEAD)?, hash)))
+            .ok_or_else(|| damaged("it has no hash at its end"))?;
+        if Sha256::digest(frame)[..] != *hash {
+            return Err(damaged("its hash differs"));
+        }
+        let mut json = Vec::new();
+        zstd::Decoder::with_buffer(frame)
+            .and_then(|decoder| decoder.take(MAX_JSON_BYTES).read_to_end(&mut json))
+            .map_err(|error| StateFault::Damaged(error.to_string()))?;
+        Self::parse(&json)
+    }
+
+    /// Reads a file; `None` = there is none.
+    fn read(path: &Path) -> Result<Option<Self>, StateFault> {
+        match fs::read(path) {
+            Ok(file) => Self::decode(&file).map(Some),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(StateFault::Damaged(error.to_string())),
+        }
+    }
+}
+
+/// Writes numbers [`rounded`].
+struct Rounding(CompactFormatter);
+
+impl Formatter for Rounding {
+    fn write_f64<W: ?Sized + io::Write>(&mut self, writer: &mut W, value: f64) -> io::Result<()> {
+        self.0.write_f64(writer, rounded(value))
+    }
+}
+
+/// A number to nine digits, and to six decimals from 1,000 on. Whole numbers (identities) and large ones (times) stay exact.
+fn rounded(value: f64) -> f64 {
+    let text = match value.abs() {
+        size if value.fract() == 0.0 || size >= 1e9 => return value,
+        size if size < 1000.0 => format!("{value:.8e}"),
+        _ => format!("{value:.6}"),
+    };
+    text.parse().unwrap_or(value)
+}
+
+/// The files of a folder, as the next writes continue them.
+#[derive(Debug)]
+pub(super) struct StateFiles {
+    folder: PathBuf,
+    /// Place in [`FILES`] of the next state.
+    next: usize,
+    /// Number of the latest state.
+    number: i64,
+    /// Place of a state that the next write sets aside first.
+    aside: Option<usize>,
+}
+
+/// The states of a folder.
+#[derive(Debug, Default)]
+pub(super) struct FoundStates {
+    /// The newest good state.
+    pub newest: Option<StateDocument>,
+    /// The state that was set aside.
+    pub aside: Option<StateDocument>,
+    /// What is wrong with files, for the history.
+    pub faults: Vec<HistoryRow>,
+}
+
+impl StateFiles {
+    /// Those of a folder, which need not exist yet, and what they hold.
+    pub(super) fn open(folder: &Path) -> (Self, FoundStates) {
+        let mut files = Self { folder: folder.to_owned(), next: 0, number: 0, aside: None };
+        let mut found = FoundStates::default();
+        let mut report = |reason: &'static str, file: &str, why: String| {
+            tracing::error!(reason, file, error = why, "a stored state is not used");
+            found.faults.push(HistoryRow::Own { reason, detail: format!("{file}: {why}") });
+        };
+        for (place, name) in FILES.into_iter().enumerate() {
+            match StateDocument::read(&folder.join(name)) {
+                Ok(None) => {}
+                Ok(Some(document)) if document.number > files.number => {
+                    (files.number, files.next) = (document.number, 1 - place);
+                    found.newest = Some(document);
+                }
+                Ok(Some(_)) => {}
+                Err(StateFault::Damaged(why)) => report("state_damaged", name, format!("damaged: {why}")),
+                Err(StateFault::Unfit(why)) => {
+                    report("state_unfit", name, format!("{why}; {SET_ASIDE}"));
+                    files.aside = Some(place);
+                }
+            }
+        }
+        found.aside = StateDocument::read(&folder.join(ASIDE)).ok().flatten();
+        (files, found)
+    }
+
+    /// The next write keeps the newest state for the first start at which it fits.
+    pub(super) fn set_aside(&mut self) {
+        self.aside = Some(1 - self.next);
+    }
+
+    /// Writes a state over the older one; durable when it returns. Returns the size of the file.
+    pub(super) fn write(&mut self, document: StateDocument) -> Result<u64, String> {
+        let named = |name: &str, error: io::Error| format!("{}: {error}", self.folder.join(name).display());
+        let file = StateDocument { number: self.number + 1, ..document }.encode()?;
+        if let Some(place) = self.aside {
+            replace(&self.folder.join(FILES[place]), &self.folder.join(ASIDE)).map_err(|error| named(ASIDE, error))?;
+            (self.next, self.aside) = (place, None);
+        }
+        let (part, path) = (self.folder.join(PART), self.folder.join(FILES[self.next]));
+        File::create(&part)
+            .and_then(|mut part| {
+                part.write_all(&file)?;
+                part.sync_all()
+            })
+            .and_then(|()| replace(&part, &path))
+            .and_then(|()| File::open(&self.folder)?.sync_all())
+            .map_err(|error| {
+                // Frees its space.
+                let _ = fs::remove_file(&part);
+                named(FILES[self.next], error)
+            })?;
+        (self.number, self.next) = (self.number + 1, 1 - self.next);
+        Ok(file.len() as u64)
+    }
+}
+
+/// Deletes the states of a folder.
+pub(super) fn forget(folder: &Path) -> io::Result<()> {
+    for name in FILES.into_iter().chain([ASIDE]) {
+        match fs::remove_file(folder.join(name)) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+    }
+    File::open(folder)?.sync_all()
+}
+
+/// Renames a file over another, or over a folder of that name.
+fn replace(from: &Path, to: &Path) -> io::Result<()> {
+    if to.is_dir() {
+        fs::remove_dir_all(to)?;
+    }
+    fs::rename(from, to)
+}
+
+#[cfg(test)]
+mod tests;
