@@ -11,9 +11,6 @@ use crate::io::paths::short_names;
 use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
 use packwatch_host::failure::Failure;
 
-/// Most parts of the life: one per per cent.
-const MAX_PARTS: usize = 99;
-
 /// Arguments of `rul`.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -43,8 +40,9 @@ pub(crate) struct Args {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    if args.at.len() > MAX_PARTS {
-        return Err(Failure::new(format!("--at: {} parts, must be at most {MAX_PARTS}", args.at.len())));
+    // One per per cent.
+    if args.at.len() > 99 {
+        return Err(Failure::new(format!("--at: {} parts, must be at most 99", args.at.len())));
     }
     check_distinct(&args.files)?;
     let shown = if args.at.is_empty() {

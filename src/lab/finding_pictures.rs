@@ -9,8 +9,6 @@ use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Half of a 95 % interval, standard deviations.
-const OF_95: f64 = 1.96;
 /// Half the width of a bar, cells.
 const HALF_BAR: f64 = 0.3;
 
@@ -118,7 +116,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     let shown_of = |wanted: bool| {
         let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
             let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;
-            Some((cell as f64 + 1.0, shown.scale * size.mean, OF_95 * shown.scale * size.std()))
+            Some((cell as f64 + 1.0, shown.scale * size.mean, crate::OF_95 * shown.scale * size.std()))
         };
         cells.iter().enumerate().filter_map(of_one).collect::<Vec<_>>()
     };

@@ -239,13 +239,11 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
+        // Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
+        min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }
 }
-
-/// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
-const AGEING_SLOPE_V: [(f64, f64); 2] = [(0.0, 0.2), (0.9, 1.0)];
 
 fn check_range(records: &[Record]) -> Result<(), LabError> {
     let judged = records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);

@@ -26,3 +26,6 @@ pub mod score;
 pub mod single_cell;
 
 pub use packwatch_host::io::result_file::write_file;
+
+/// Half of a normal distribution's 95 % interval, standard deviations.
+const OF_95: f64 = 1.96;

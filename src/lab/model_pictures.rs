@@ -8,16 +8,12 @@ use crate::cell::{CellModel, ModelBands};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Shape};
 use crate::config::cell_model::{KnownBy, SourcedModel};
 
-/// Half of a 95 % interval, standard deviations.
-const OF_95: f64 = 1.96;
 /// Points of a line over SOC or temperature.
 const POINTS: u32 = 200;
 /// Temperatures of the picture over temperature, as far as the tables go, degrees C.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
 /// A cold temperature beside that of the curve, degrees C.
 const COLD_C: f64 = 0.0;
-/// SOC of the picture over temperature.
-const SHOWN_SOC: [(f64, Ink); 2] = [(0.5, Ink::Blue), (0.2, Ink::Orange)];
 /// SOC below which a curve or a resistance may leave its picture: both rise many times there, percent.
 const STEEP_PERCENT: f64 = 12.0;
 
@@ -86,7 +82,7 @@ fn is_known(known_by: KnownBy) -> bool {
 fn curve(sourced: &SourcedModel) -> Picture {
     let bands = ModelBands::new(&sourced.model);
     let band = along(0.0, 1.0).filter_map(|soc| {
-        let (v, half_v) = (bands.ocv_v(soc), OF_95 * bands.curve_std_v(soc)?);
+        let (v, half_v) = (bands.ocv_v(soc), crate::OF_95 * bands.curve_std_v(soc)?);
         Some((100.0 * soc, v - half_v, v + half_v))
     });
     let band: Vec<_> = band.collect();
@@ -132,7 +128,7 @@ fn resistance_layers(
     };
     let band = xs.clone().map(|x| {
         let (soc, temperature_c) = place(x);
-        let factor = (OF_95 * bands.resistance(soc, temperature_c).std()).exp();
+        let factor = (crate::OF_95 * bands.resistance(soc, temperature_c).std()).exp();
         (x, milliohm(x) / factor, milliohm(x) * factor)
     });
     let points: Vec<_> = xs.map(|x| (x, milliohm(x))).collect();
@@ -168,7 +164,7 @@ fn resistance_over_temperature(sourced: &SourcedModel) -> Option<Picture> {
     let of_soc = |(soc, ink): (f64, Ink)| {
         resistance_layers(sourced, (&format!("SOC {:.0} %", 100.0 * soc), ink), along(low, high), move |t| (soc, t))
     };
-    let layers = SHOWN_SOC.into_iter().rev().flat_map(of_soc).collect();
+    let layers = [(0.5, Ink::Blue), (0.2, Ink::Orange)].into_iter().rev().flat_map(of_soc).collect();
     let axis = Axis::number("temperature, \u{b0}C").within(low, high);
     let title = "Resistance once settled, over temperature".to_owned();
     Some(chart(title, "Settled resistance, milliohm, over temperature", axis, "m\u{3a9}", layers))

@@ -8,9 +8,6 @@ use crate::cell_faults::{Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Most cells that are left out by name: more do not fit into a line.
-const MOST_NAMED: usize = 12;
-
 /// The lines; without a `model` there is no energy.
 pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&CellModel>) -> Vec<(String, String)> {
     let pack = match imbalance {
@@ -34,7 +31,8 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
             pack.left_out.iter().filter(|it| it.1 == *reason).map(|it| number(it.0).to_string()).collect();
         match cells.len() {
             0 => None,
-            count if count > MOST_NAMED => Some(("left out", format!("{words}: {count} cells"))),
+            // Most cells that are left out by name: more do not fit into a line.
+            count if count > 12 => Some(("left out", format!("{words}: {count} cells"))),
             _ => Some(("left out", format!("{words}: cell {}", cells.join(", ")))),
         }
     }));

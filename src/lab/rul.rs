@@ -131,7 +131,7 @@ impl FromStr for Threshold {
 
     /// `1.4`, `1.4 Ah`, `70 %`.
     fn from_str(text: &str) -> Result<Self, String> {
-        const EXPECTED: &str =
+        let expected =
             "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
         let above_0 = |text: &str| text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
         let found = match text.trim().strip_suffix('%') {
@@ -140,7 +140,7 @@ impl FromStr for Threshold {
             }
             None => above_0(text.trim().trim_end_matches("Ah")).map(Self::AmpereHours),
         };
-        found.ok_or_else(|| EXPECTED.to_owned())
+        found.ok_or_else(|| expected.to_owned())
     }
 }
 

@@ -36,9 +36,6 @@ use super::measured::MeasuredFile;
 use crate::error::LabError;
 use crate::monitor::MonitorConfig;
 
-/// Half-width of a Gaussian's 95 % interval in standard deviations.
-const STD_OF_95: f64 = 1.96;
-
 /// Settings of all files and cases.
 #[derive(Debug, Clone)]
 pub struct ScoreSettings {
@@ -69,13 +66,10 @@ pub struct ScoreSettings {
 }
 
 impl ScoreSettings {
-    /// Least standard deviation of an initial SOC where none is given, fraction.
-    const MIN_INITIAL_SOC_STD: f64 = 0.05;
-
     /// Returns the standard deviation of the initial SOC, fraction: the given one, else the size of its error, at least 5
     /// points.
     pub fn initial_soc_std(&self, error_points: f64) -> f64 {
-        self.soc_std.unwrap_or((error_points.abs() / 100.0).max(Self::MIN_INITIAL_SOC_STD))
+        self.soc_std.unwrap_or((error_points.abs() / 100.0).max(0.05))
     }
 }
 

@@ -12,13 +12,6 @@ use pyo3_arrow::PyArray;
 
 use crate::error::data;
 
-/// Kinds of NumPy's dtypes that are numbers: bool, signed, unsigned, real, and objects that each convert to a real.
-const NUMBERS: [&str; 5] = ["b", "i", "u", "f", "O"];
-/// Type of what pandas has in an array of objects where a number is missing.
-const MISSING: &str = "NAType";
-/// Layout that is needed: C order, aligned, a plain array and none of a subclass.
-const LAYOUT: &str = "CAE";
-
 /// Numbers, row after row.
 #[derive(Debug)]
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
@@ -139,7 +132,8 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;
     let refused = |what: String| Err(data(format!("{name} is an array of {what}, must be one of numbers")));
-    if !NUMBERS.contains(&kind.as_str()) {
+    // Bool, signed, unsigned, real, and objects that each convert to a real.
+    if !["b", "i", "u", "f", "O"].contains(&kind.as_str()) {
         return refused(dtype.str()?.to_string());
     }
     if kind == "O" {
@@ -147,7 +141,7 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
         for object in objects.cast::<PyList>()? {
             let kind = object.get_type().name()?;
             let is_number = object.hasattr("__float__")? || object.hasattr("__index__")?;
-            if !is_number && !object.is_none() && kind != MISSING {
+            if !is_number && !object.is_none() && kind != "NAType" {
                 return refused(kind.to_string());
             }
         }
@@ -156,7 +150,8 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
 }
 
 fn laid_out<'py>(values: &Bound<'py, PyAny>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
-    let array = values.py().import("numpy")?.call_method1("require", (values, dtype, LAYOUT))?;
+    // Layout that is needed: C order, aligned, a plain array and none of a subclass.
+    let array = values.py().import("numpy")?.call_method1("require", (values, dtype, "CAE"))?;
     // A single number is an array of one.
     if array.getattr("ndim")?.eq(0)? { array.call_method1("reshape", (-1,)) } else { Ok(array) }
 }

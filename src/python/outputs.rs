@@ -14,8 +14,6 @@ use crate::table::{Table, reals};
 
 /// Reals of an estimate: all columns but time, cell and whether it was accepted.
 const REALS: usize = ESTIMATE_COLUMNS.len() - 3;
-/// Those before the column `accepted`.
-const REALS_BEFORE_ACCEPTED: usize = 11;
 
 /// Tables of what came out.
 #[pyclass(frozen, module = "packwatch")]
@@ -174,7 +172,7 @@ impl EstimateColumns {
         let accepted: ArrayRef = Arc::new(BooleanArray::from(std::mem::take(&mut self.accepted)));
         let mut arrays = vec![time_s, cell];
         arrays.extend(self.reals.iter_mut().map(|column| reals(std::mem::take(column))));
-        arrays.insert(2 + REALS_BEFORE_ACCEPTED, accepted);
+        arrays.insert(13, accepted);
         Table::new(ESTIMATE_COLUMNS.into_iter().zip(arrays).collect())
     }
 }

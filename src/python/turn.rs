@@ -13,9 +13,6 @@ use pyo3::prelude::*;
 use crate::error::data;
 use crate::monitor::State;
 
-/// Between two looks at whether it is this call's turn: short beside a call's own overhead in Python, long beside a look.
-const PERIOD: Duration = Duration::from_millis(1);
-
 /// A monitor's state, for one call at a time.
 pub(crate) struct Turns {
     state: Mutex<State>,
@@ -53,7 +50,8 @@ impl Turns {
                 }
                 Err(TryLockError::WouldBlock) => {
                     py.check_signals()?;
-                    py.detach(|| thread::sleep(PERIOD));
+                    // Between two looks at whether it is this call's turn: short beside a call's own overhead in Python, long beside a look.
+                    py.detach(|| thread::sleep(Duration::from_millis(1)));
                 }
             }
         }

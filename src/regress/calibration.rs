@@ -14,13 +14,9 @@ use super::scale::StandardisedRows;
 /// Nominal coverage of the interval.
 pub(super) const LEVEL: f64 = 0.95;
 /// Half width of the Gaussian interval of that level, in standard deviations.
-pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
+pub const GAUSSIAN: f64 = 1.959_963_984_540_054;
 /// Rows that are left out, one at a time; the factor's own standard error is then below 1 %.
 pub(super) const CALIBRATION_ROWS: usize = 8000;
-/// Most rows of the spread at a row; otherwise a twentieth of them.
-const MOST_NEAR: usize = 200;
-/// Fewest rows of the spread at a row; with fewer it is 1 everywhere.
-const FEWEST_NEAR: usize = 20;
 /// Weight of the mean of all rows in the spread at a row, in rows.
 const SHRINKAGE: f64 = 20.0;
 
@@ -44,11 +40,13 @@ impl Calibration {
 
     /// From rows and their ratios when predicted without themselves. Without rows: Gaussian.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
-        let near = (ratios.len() / 20).min(MOST_NEAR);
+        // Most rows of the spread at a row; otherwise a twentieth of them.
+        let near = (ratios.len() / 20).min(200);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
         let tree =
-            (near >= FEWEST_NEAR && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
+            // Fewest rows of the spread at a row; with fewer it is 1 everywhere.
+            (near >= 20 && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;
         let relative = |(k, ratio): (usize, &f64)| ratio / calibration.spread(&inputs[k * d..][..d], Some(k));

@@ -24,8 +24,6 @@ use super::scale::StandardisedRows;
 
 /// Queries of one block of a prediction.
 const BLOCK_QUERIES: usize = 256;
-/// Columns one thread takes at a time.
-const COLUMNS: usize = 8;
 
 /// State for predictions.
 #[derive(Debug, Clone)]
@@ -165,11 +163,9 @@ impl Posterior {
 fn fill(covariance: &Covariance, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
     let diagonal = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
-    matrix.par_chunks_mut(n).enumerate().with_max_len(COLUMNS).for_each_init(
-        Default::default,
-        |scratch, (j, column)| {
-            column[j] = diagonal;
-            covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);
-        },
-    );
+    // Columns one thread takes at a time.
+    matrix.par_chunks_mut(n).enumerate().with_max_len(8).for_each_init(Default::default, |scratch, (j, column)| {
+        column[j] = diagonal;
+        covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);
+    });
 }

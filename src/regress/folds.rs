@@ -14,9 +14,6 @@ use super::model::{Hyperparameter, Prediction, fit};
 use super::scale::check;
 use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 
-/// Most folds.
-const MAX_FOLDS: usize = 1000;
-
 /// Outcome of one fold.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fold {
@@ -99,7 +96,7 @@ pub fn cross_validate(
 ) -> Result<Folds, RegressionError> {
     check(rows)?;
     let n = rows.targets.len();
-    let most = MAX_FOLDS.min(n / 2);
+    let most = (n / 2).min(1000);
     if !(2..=most).contains(&folds) {
         return Err(RegressionError::range("folds", folds, format!("2 to {most}")));
     }

@@ -7,9 +7,6 @@
 
 use std::collections::BinaryHeap;
 
-/// Largest number of rows of a leaf.
-const LEAF_ROWS: usize = 16;
-
 /// A tree over rows, numbered from 0.
 #[derive(Debug, Clone)]
 pub(super) struct KdTree {
@@ -78,7 +75,8 @@ impl KdTree {
             ends.1 - ends.0
         };
         let axis = (0..d).max_by(|a, b| spread(*a).total_cmp(&spread(*b))).unwrap_or(0);
-        if rows.len() <= LEAF_ROWS || spread(axis) <= 0.0 {
+        // Largest number of rows of a leaf.
+        if rows.len() <= 16 || spread(axis) <= 0.0 {
             return;
         }
         let middle = rows.len() / 2;

@@ -48,6 +48,7 @@ mod vector_math;
 mod tests;
 
 pub use basis::Basis;
+pub use calibration::GAUSSIAN;
 pub use error::RegressionError;
 pub use folds::{Fold, Folds, PredictionScore, assign, cross_validate, score};
 pub use jitter::Jitter;

@@ -5,13 +5,6 @@
 //! A variable at a bound whose gradient points outward stays there for the step. The step is shortened until the function
 //! falls enough (Armijo), and is projected onto the box. A point without a value counts as infinitely high.
 
-/// Longest first step of a search, and of any step, in one variable. Variables are logarithms: a factor of 7.
-const LONGEST_STEP: f64 = 2.0;
-/// Smallest decrease of a step, as part of its linear prediction.
-const ARMIJO: f64 = 1e-4;
-/// Most reductions of one step.
-const MAX_CUTS: usize = 12;
-
 /// Value and gradient of the objective; `None` = no value at this point.
 pub(super) type Evaluation = Option<(f64, Vec<f64>)>;
 
@@ -82,14 +75,17 @@ fn line_search<E>(
     if longest == 0.0 {
         return Ok(None);
     }
-    let mut step = (LONGEST_STEP / longest).min(1.0);
-    for _ in 0..MAX_CUTS {
+    // Longest first step of a search, and of any step, in one variable. Variables are logarithms: a factor of 7.
+    let mut step = (2.0 / longest).min(1.0);
+    // Most reductions of one step.
+    for _ in 0..12 {
         let x: Vec<f64> =
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();
         let slope: f64 = (0..x.len()).map(|k| at.gradient[k] * (x[k] - at.x[k])).sum();
         let found = objective(&x)?;
         if let Some((value, gradient)) = found.filter(is_finite) {
-            if slope < 0.0 && value <= at.value + ARMIJO * slope {
+            // Smallest decrease of a step, as part of its linear prediction.
+            if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
             // The minimum of the parabola through both points, within limits.

@@ -26,10 +26,6 @@ use super::{exact, nearest};
 /// Rows whose factors the search of [`Form::Nearest`] sums over; the effect of this choice on the hyperparameters is far
 /// too small to show in a prediction.
 const SEARCH_ROWS: usize = 6000;
-/// Most choices of neighbours while the length scales move.
-const MAX_ROUNDS: usize = 4;
-/// Change of the ratio of two length scales below which the choice is kept.
-const SAME_METRIC: f64 = 1.3;
 /// Most threads.
 const MAX_THREADS: usize = 1024;
 /// Searches besides the first.
@@ -235,7 +231,8 @@ impl<'a> FitJob<'a> {
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
-        for _ in 0..MAX_ROUNDS {
+        // Most choices of neighbours while the length scales move.
+        for _ in 0..4 {
             let metric = self.metric(&start);
             let Some(mut minimum) = self.one_round(&start, &metric, (&low, &high), monitor)? else { break };
             minimum.iterations += found.map_or(0, |before| before.iterations);
@@ -326,7 +323,7 @@ fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
 fn is_same_metric(a: &[f64], b: &[f64]) -> bool {
     let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
     let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
-    high - low < SAME_METRIC.ln()
+    high - low < 1.3_f64.ln()
 }
 
 pub(super) fn threads(count: usize) -> Result<ThreadPool, RegressionError> {

@@ -13,9 +13,6 @@ use super::minimise::{Evaluation, Minimum, SearchLimits, minimise};
 use super::plan::{Parameter, ParameterRole, Plan};
 use super::settings::{FitProgress, ProgressCallback};
 
-/// Decrease of the negative log likelihood per row below which a search ends, twice in succession.
-const CONVERGED_PER_ROW: f64 = 5e-6;
-
 /// Bounds of a parameter and range of its random starts, in standardised units, before the logarithm.
 fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
@@ -92,7 +89,8 @@ pub(super) fn descend(
     // The search works per row, so that the first step has the length of the gradient.
     let rows = monitor.rows as f64;
     let scale = 1.0 / rows;
-    let limits = SearchLimits { low, high, max_iterations, tolerance: CONVERGED_PER_ROW * rows * scale };
+    // Decrease of the negative log likelihood per row below which a search ends, twice in succession.
+    let limits = SearchLimits { low, high, max_iterations, tolerance: 5e-6 * rows * scale };
     let evaluate = |theta: &[f64]| -> Result<Evaluation, RegressionError> {
         match objective(theta) {
             Ok((value, gradient)) => Ok(Some((value * scale, gradient.iter().map(|g| g * scale).collect()))),

@@ -12,8 +12,6 @@ const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
 const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
 /// Added to a small number, it leaves the nearest integer in the low bits.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
-/// Lower limit of the argument of exp: about 1e-304, far from the subnormal numbers.
-const EXP_LOWEST: f64 = -700.0;
 /// 1/k! for k = 13 down to 0.
 const EXP_SERIES: [f64; 14] = [
     1.605_904_383_682_161_3e-10,
@@ -35,7 +33,8 @@ const EXP_SERIES: [f64; 14] = [
 /// exp(x) for x <= 0.
 #[inline(always)]
 pub(crate) fn exp(x: f64) -> f64 {
-    let x = x.max(EXP_LOWEST);
+    // Lower limit of the argument of exp: about 1e-304, far from the subnormal numbers.
+    let x = x.max(-700.0);
     let rounded = x * LOG2_E + ROUNDER;
     let whole = rounded - ROUNDER;
     let rest = (x - whole * LN2_HIGH) - whole * LN2_LOW;

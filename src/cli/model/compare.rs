@@ -7,9 +7,6 @@ use crate::cell::model_comparison::{AtTemperature, Difference};
 use crate::cli::common::output;
 use crate::config::cell_model::SourcedModel;
 
-/// Rows of the curve: every 10th of its steps of 1 %.
-const CURVE_EVERY: usize = 10;
-
 /// A model with its name for people.
 type Named<'a> = (&'a str, &'a SourcedModel);
 
@@ -25,7 +22,8 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
     let rows = rows.into_iter().map(|(what, value)| vec![what.to_owned(), value]);
     page.push_str(&output::table::<&str>(&[], rows, 2));
     page.push_str("\nopen-circuit voltage at 25 \u{b0}C\n");
-    let points = comparison.curve_v.iter().step_by(CURVE_EVERY);
+    // Rows of the curve: every 10th of its steps of 1 %.
+    let points = comparison.curve_v.iter().step_by(10);
     let rows = points.map(|at| vec![format!("{:.0}", 100.0 * at.soc), signed(1e3 * at.value)]);
     page.push_str(&output::table(&["SOC, %", "mV"], rows, 0));
     if comparison.temperatures.is_empty() {

@@ -12,8 +12,6 @@ use crate::monitor::{ModelChange, ModelState};
 const CURVE_STEPS: u32 = 20;
 /// SOC of the columns of resistances.
 const RESISTANCE_SOC: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
-/// SOC of the parts of the resistance.
-const PARTS_SOC: f64 = 0.5;
 
 /// What is shown of a cell model.
 #[derive(Debug, Serialize)]
@@ -353,7 +351,8 @@ fn resistance_row(sourced: &SourcedModel, bands: &ModelBands<'_>, temperature_c:
         ohm: model.settled_ohm(&model.grid_position(soc, temperature_c)),
         std: bands.resistance(soc, temperature_c).std(),
     });
-    let position = model.grid_position(PARTS_SOC, temperature_c);
+    // SOC of the parts of the resistance.
+    let position = model.grid_position(0.5, temperature_c);
     let part =
         |i: usize| BranchPart { r_ohm: model.branch_r_ohm(i, &position), tau_s: model.branch_tau_s(i, &position) };
     ResistanceRow {

@@ -175,19 +175,19 @@ fn capacity_error(text: &str) -> Result<f64, String> {
 
 /// Seconds of `600`, `600s`, `10min`, `1h`.
 fn duration(text: &str) -> Result<f64, String> {
-    const UNITS: [(&str, f64); 3] = [("min", 60.0), ("h", 3600.0), ("s", 1.0)];
+    let units = [("min", 60.0), ("h", 3600.0), ("s", 1.0)];
     let text = text.trim();
     let (digits, unit) =
-        UNITS.iter().find_map(|(unit, seconds)| Some((text.strip_suffix(unit)?, *seconds))).unwrap_or((text, 1.0));
+        units.iter().find_map(|(unit, seconds)| Some((text.strip_suffix(unit)?, *seconds))).unwrap_or((text, 1.0));
     let value = within(digits, |value| value >= 0.0, "0 or more, like 600, 600s, 10min or 1h")?;
     Ok(value * unit)
 }
 
 fn window(text: &str) -> Result<(f64, f64), String> {
-    const EXPECTED: &str = "must be two parts above 0 and at most 1, the smaller first, like 0.4,0.7";
-    let (least, most) = text.split_once(',').ok_or(EXPECTED)?;
-    let (least, most) = (finite(least).map_err(|_| EXPECTED)?, finite(most).map_err(|_| EXPECTED)?);
-    if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(EXPECTED.to_owned()) }
+    let expected = "must be two parts above 0 and at most 1, the smaller first, like 0.4,0.7";
+    let (least, most) = text.split_once(',').ok_or(expected)?;
+    let (least, most) = (finite(least).map_err(|_| expected)?, finite(most).map_err(|_| expected)?);
+    if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(expected.to_owned()) }
 }
 
 fn load(text: &str) -> Result<[f64; 3], String> {

@@ -274,3 +274,18 @@ fn read_starts(path: &Path, section: &str) -> Result<HashMap<Vec<u8>, Timestamp>
     }
     Ok(starts)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn battery_data_format_counts_charge_as_positive() {
+        let text = "Test Time / s,Voltage / V,Current / A\n0,3.5,-2\n";
+        let options = CsvOptions { cells: 1, ..CsvOptions::default() };
+        let mut log = CsvLog::open(Box::new(text.as_bytes()), "cell.csv", &options).expect("opens");
+        assert!(matches!(log.next_row(), Ok(Some(Ok(_)))));
+        let expected = [(Channel::Current, Some(2.0)), (Channel::CellVoltage(CellIndex(0)), Some(3.5))];
+        assert!(log.values.len() == 2 && expected.iter().all(|value| log.values.contains(value)), "{:?}", log.values);
+    }
+}

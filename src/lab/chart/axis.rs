@@ -13,12 +13,8 @@ const STEPS: [(f64, &[f64]); 4] = [
     (HOUR, &[1.0, 2.0, 3.0, 4.0, 6.0, 12.0]),
     (DAY, &[1.0, 2.0, 5.0, 10.0, 20.0]),
 ];
-/// Steps above, months.
-const STEPS_MONTHS: [i64; 7] = [1, 2, 3, 6, 12, 24, 60];
 /// Days of an average month.
 const MONTH_S: f64 = 30.44 * DAY;
-/// Room above and below the data, parts of their range.
-const MARGIN: f64 = 0.06;
 
 /// Scale of an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -62,7 +58,8 @@ impl Axis {
         }
         let none = (f64::INFINITY, f64::NEG_INFINITY);
         let ends = values.filter(|v| v.is_finite()).fold(none, |(low, high), v| (low.min(v), high.max(v)));
-        opened(ends, if margin { MARGIN } else { 0.0 })
+        // Room above and below the data, parts of their range.
+        opened(ends, if margin { 0.06 } else { 0.0 })
     }
 
     /// Positions and words of about `count` ticks.
@@ -126,7 +123,8 @@ fn date_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
 }
 
 fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
-    let step = STEPS_MONTHS.into_iter().find(|step| *step as f64 * MONTH_S >= raw);
+    // Steps above, months.
+    let step = [1, 2, 3, 6, 12, 24, 60].into_iter().find(|step| *step as f64 * MONTH_S >= raw);
     let step = step.unwrap_or_else(|| 12 * ((raw / (12.0 * MONTH_S)).ceil() as i64));
     let text = format_utc(Timestamp::from_secs(low));
     let part = |range: std::ops::Range<usize>| text.get(range).and_then(|digits| digits.parse::<i64>().ok());

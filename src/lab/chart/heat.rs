@@ -8,8 +8,6 @@ use super::svg::{Svg, short, text_width};
 
 /// Height of a row, pixels, within these bounds.
 const ROW: (f64, f64) = (4.0, 20.0);
-/// Height of a picture with as many rows as fit, pixels.
-const WANTED: f64 = 300.0;
 
 /// Values over rows (cells, from 1) and columns of equal width.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -36,7 +34,8 @@ impl Heat {
         let values = || self.rows.iter().flatten().flatten().copied().filter(|value| value.is_finite());
         let (low, high) = Axis::default().ends(values(), false);
         let top = self.legend(&mut svg, top, size.width, (low, high));
-        let row = (WANTED / self.rows.len().max(1) as f64).clamp(ROW.0, ROW.1).floor();
+        // Height of a picture with as many rows as fit, pixels.
+        let row = (300.0 / self.rows.len().max(1) as f64).clamp(ROW.0, ROW.1).floor();
         let left = text_width(&self.rows.len().to_string(), 11.5) + 12.0;
         let height = row * self.rows.len() as f64;
         let x = self.x.ends(std::iter::empty(), false);

@@ -7,19 +7,10 @@ use super::{Size, thin};
 
 /// Font size of ticks and legend, pixels, as the style sheet has it.
 const SMALL: f64 = 11.5;
-/// Most points of a layer with a tool tip each; more are dots without.
-const MAX_TIPS: usize = 400;
-/// Height of the title, of a row of the legend, and of the labels below the axis, pixels.
-const TITLE: f64 = 24.0;
 const ROW: f64 = 18.0;
 const FOOT: f64 = 38.0;
 /// Radius of a point, pixels.
 const DOT: f64 = 2.6;
-/// Ticks of the x axis at most, and room between their words, pixels.
-const MAX_TICKS: u32 = 10;
-const GAP: f64 = 16.0;
-/// Room at the right, pixels: half of the last tick's words.
-const RIGHT: f64 = 22.0;
 
 /// A value to be drawn as a point.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -108,9 +99,10 @@ impl Area {
     fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
         let fits = |ticks: &[(f64, String)]| {
             let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
-            ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + GAP)
+            // Room between two words.
+            ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + 16.0)
         };
-        let counts = (1..=MAX_TICKS).rev().map(f64::from);
+        let counts = (1..=10).rev().map(f64::from);
         let mut choices = counts.map(|count| axis.ticks(self.x, count));
         choices.find(|ticks| fits(ticks)).unwrap_or_default()
     }
@@ -144,7 +136,8 @@ impl Chart {
         let height = size.height - 60.0 - FOOT;
         let y_ticks = self.y.ticks(y, height / 28.0);
         let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
-        let area = Area { left, top, width: size.width - left - RIGHT, height, x, y };
+        // Room at the right, pixels: half of the last tick's words.
+        let area = Area { left, top, width: size.width - left - 22.0, height, x, y };
         for (y, word) in y_ticks {
             let at = top + area.py(y);
             svg.path("g", &format!("M{} {}h{}", short(left), short(at), short(area.width)), "");
@@ -181,7 +174,7 @@ pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
         svg.text(0.0, y + 16.0, "q", &line);
         y += 18.0;
     }
-    if y > 0.0 { y + TITLE - 18.0 } else { 0.0 }
+    if y > 0.0 { y + 6.0 } else { 0.0 }
 }
 
 /// Words in lines of at most this width.
@@ -264,7 +257,8 @@ impl Layer {
 
     fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
         let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
-        if finite().count() <= MAX_TIPS {
+        // Most points of a layer with a tool tip each; more are dots without.
+        if finite().count() <= 400 {
             return finite().for_each(|point| {
                 // A point at the very edge is not cut in half.
                 let x = area.px(point.x);

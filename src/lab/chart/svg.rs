@@ -2,9 +2,6 @@
 
 use std::fmt::Write as _;
 
-/// Average width of a character, parts of the font size.
-const CHARACTER: f64 = 0.56;
-
 /// Escapes text for an element or an attribute.
 pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
@@ -24,7 +21,8 @@ pub fn escape(text: &str) -> String {
 
 /// Width of a text in a font of this size, pixels, roughly.
 pub(super) fn text_width(text: &str, size: f64) -> f64 {
-    text.chars().count() as f64 * size * CHARACTER
+    // Average width of a character, parts of the font size.
+    text.chars().count() as f64 * size * 0.56
 }
 
 /// A coordinate with one decimal, as short as it goes.

@@ -10,10 +10,6 @@ use crate::ident::MeasuredPart;
 
 /// Difference of the logarithms of the posterior densities from which on another chemistry is the cell's: as in the service.
 const MARGIN: f64 = 12.0;
-/// Fewest rows that are compared.
-const LEAST_ROWS: usize = 12;
-/// Temperature where a log has none, degrees C.
-const AMBIENT_C: f64 = 25.0;
 
 /// The label a model was made of; `None` = it is of a file.
 pub(super) fn label_of(model: &CellModel) -> Option<Label> {
@@ -45,7 +41,8 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 unmeasured_s: 0.0,
                 current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
-                ambient_c: AMBIENT_C,
+                // Temperature where a log has none, degrees C.
+                ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
             };
             if notebook.add(&config, &step) {
@@ -71,7 +68,8 @@ pub(super) fn note<'a>(
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
         Some((chemistry, fit::label_cost(&of.prior()?, &rows, &[capacity_ah])?))
     };
-    let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= LEAST_ROWS) else {
+    // Fewest rows that are compared.
+    let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= 12) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
     };
     let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);

@@ -5,24 +5,6 @@
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
-/// Least part of the charge whose voltages say something of capacity and curve.
-const LEAST_SPAN: f64 = 0.3;
-/// A current below the capacity over this time, h, is rest.
-const REST_H: f64 = 50.0;
-/// Least time at rest, s, and least charge moved in one direction, as SOC.
-const LEAST_REST_S: f64 = 300.0;
-const LEAST_MOVED: f64 = 0.02;
-/// Interval of the readings from which on the series resistance cannot be separated from the fastest branch, s.
-const SLOW_S: f64 = 3.0;
-/// Steps of the voltage from which on they hide resistances of small currents, V.
-const COARSE_V: f64 = 0.01;
-/// Readings of a stretch of which the step of the voltage is found.
-const STEP_ROWS: usize = 2000;
-/// Temperatures within this are one, K.
-const SAME_K: f64 = 1e-6;
-/// Part of its deviation before the fit that is left of a capacity that the logs do not show.
-const UNSHOWN: f64 = 0.7;
-
 /// A capacity with its standard deviation, Ah, before or after a fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Capacity {
@@ -33,32 +15,34 @@ pub(super) struct Capacity {
 /// The sentences.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
-    let is_unshown = after.std_ah / after.mean_ah > UNSHOWN * before.std_ah / before.mean_ah;
+    // Part of its deviation before the fit that is left of a capacity that the logs do not show.
+    let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
         notes
             .push("the logs do not show the capacity: it stays near that of the model the fit started from".to_owned());
     }
     let span = records.iter().map(span).fold(0.0, f64::max);
-    if span < LEAST_SPAN {
+    if span < 0.3 {
         notes.push(format!(
             "no log moves more than {:.0} % of the charge: the curve beyond stays that of the model the fit started from",
             100.0 * span
         ));
     }
-    let rest_a = after.mean_ah / REST_H;
+    // A current below the capacity over 50 h is rest.
+    let rest_a = after.mean_ah / 50.0;
     let (mut rest_s, mut moved) = (0.0, [0.0; 2]);
     for row in records.iter().flat_map(|record| &record.rows) {
         rest_s += if row.mean_current_a.abs() < rest_a { row.dt_s } else { 0.0 };
         let soc = row.mean_current_a * row.dt_s / 3600.0 / after.mean_ah;
         moved[usize::from(soc < 0.0)] += soc.abs();
     }
-    if rest_s < LEAST_REST_S {
+    if rest_s < 300.0 {
         notes.push(
             "no rest in the logs: the curve and slow resistances are separated by their usual sizes alone".to_owned(),
         );
     }
     for (moved, direction) in moved.iter().zip(["discharge", "charge"]) {
-        if *moved < LEAST_MOVED {
+        if *moved < 0.02 {
             notes.push(format!("no {direction} in the logs: its voltages are a guess"));
         }
     }
@@ -66,20 +50,20 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
         .iter()
         .flat_map(|part| &part.temperature_c)
         .fold((f64::MAX, f64::MIN), |(low, high), t| (low.min(*t), high.max(*t)));
-    if high_c - low_c < SAME_K {
+    if high_c - low_c < 1e-6 {
         let what =
             "no temperature in the logs, or one that never changes: the resistances follow it as those of usual cells";
         notes.push(what.to_owned());
     }
     let interval_s =
         median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
-    if interval_s > SLOW_S {
+    if interval_s > 3.0 {
         notes.push(format!(
             "readings every {interval_s:.0} s: the series resistance cannot be separated from the fastest branch"
         ));
     }
     let step_v = step_v(parts);
-    if step_v > COARSE_V {
+    if step_v > 0.01 {
         notes.push(format!("voltages in steps of {:.0} mV: curve and resistances are known less well", 1e3 * step_v));
     }
     notes
@@ -95,7 +79,7 @@ fn span(record: &Record) -> f64 {
 /// Smallest difference between two voltages, V, that are not equal.
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
-        let pairs = part.voltage_v.windows(2).take(STEP_ROWS).map(|pair| (pair[1] - pair[0]).abs());
+        let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());
         pairs.filter(|step_v| *step_v > 1e-6).fold(f64::INFINITY, f64::min)
     };
     let least_v = parts.iter().map(of_part).fold(f64::INFINITY, f64::min);

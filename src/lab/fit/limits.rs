@@ -16,10 +16,6 @@ const HELD_S: f64 = 30.0;
 const REST_SHARE: f64 = 0.02;
 /// Part of the rows that are stray values.
 const STRAY: usize = 10_000;
-/// Pulses beyond a limit are mentioned from here, V.
-const BEYOND_V: f64 = 0.02;
-/// A discharge that ends further than this above the median end was broken off, V.
-const BROKEN_OFF_V: f64 = 0.3;
 /// Error of a reading at a limit, V.
 const READING_V: f64 = 0.005;
 
@@ -54,7 +50,8 @@ pub(super) fn voltage_limits(
     if request.voltage_max_v.is_none() {
         notes.push(format!("voltage_max_v = {high_v} by {}; --voltage-max sets another", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
-        if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + BEYOND_V) {
+        // Pulses beyond a limit are mentioned from here, V.
+        if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
             notes.push(format!("pulses above voltage_max_v do not count: {}", pulse.place()));
         }
     }
@@ -130,7 +127,8 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + BROKEN_OFF_V;
+    // A discharge that ends further than this above the median end was broken off, V.
+    let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();
     let high = high.or_else(|| held_limits(files.iter()).map(|(_, (_, high))| high))?;

@@ -24,6 +24,7 @@ use crate::error::LabError;
 use crate::ident::fit::{FitSettings, FittedTables, judge};
 use crate::ident::grid::{Grid, arrhenius};
 use crate::ident::parameters::ParameterTables;
+use crate::ident::pass::COLD_POWER;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Limits, Record};
 use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
@@ -33,8 +34,6 @@ use crate::monitor::{Estimate, Input, Monitor, MonitorConfig};
 use crate::quantity::CellIndex;
 use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
-/// A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
-const HOLE_S: f64 = 120.0;
 /// Rows of the shortest stretch that is used.
 const LEAST_ROWS: usize = 20;
 /// Least standard deviation of the SOC at which a stretch begins.
@@ -54,15 +53,10 @@ const COLD_SOC: f64 = 0.03;
 /// Residual of a fit from which on the logs are not of one cell, V, and the power of Arrhenius' factor by which it grows with cold:
 /// fits of the cells of `tests/label` leave 5 to 20 mV in the warmth and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-const COLD_POWER: f64 = 0.7;
-/// Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
-const LEAST_OFFSET_H: f64 = 1000.0;
 /// A charge is at its end when the voltage is at most so far below the highest, V, and the current below the rated capacity over
 /// this time, h.
 const HELD_V: f64 = 0.012;
 const FADED_H: f64 = 15.0;
-/// Temperatures of stretches closer than this share a node, K.
-const NODE_GAP_K: f64 = 5.0;
 /// Least error of the configured model's curve, V: smooth over [`CURVE_SOC`], and of each breakpoint alone.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
 const CURVE_SOC: f64 = 0.1;
@@ -150,7 +144,8 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        let has_hole = last_s.is_none_or(|last_s| time_s - last_s > HOLE_S || time_s < last_s);
+        // A hole longer than this begins a new stretch, s: more than the interval of any logger, less than a stop.
+        let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
             self.stretches.push(Stretch { beginning, ..Stretch::default() });
@@ -375,7 +370,8 @@ fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     };
     let mut medians: Vec<f64> = stretches.iter().map(median).collect();
     medians.sort_by(f64::total_cmp);
-    let groups = medians.chunk_by(|a, b| b - a < NODE_GAP_K);
+    // Temperatures of stretches closer than this share a node, K.
+    let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }
 
@@ -414,7 +410,8 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
-        offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / LEAST_OFFSET_H),
+        // Least standard deviation of the current sensor's offset: the rated capacity over this time, h.
+        offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }
 

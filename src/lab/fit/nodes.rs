@@ -8,8 +8,6 @@ use crate::ident::grid::interpolate;
 
 /// Error of the SOC that linear interpolation may cause, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Error of the voltage below which nothing is added, V: no model is better.
-const LEAST_V: f64 = 0.001;
 /// Width over which the slope counts, SOC: an estimate moves over a plateau's steps.
 const SLOPE_WIDTH: f64 = 0.04;
 /// Least distance of breakpoints. The points looked at are this far apart.
@@ -45,7 +43,8 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
         let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
         let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
         let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
-        if error_v > LEAST_V { error_v / slope_v } else { 0.0 }
+        // Error of the voltage below which nothing is added, V: no model is better.
+        if error_v > 0.001 { error_v / slope_v } else { 0.0 }
     };
     curves.iter().map(of_curve).fold(0.0, f64::max)
 }

@@ -7,15 +7,13 @@ use crate::chart::{self, Chart, Ink, Layer, Picture};
 use crate::error::LabError;
 use crate::ident::pass::residuals;
 
-/// Most panels: a longer page is not read.
-const MAX_PANELS: usize = 40;
-
 /// Writes the plot.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
-    let panels: Vec<Picture> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
+    // Most panels: a longer page is not read.
+    let panels: Vec<Picture> = (0..outcome.files.len()).take(40).map(|number| panel(outcome, number)).collect();
     Ok(chart::write_stack(path, &panels)?)
 }
 

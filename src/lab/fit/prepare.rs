@@ -9,16 +9,10 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Temperature assumed where a file has none, degrees C.
-const DEFAULT_C: f64 = 25.0;
-/// Temperatures of files closer than this share a node, K.
-const NODE_GAP_K: f64 = 5.0;
 /// Voltages further than this beyond the cell's limits are not credible, V.
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
 /// Weight of a charge relative to a discharge of an ageing cell: its voltage carries slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
-/// Least share of the capacity that a slow test must discharge.
-const SLOW_TEST_SHARE: f64 = 0.5;
 
 /// One stretch of a file with its SOC, not yet placed in the grid.
 pub(super) struct AnchoredPart {
@@ -43,7 +37,8 @@ pub(super) struct FitInputs {
 /// next one.
 fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
-    let mut temperature_c = known.unwrap_or(DEFAULT_C);
+    // Temperature assumed where a file has none, degrees C.
+    let mut temperature_c = known.unwrap_or(25.0);
     let mut clean = MeasuredPart { key: part.key.clone(), kind: part.kind.clone(), ..MeasuredPart::default() };
     for k in 0..part.len() {
         let backwards = clean.time_s.last().is_some_and(|&last| part.time_s[k] < last);
@@ -168,7 +163,8 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
         }
     }
     let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
-    if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < SLOW_TEST_SHARE * whole_ah {
+    // Least share of the capacity that a slow test must discharge.
+    if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
         return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
     }
     test.temperature_c = sum_c / test.out_ah.len() as f64;
@@ -269,7 +265,8 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                Some((sum, count)) if t - last < NODE_GAP_K => (*sum, *count) = (*sum + t, *count + 1.0),
+                // Temperatures of files closer than this share a node, K.
+                Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }
             last = t;

@@ -9,23 +9,17 @@ use crate::cell::arrhenius;
 use crate::ident::fit::FittedTables;
 use crate::ident::grid::Grid;
 use crate::ident::parameters::ParameterTables;
+use crate::ident::pass::COLD_POWER;
 use crate::ident::record::Record;
 
 /// Distance of the rows beyond the measured temperatures, K.
 const REACH_K: f64 = 40.0;
 /// Standard deviation of the activation energy of a cell's resistances, J/mol: that of 15 to 35 kJ/mol, all as likely.
 const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
-/// Gas constant, J/(mol K).
-const GAS_CONSTANT_J_PER_MOL_K: f64 = 8.314_462_618;
 /// 0 degrees C in K.
 const ZERO_CELSIUS_K: f64 = 273.15;
 /// Share of the time at either end of the temperatures that does not count: sensors settle, values stray.
 const STRAY: f64 = 0.005;
-/// Power of Arrhenius' factor by which the rest of the error grows with cold, as between measured temperatures.
-const COLD_POWER: f64 = 0.7;
-
-/// Errors are limited to this, V: an estimate hardly follows such a voltage.
-const MOST_V: f64 = 0.5;
 
 /// Ranges of the data of a fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -127,7 +121,8 @@ impl ModelTables {
         let nodes = row * columns..(row + 1) * columns;
         let factor = arrhenius(to_c) / arrhenius(from_c);
         let per_kelvin = 1.0 / (to_c + ZERO_CELSIUS_K) - 1.0 / (from_c + ZERO_CELSIUS_K);
-        let log_std = (ENERGY_STD_J_PER_MOL / GAS_CONSTANT_J_PER_MOL_K * per_kelvin).abs();
+        // Gas constant, J/(mol K).
+        let log_std = (ENERGY_STD_J_PER_MOL / 8.314_462_618 * per_kelvin).abs();
         self.grid.temperature_c.push(to_c);
         let ParameterTables { ocv_v, r0_ohm, r_ohm, tau_s } = &fitted.tables;
         self.tables.ocv_v.extend(&ocv_v[nodes.clone()]);
@@ -143,7 +138,8 @@ impl ModelTables {
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(MOST_V)
+            // Errors are limited to this, V: an estimate hardly follows such a voltage.
+            libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }
 }

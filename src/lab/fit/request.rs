@@ -11,8 +11,6 @@ use crate::quantity::bounds;
 
 /// Most SOC breakpoints: one per per cent. The time of a fit grows with the cube of their number.
 pub const MAX_SOC_NODES: usize = 101;
-/// Most temperature breakpoints: no data have more.
-const MAX_TEMPERATURES: usize = 32;
 
 /// What to fit.
 #[derive(Debug, Clone, Default)]
@@ -105,7 +103,8 @@ impl FitRequest {
     fn check_nodes(&self) -> Result<(), LabError> {
         if let Some(temperatures_c) = &self.temperature_c {
             let allowed = bounds::TEMPERATURE_C;
-            check_list("--temperatures", temperatures_c, 1..=MAX_TEMPERATURES)?;
+            // Most temperature breakpoints: no data have more.
+            check_list("--temperatures", temperatures_c, 1..=32)?;
             check("--temperatures", temperatures_c.iter().copied(), |found| allowed.has(found), allowed.allowed)?;
         }
         let Some(soc) = &self.soc else { return Ok(()) };

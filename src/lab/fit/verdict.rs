@@ -9,10 +9,6 @@ use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
 /// SOC over which errors are averaged: below, curves are so steep that any model is good, and few cells go there.
 const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
-/// Error of the SOC up to which a temperature counts as good, points.
-const GOOD_POINTS: f64 = 2.0;
-/// Error of the SOC at one breakpoint from which its voltage is of no use, points.
-const FLAT_POINTS: f64 = 5.0;
 
 /// The sentences, for the end of the output.
 pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
@@ -55,7 +51,8 @@ fn rounded(points: f64) -> String {
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= GOOD_POINTS);
+    // Error of the SOC up to which a temperature counts as good, points.
+    let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
         let worst = good.iter().map(|(_, points)| *points).fold(0.0, f64::max);
@@ -71,7 +68,8 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
 
 /// Where the curve of every temperature is too flat for the model's error.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > FLAT_POINTS);
+    // Error of the SOC at one breakpoint from which its voltage is of no use, points.
+    let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");
     (!flat.is_empty())

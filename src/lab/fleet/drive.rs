@@ -13,9 +13,6 @@ use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 
-/// Records between two reports of progress.
-const REPORT_EVERY: u64 = 4096;
-
 /// An opened log, and a note for the user on how it is read.
 pub type OpenedLog = (LogSource, Option<String>);
 
@@ -80,7 +77,8 @@ pub fn drive(
         }
         tick(&mut ticks, &mut monitor, record.input())?;
         records += 1;
-        if records.is_multiple_of(REPORT_EVERY) {
+        // Records between two reports of progress.
+        if records.is_multiple_of(4096) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
             report(bytes - reported);
             reported = bytes;

@@ -31,8 +31,6 @@ use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 
-/// Version of `about.json`.
-const VERSION: u32 = 1;
 /// What is written last of a log's tables.
 pub(super) const ABOUT: &str = "about.json";
 
@@ -185,7 +183,7 @@ fn write_about(
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
-        "version": VERSION,
+        "version": 1,
         "metadata": metadata,
         "rows": exported.rows,
         "log": driven.counts,

@@ -21,8 +21,6 @@ use crate::config::{self, Config, ConfigFiles};
 
 /// Most combinations: a longer table is not readable.
 pub const MAX_COMBINATIONS: usize = 1000;
-/// Most faults quoted of one combination.
-const MAX_QUOTED: usize = 3;
 /// One `--set`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Choice {
@@ -35,12 +33,12 @@ impl std::str::FromStr for Choice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        const EXPECTED: &str = "must be KEY=VALUE[,VALUE...]";
-        let (key, values) = text.split_once('=').ok_or(EXPECTED)?;
+        let expected = "must be KEY=VALUE[,VALUE...]";
+        let (key, values) = text.split_once('=').ok_or(expected)?;
         let key = key.trim().to_owned();
         let parts = split(values);
         if key.is_empty() || key.split('.').any(str::is_empty) || parts.iter().any(|part| part.is_empty()) {
-            return Err(EXPECTED.to_owned());
+            return Err(expected.to_owned());
         }
         if let Some(twice) = (1..parts.len()).find(|&index| parts[..index].contains(&parts[index])) {
             return Err(format!("value {} given twice", parts[twice]));
@@ -137,7 +135,8 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
                 if first_refused.is_empty() {
                     let set: Vec<_> =
                         grid.keys.iter().zip(&combination).map(|(k, (v, _))| format!("{k}={v}")).collect();
-                    first_refused = faults.iter().take(MAX_QUOTED).map(|f| format!("{}: {f}", set.join(" "))).collect();
+                    // Most faults quoted of one combination.
+                    first_refused = faults.iter().take(3).map(|f| format!("{}: {f}", set.join(" "))).collect();
                 }
             }
         }

@@ -34,18 +34,8 @@ pub const MAX_LAGS: usize = 200;
 pub const MAX_STEPS: usize = 10_000;
 /// Most horizons with a process of their own; there are no forecasts between them.
 pub const MAX_HORIZONS: usize = 10;
-/// Fewest windows to train on.
-const FEWEST: usize = 20;
-/// Most windows of a block that are judged for the interval.
-const BLOCK_WINDOWS: usize = 750;
-/// Most windows after the origin that are judged.
-const HELD_OUT: usize = 5000;
 /// Where the blocks for the interval begin and end, parts of the training rows.
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
-/// Steps of a search that begins where the horizon before it ended.
-const WARM_STEPS: usize = 20;
-/// Fractions of its multiples fill a stretch evenly and never repeat.
-const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What to forecast.
 #[derive(Debug, Clone)]
@@ -187,7 +177,8 @@ impl HorizonTask<'_> {
         let fit_s = begin.elapsed().as_secs_f64();
         let predict = |rows: &[usize]| self.predict(&model, rows, &spread);
         let at_origin = predict(&[from])?.remove(0);
-        let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), HELD_OUT);
+        // Most windows after the origin that are judged.
+        let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), 5000);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
         let (score, persistence_rmse) = self.judge(&held_out);
         let horizon = HorizonForecast {
@@ -207,7 +198,8 @@ impl HorizonTask<'_> {
 
     /// Windows that a process needs: more than it has features.
     fn fewest(&self) -> usize {
-        FEWEST.max(self.windows.width() + 2)
+        // Fewest windows to train on.
+        (self.windows.width() + 2).max(20)
     }
 
     /// A process fitted to windows that were over before row `end`, and how many; `None` when these are too few. With
@@ -231,7 +223,8 @@ impl HorizonTask<'_> {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
             settings.start = start.to_vec();
-            settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
+            // Steps of a search that begins where the horizon before it ended.
+            settings.max_iterations = settings.max_iterations.min(20);
             settings.restarts = 0;
         }
         let rows = TrainingRows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
@@ -248,7 +241,8 @@ impl HorizonTask<'_> {
             // The forecast row may lie beyond the block: a block may be shorter than the horizon.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
-            let rows = chosen(&rows, BLOCK_WINDOWS);
+            // Most windows of a block that are judged for the interval.
+            let rows = chosen(&rows, 750);
             if rows.is_empty() {
                 continue;
             }
@@ -319,7 +313,8 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
 /// stretch: a fixed stride would always meet repeating rows, such as those of cycles, at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
-    let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * GOLDEN).fract() };
+    // Multiples of the golden ratio: their fractions fill a stretch evenly and never repeat.
+    let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * 0.618_033_988_749_894_9).fract() };
     let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
     (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
 }

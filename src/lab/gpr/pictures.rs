@@ -9,10 +9,6 @@ use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Sha
 
 /// Rows of the stretch that is drawn with its interval: each can be seen.
 const STRETCH: usize = 150;
-/// Most points of predicted against measured.
-const SCATTER: usize = 3000;
-/// Rows before the origin that a fan shows, at least.
-const BEFORE: usize = 60;
 
 /// Draws the cross-validation of every kernel, as SVG.
 ///
@@ -69,7 +65,8 @@ fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
 }
 
 fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
-    let every = truth.len().div_ceil(SCATTER).max(1);
+    // Most points of predicted against measured.
+    let every = truth.len().div_ceil(3000).max(1);
     let pairs = truth.iter().zip(&validated.folds.predictions).step_by(every);
     let mut pairs: Vec<(f64, f64)> = pairs.map(|(y, p)| (*y, p.mean)).collect();
     pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -134,7 +131,8 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
-    let rows = from.saturating_sub(BEFORE.max(2 * most))..(from + most + 1).min(data.len());
+    // Rows before the origin that a fan shows, at least.
+    let rows = from.saturating_sub((2 * most).max(60))..(from + most + 1).min(data.len());
     let x = |row: usize| row as f64 - from as f64;
     let at = |horizon: &HorizonForecast| horizon.steps as f64;
     let now = [(0.0, value(from), value(from))];

@@ -16,8 +16,6 @@ const UNITS: [&str; 36] = [
 ];
 /// Most rows of a regression: their numbers take some gigabytes.
 const MAX_ROWS: usize = 5_000_000;
-/// Most columns listed in an error.
-const MAX_LISTED: usize = 40;
 
 /// Treatment of a row without a required value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -256,7 +254,8 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     let found = if exact.is_empty() { all(&|column| stem(column) == Some(name)) } else { exact };
     let list = |columns: &mut dyn Iterator<Item = &String>| {
         let names: Vec<&str> = columns.map(String::as_str).collect();
-        let more = names.len().saturating_sub(MAX_LISTED);
+        // Most columns listed in an error.
+        let more = names.len().saturating_sub(40);
         let shown = names[..names.len() - more].join(", ");
         if more > 0 { format!("{shown} and {more} more") } else { shown }
     };

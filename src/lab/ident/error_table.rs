@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use super::fit::FittedTables;
 use super::grid::{Grid, arrhenius};
-use super::pass::residuals;
+use super::pass::{COLD_POWER, residuals};
 use super::record::Record;
 
 /// Length of a block, s.
@@ -24,10 +24,6 @@ const LEAN_SOC: f64 = 1.0;
 const UNSEEN: f64 = 3.0;
 /// A file visits a node when so much charge moved near it, as SOC.
 const VISIT_SOC: f64 = 0.005;
-/// Power of Arrhenius' factor by which error grows with cold.
-const COLD_POWER: f64 = 0.7;
-/// Least error assumed of a model, V.
-const LEAST_V: f64 = 0.001;
 
 /// Sums per node.
 struct NodeSums {
@@ -127,7 +123,8 @@ fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let of_node = |node: usize| {
         let files = if sums.files[node] > 0.0 { sums.files[node] } else { most_files };
         let variance = (sums.square[node] + LEAN_SOC * mean) / (sums.weight[node] + LEAN_SOC);
-        (variance * (1.0 + UNSEEN / files)).sqrt().max(LEAST_V)
+        // Least error assumed of a model, V.
+        (variance * (1.0 + UNSEEN / files)).sqrt().max(0.001)
     };
     Some(range.map(of_node).collect())
 }

@@ -20,11 +20,6 @@ pub mod solve;
 pub mod thermal;
 pub mod unanchored;
 
-/// A tester holds the voltage where the current is below this part of the load's, and the voltage at its lowest.
-const HELD_CURRENT: f64 = 0.97;
-/// Largest distance of a held voltage from the lowest, V.
-const HELD_VOLTAGE_V: f64 = 0.05;
-
 /// A stretch of rows over which time runs on.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
@@ -77,7 +72,8 @@ impl MeasuredPart {
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
             let current_a = self.current_a[row];
-            current_a > 0.0 && current_a < HELD_CURRENT * load_a && self.voltage_v[row] <= lowest_v + HELD_VOLTAGE_V
+            // A tester holds the voltage where the current is below 97 % of the load's, and the voltage within 50 mV of its lowest.
+            current_a > 0.0 && current_a < 0.97 * load_a && self.voltage_v[row] <= lowest_v + 0.05
         };
         let first = (0..=last).rev().take_while(|&row| is_held(row)).last().unwrap_or(last);
         charge_ah[last] - charge_ah[first]

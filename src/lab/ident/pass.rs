@@ -26,7 +26,7 @@ const FREE_REPEATS_S: f64 = 250.0;
 /// Part of the voltage drop by which a circuit is wrong.
 const DROP_ERROR: f64 = 0.05;
 /// Power of Arrhenius' factor by which a circuit's error grows with cold.
-const COLD_POWER: f64 = 0.7;
+pub const COLD_POWER: f64 = 0.7;
 /// Such errors from which on the cost grows linearly.
 const HUBER_ERRORS: f64 = 3.0;
 

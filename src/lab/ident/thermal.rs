@@ -8,10 +8,6 @@ use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
 
-/// Least warming of a usable record, K.
-const MIN_RISE_K: f64 = 2.0;
-/// Most a record may cool below its beginning, K: else it began warmer than its surroundings.
-const MAX_FALL_K: f64 = 1.0;
 /// Ranges of credible values: J/K, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
@@ -80,7 +76,8 @@ fn warms(record: &Record) -> bool {
     let temperatures = record.rows.iter().map(|row| row.temperature_c);
     let (low, high) = temperatures.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| (low.min(t), high.max(t)));
     let discharge = last.soc < first.soc;
-    discharge && high - first.temperature_c >= MIN_RISE_K && first.temperature_c - low <= MAX_FALL_K
+    // Cooled by more than 1 K: it began warmer than its surroundings.
+    discharge && high - first.temperature_c >= 2.0 && first.temperature_c - low <= 1.0
 }
 
 #[cfg(test)]

@@ -17,8 +17,6 @@ use crate::quantity::{CellIndex, Channel, Timestamp};
 const FIRST_DATE_S: f64 = 978_307_200.0;
 /// Largest difference between two statements about the new battery, fraction: they may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
-/// Where a cell's resistance is stated: half charge, 25 degrees C.
-const RESISTANCE_AT: (f64, f64) = (0.5, 25.0);
 
 /// What no record holds, from the command line. `None` = not given.
 #[derive(Debug, Clone, Copy, Default)]
@@ -321,10 +319,7 @@ impl<'a> Battery<'a> {
     /// Series resistance of a new cell, ohm.
     fn new_ohm(&self) -> Result<f64, String> {
         match self.monitor.model().state {
-            ModelState::Given | ModelState::Learned => {
-                let (soc, temperature_c) = RESISTANCE_AT;
-                Ok(self.model.r0_ohm(&self.model.grid_position(soc, temperature_c)))
-            }
+            ModelState::Given | ModelState::Learned => Ok(self.model.r0_ohm(&self.model.grid_position(0.5, 25.0))),
             ModelState::Prior | ModelState::Learning | ModelState::Unfit => {
                 Err("the resistance of a new cell is not known: no model file, and its own model is not learned yet"
                     .to_owned())

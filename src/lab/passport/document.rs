@@ -13,9 +13,6 @@ use super::standards;
 use crate::config::VehicleIdentity;
 use crate::io::stamp::format_utc;
 
-/// Version of the details.
-const VERSION: u32 = 1;
-
 /// Merges the known values into the manufacturer's part and checks the whole.
 ///
 /// # Errors
@@ -64,7 +61,7 @@ pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdent
     let vehicle: Map<String, Value> =
         vehicle.labels().into_iter().map(|(key, text)| (key.to_owned(), Value::from(text))).collect();
     json!({
-        "version": VERSION,
+        "version": 1,
         "program": format!("packwatch {}", env!("CARGO_PKG_VERSION")),
         "standard": standard.name(),
         "vehicle": vehicle,

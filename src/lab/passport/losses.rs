@@ -15,10 +15,6 @@
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{Channel, Fault, Timestamp};
 
-/// Largest part of the time of charges and discharges for which the current may be lost: far below the deviation of a current
-/// sensor's gain, and enough for single lost frames.
-const MAX_LOST_PART: f64 = 1e-3;
-
 /// How a replay's current and voltages are read.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
@@ -117,7 +113,9 @@ impl Losses {
 
 /// Whether so much of a time, s, is lost that its sum is not known.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    lost_s > MAX_LOST_PART * used_s
+    // Largest part of the time of charges and discharges for which the current may be lost: far below the deviation of a current
+    // sensor's gain, and enough for single lost frames.
+    lost_s > 1e-3 * used_s
 }
 
 #[cfg(test)]

@@ -42,13 +42,6 @@ pub(super) enum Kind {
     Reading,
 }
 
-/// Members of a document in a list.
-const DOCUMENT: [(&str, Kind); 3] = [("content", Kind::Text), ("contentType", Kind::Text), ("header", Kind::Text)];
-/// Members of a measured value.
-const READING: [(&str, Kind); 2] = [("value", Kind::Number), ("time", Kind::Time)];
-/// Member of a place in a list.
-const FACILITY: [(&str, Kind); 1] = [("facility", Kind::Partner("BPNA"))];
-
 /// A part of a document.
 #[derive(Debug)]
 pub(super) enum Shape {
@@ -114,9 +107,9 @@ impl Shape {
     fn of_kind(kind: Kind) -> Self {
         let list = |rows: &[(&str, Kind)]| Self::List { is_set: false, item: Box::new(Self::of_rows(rows)) };
         match kind {
-            Kind::Documents => list(&DOCUMENT),
-            Kind::Facilities => list(&FACILITY),
-            Kind::Reading => Self::of_rows(&READING),
+            Kind::Documents => list(&[("content", Kind::Text), ("contentType", Kind::Text), ("header", Kind::Text)]),
+            Kind::Facilities => list(&[("facility", Kind::Partner("BPNA"))]),
+            Kind::Reading => Self::of_rows(&[("value", Kind::Number), ("time", Kind::Time)]),
             kind => Self::Leaf(kind),
         }
     }

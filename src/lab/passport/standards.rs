@@ -11,8 +11,6 @@ use Kind::{
 
 const PERCENT: Kind = Within(0.0, 100.0);
 const AT_LEAST_0: Kind = Within(0.0, f64::INFINITY);
-/// Largest number of an unsigned integer of 32 bits, which the model names for cycles.
-const CYCLES: Kind = Within(0.0, 4_294_967_295.0);
 
 const LENGTH_UNIT: Kind = Choice(&[
     "unit:millimetre",
@@ -23,14 +21,6 @@ const LENGTH_UNIT: Kind = Choice(&[
     "unit:foot",
     "unit:yard",
 ]);
-const MASS_UNIT: Kind = Choice(&[
-    "unit:gram",
-    "unit:kilogram",
-    "unit:tonneMetricTon",
-    "unit:tonUsOrShortTonUkorus",
-    "unit:ounceAvoirdupois",
-    "unit:pound",
-]);
 const SHARE_UNIT: Kind = Choice(&[
     "unit:partPerMillion",
     "unit:percent",
@@ -39,7 +29,6 @@ const SHARE_UNIT: Kind = Choice(&[
     "unit:partPerTrillionUs",
     "unit:partPerBillionUs",
 ]);
-const LIFE_UNIT: Kind = Choice(&["unit:day", "unit:month", "unit:year", "unit:cycle", "unit:runningOrOperatingHour"]);
 const SUBSTANCE: Kind = Choice(&["CAS", "EC", "IUPAC"]);
 const FOOTPRINT: Kind = Choice(&[
     "Climate Change Total",
@@ -98,7 +87,8 @@ const PRODUCT_CONDITION: &[(&str, Kind)] = &[
     ("EnergyThroughput?.LastUpdate", Time),
     ("CapacityThroughput?.CapacityThroughputValue", Number),
     ("CapacityThroughput?.LastUpdate", Time),
-    ("NumberOfFullCycles.NumberOfFullCyclesValue", CYCLES),
+    // Largest number of an unsigned integer of 32 bits, which the model names for cycles.
+    ("NumberOfFullCycles.NumberOfFullCyclesValue", Within(0.0, 4_294_967_295.0)),
     ("NumberOfFullCycles.LastUpdate", Time),
     ("StateOfCertifiedEnergy?.StateOfCertifiedEnergyValue", Number),
     ("StateOfCertifiedEnergy?.LastUpdate", Time),
@@ -152,7 +142,10 @@ const BATTERY_PASS: &[(&str, Kind)] = &[
     ("operation.manufacturer.manufacturer", Partner("BPNL")),
     ("operation.manufacturer.manufacturingDate?", Date),
     ("characteristics.warranty.lifeValue", Number),
-    ("characteristics.warranty.lifeUnit", LIFE_UNIT),
+    (
+        "characteristics.warranty.lifeUnit",
+        Choice(&["unit:day", "unit:month", "unit:year", "unit:cycle", "unit:runningOrOperatingHour"]),
+    ),
     ("characteristics.physicalDimension.height?.value", Number),
     ("characteristics.physicalDimension.height?.unit", LENGTH_UNIT),
     ("characteristics.physicalDimension.length?.value", Number),
@@ -160,7 +153,17 @@ const BATTERY_PASS: &[(&str, Kind)] = &[
     ("characteristics.physicalDimension.width?.value", Number),
     ("characteristics.physicalDimension.width?.unit", LENGTH_UNIT),
     ("characteristics.physicalDimension.weight.value", Number),
-    ("characteristics.physicalDimension.weight.unit", MASS_UNIT),
+    (
+        "characteristics.physicalDimension.weight.unit",
+        Choice(&[
+            "unit:gram",
+            "unit:kilogram",
+            "unit:tonneMetricTon",
+            "unit:tonUsOrShortTonUkorus",
+            "unit:ounceAvoirdupois",
+            "unit:pound",
+        ]),
+    ),
     ("sustainability.documents.separateCollection", Documents),
     ("sustainability.documents.wastePrevention", Documents),
     ("sustainability.documents.euTaxonomyDisclosureStatement?", Documents),

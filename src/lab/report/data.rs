@@ -11,9 +11,6 @@ use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
 use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
-/// Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
-const FIRST_DATE_S: f64 = 3.0e8;
-
 /// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
@@ -220,17 +217,17 @@ impl Data {
     }
 
     fn take_capacity(&mut self, time_s: f64, fields: &Fields) {
-        const UNKNOWN: (f64, f64) = (f64::NAN, f64::NAN);
+        let unknown = (f64::NAN, f64::NAN);
         let Some(cell) = cell_of(fields) else { return };
         self.learned.push(CapacityRecord {
             time_s,
             cell,
             measured_ah: fields.number("measured_ah"),
             measured_std_ah: fields.number("measured_std_ah"),
-            capacity_ah: fields.pair("capacity_ah", "capacity_std_ah").unwrap_or(UNKNOWN),
+            capacity_ah: fields.pair("capacity_ah", "capacity_std_ah").unwrap_or(unknown),
             usable_ah: fields.pair("usable_capacity_ah", "usable_capacity_std_ah"),
             losses: None,
-            resistance: fields.pair("resistance_ratio", "resistance_ratio_std").unwrap_or(UNKNOWN),
+            resistance: fields.pair("resistance_ratio", "resistance_ratio_std").unwrap_or(unknown),
         });
     }
 
@@ -326,7 +323,8 @@ impl Data {
 
     /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
-        self.first_s >= FIRST_DATE_S
+        // Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
+        self.first_s >= 3.0e8
     }
 
     /// Number of cells with data.

@@ -12,8 +12,6 @@ use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
-/// Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
-const DEFAULT_GAIN_STD: f64 = 0.005;
 /// Points of a fan.
 const POINTS: usize = 60;
 /// Longest fan: medians until the end of life, and lengths of the record.
@@ -91,7 +89,8 @@ fn display(why: InsufficientData) -> String {
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
 pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
-    let gain_std = context.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
+    // Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
+    let gain_std = context.config.map_or(0.005, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> =
         data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();

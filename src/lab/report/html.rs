@@ -110,9 +110,6 @@ const SECTIONS: [Section; 9] = [
     },
 ];
 
-/// Style of the page; its colours are those of the pictures.
-const STYLE: &str = include_str!("page.css");
-
 /// Renders the page.
 pub fn page(data: &Data, context: &PageContext<'_>) -> String {
     let outlook = forecast::outlook(data, context);
@@ -154,7 +151,7 @@ fn head(title: &str) -> Markup {
                 content="default-src 'none'; style-src 'unsafe-inline'; img-src data:";
             link rel="icon" href="data:,";
             title { (title) }
-            style { (PreEscaped(variables())) (PreEscaped(STYLE)) }
+            style { (PreEscaped(variables())) (PreEscaped(include_str!("page.css"))) }
         }
     }
 }

@@ -9,11 +9,6 @@ use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
 
 /// SOC and temperatures, degrees C, that are judged.
 const SOC_STEPS: u32 = 20;
-const TEMPERATURES_C: [f64; 8] = [-20.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0];
-/// SOC between which the curve's error is averaged, steps.
-const MIDDLE: std::ops::RangeInclusive<u32> = 2..=18;
-/// A cold temperature beside that of the curve, degrees C.
-const COLD_C: f64 = 0.0;
 /// SOC at which resistances are stated.
 const HALF: f64 = 0.5;
 
@@ -73,7 +68,7 @@ pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
 }
 
 fn curve(bands: &ModelBands<'_>) -> String {
-    let std_v = MIDDLE.map(|k| bands.curve_std_v(soc(k))).collect::<Option<Vec<f64>>>();
+    let std_v = (2..=18).map(|k| bands.curve_std_v(soc(k))).collect::<Option<Vec<f64>>>();
     let mean_square = |values: Vec<f64>| values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
     std_v.map(mean_square).map_or_else(
         || "unknown: the model states no error".to_owned(),
@@ -90,7 +85,7 @@ fn resistance(sourced: &SourcedModel, bands: &ModelBands<'_>) -> String {
         let milliohm = 1e3 * sourced.model.settled_ohm(&sourced.model.grid_position(HALF, t));
         format!("{milliohm:.2} m\u{3a9} \u{b1} {:.0} % at {t:.0} \u{b0}C", 100.0 * bands.resistance(HALF, t).std())
     };
-    format!("{}, {}", at(CURVE_C), at(COLD_C))
+    format!("{}, {}", at(CURVE_C), at(0.0))
 }
 
 fn seen(coverage: &Coverage) -> String {
@@ -118,7 +113,11 @@ fn unknown_soc(sourced: &SourcedModel) -> String {
 }
 
 fn unknown_temperatures(sourced: &SourcedModel) -> String {
-    unknown(TEMPERATURES_C.into_iter().map(|t| (t, sourced.resistances_known_by(t))), 1.0, "\u{b0}C")
+    unknown(
+        [-20.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0].into_iter().map(|t| (t, sourced.resistances_known_by(t))),
+        1.0,
+        "\u{b0}C",
+    )
 }
 
 /// Neighbouring places that are not known by data, in words.

@@ -8,7 +8,8 @@ use super::forecast::{self, Outlook};
 use super::limits::thresholds;
 use super::series::{self, CellStep};
 use super::summary;
-use super::trace::{OF_95, TraceBin};
+use super::trace::TraceBin;
+use crate::OF_95;
 use crate::alarm::Rule;
 use crate::chart::{
     self, Axis, Chart, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
@@ -18,14 +19,6 @@ use crate::{finding_pictures, model_pictures};
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
     "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
-
-/// A gap of this part of the whole interrupts a line, if it is also this long: some sensors are slow.
-const MAX_HOLE_PART: usize = 100;
-const MAX_HOLE_S: f64 = 100.0;
-/// Fewest bins of such a gap.
-const MAX_HOLE_BINS: usize = 3;
-/// The last half-cycles get their own picture when they are at most this part of the record.
-const MAX_RECENT: f64 = 0.9;
 
 /// Writes every picture of the report into a folder, as SVG; returns the number of pictures.
 ///
@@ -150,7 +143,8 @@ fn range(
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
     let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
-    let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
+    // A gap of this part of the whole interrupts a line, if it is also 100 s and 3 bins long: some sensors are slow.
+    let hole = (all.len() / 100).max((100.0 / width_s) as usize).max(3);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
         let is_filled = bin.soc.0 <= bin.soc.1;
@@ -182,7 +176,7 @@ fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
     // Almost the whole record: the picture before shows it.
-    if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
+    if moments.last()?.0 - moments.first()?.0 > 0.9 * (last_s - first_s) {
         return None;
     }
     let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);

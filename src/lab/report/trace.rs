@@ -6,11 +6,6 @@ use super::bins::{Bin, Bins};
 use crate::cell::Coverage;
 use crate::monitor::Estimate;
 
-/// Half of a 95 % interval, standard deviations.
-pub(super) const OF_95: f64 = 1.96;
-/// Charges and discharges kept in detail, the last ones, each with the rest after it.
-const DETAILED: usize = 6;
-
 /// The estimates of a stretch of time, of all cells.
 #[derive(Debug, Clone)]
 pub(super) struct TraceBin {
@@ -54,7 +49,7 @@ impl TraceBin {
     fn take(&mut self, e: &Estimate) {
         let [soc, temperature_c, innovation_v] =
             [e.soc, e.measured.temperature_c, e.innovation_v].map(|value| (value, value));
-        let soc_band = (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std);
+        let soc_band = (e.soc - crate::OF_95 * e.soc_std, e.soc + crate::OF_95 * e.soc_std);
         self.join(&Self { soc, soc_band, temperature_c, innovation_v, health: Consistency::of(e) });
     }
 }
@@ -75,7 +70,7 @@ impl Consistency {
         if !parts.is_finite() {
             return Self::default();
         }
-        let (inside, gated) = (u64::from(parts.abs() <= OF_95), u64::from(!e.accepted));
+        let (inside, gated) = (u64::from(parts.abs() <= crate::OF_95), u64::from(!e.accepted));
         Self { count: 1, inside, gated, squares: parts * parts }
     }
 
@@ -129,7 +124,8 @@ impl Trace {
     /// Starts the bins of a charge or discharge.
     pub(super) fn turn(&mut self, time_s: f64) {
         self.recent.push_back(Bins::new(time_s));
-        while self.recent.len() > DETAILED {
+        // Charges and discharges kept in detail, the last ones, each with the rest after it.
+        while self.recent.len() > 6 {
             self.recent.pop_front();
         }
     }

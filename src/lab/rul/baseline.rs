@@ -3,28 +3,17 @@
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first passes the threshold.
 
-/// The straight line goes through this part of the points, the last ones.
-const LAST_PART: f64 = 0.3;
-/// Fewest points of the straight line, where the history has as many.
-const LAST_POINTS: usize = 5;
-/// A curve is followed until this many times the use so far.
-const FOLLOWED: f64 = 20.0;
 /// Steps it is followed in.
 const STEPS: u32 = 20_000;
-/// Starts of the search for the exponents, e-folds over the use so far: both falling, one rising, nearly straight.
-const STARTS: [[f64; 2]; 4] = [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]];
 /// First step of that search, and the step at which it ends.
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Most moves of that search: a search that needs more creeps along a flat valley.
-const MAX_MOVES: u32 = 400;
 /// Exponents beyond this are not tried: e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
-/// A determinant below this share of its terms: both exponentials coincide.
-const SINGULAR: f64 = 1e-12;
 
 /// Straight line of least squares through the last points; `None` = it does not fall.
 pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
-    let wanted = ((LAST_PART * points.len() as f64) as usize).max(LAST_POINTS);
+    // The straight line goes through this part of the points, the last ones.
+    let wanted = ((0.3 * points.len() as f64) as usize).max(5);
     let last = &points[points.len().saturating_sub(wanted)..];
     let count = last.len() as f64;
     let [used, capacity] = [0, 1].map(|axis| last.iter().map(|point| point[axis]).sum::<f64>() / count);
@@ -44,10 +33,13 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
         return None;
     }
     let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
-    let found = STARTS.iter().filter_map(|&start| search(start, &fit));
+    // Starts of the search for the exponents, e-folds over the use so far: both falling, one rising, nearly straight.
+    let found =
+        [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]].into_iter().filter_map(|start| search(start, &fit));
     let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;
     let capacity = |used: f64| a * (b * used / scale).exp() + c * (d * used / scale).exp();
-    let step = (FOLLOWED - 1.0) * scale / f64::from(STEPS);
+    // A curve is followed until 20 times the use so far.
+    let step = 19.0 * scale / f64::from(STEPS);
     (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
 }
 
@@ -56,14 +48,15 @@ type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
 /// Pattern search: takes a better neighbour and doubles the step, else halves the step.
 fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> Option<ExponentialFit> {
-    const NEIGHBOURS: [[f64; 2]; 8] =
+    let neighbours: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
-    for _ in 0..MAX_MOVES {
+    // Most moves of that search: a search that needs more creeps along a flat valley.
+    for _ in 0..400 {
         if step < SEARCH.1 {
             break;
         }
-        let around = NEIGHBOURS.iter().map(|n| [0, 1].map(|i| (best.2[i] + step * n[i]).clamp(-STEEPEST, STEEPEST)));
+        let around = neighbours.iter().map(|n| [0, 1].map(|i| (best.2[i] + step * n[i]).clamp(-STEEPEST, STEEPEST)));
         match around.filter_map(fit).min_by(|x, y| x.0.total_cmp(&y.0)) {
             Some(better) if better.0 < best.0 => (best, step) = (better, 2.0 * step),
             _ => step *= 0.5,
@@ -86,7 +79,8 @@ fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Expone
     }
     let determinant = xx * yy - xy * xy;
     // Not above covers NaN too.
-    if !matches!(determinant.partial_cmp(&(SINGULAR * xx * yy)), Some(std::cmp::Ordering::Greater)) {
+    // A determinant below this share of its terms: both exponentials coincide.
+    if !matches!(determinant.partial_cmp(&(1e-12 * xx * yy)), Some(std::cmp::Ordering::Greater)) {
         return None;
     }
     let factors = [(xc * yy - yc * xy) / determinant, (yc * xx - xc * xy) / determinant];

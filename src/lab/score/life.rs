@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 
+use super::ScoreSettings;
 use super::cycles::CycleTable;
 use super::soc::{largest, mean};
-use super::{STD_OF_95, ScoreSettings};
+use crate::OF_95;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::Mode;
 
@@ -108,7 +109,7 @@ impl LifeRecorder {
 fn score(each: Vec<DischargeScore>, table: &CycleTable, threshold_ah: f64, skip: usize) -> LifeScore {
     let counted = each.iter().filter(|d| d.number > skip);
     let pairs: Vec<(f64, f64)> =
-        counted.clone().filter_map(|d| Some((d.usable_ah - d.truth_ah?, STD_OF_95 * d.usable_std_ah))).collect();
+        counted.clone().filter_map(|d| Some((d.usable_ah - d.truth_ah?, OF_95 * d.usable_std_ah))).collect();
     let mut truths = (1..).zip(&table.discharges).skip(skip);
     LifeScore {
         discharges: table.discharges.len(),

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::Case;
 use super::life::{DischargeScore, LifeScore};
 use super::soc::SocSample;
-use super::{Case, STD_OF_95};
+use crate::OF_95;
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
 /// Words for an error of the capacity and one of the current.
@@ -70,7 +71,7 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         title,
         "usable capacity, Ah",
         vec![
-            band(each.iter().map(|d| (number(d), d.usable_ah, STD_OF_95 * d.usable_std_ah))),
+            band(each.iter().map(|d| (number(d), d.usable_ah, OF_95 * d.usable_std_ah))),
             Layer::line("published", Ink::Plain, each.iter().filter_map(|d| Some((number(d), d.truth_ah?)))),
             Layer::line("estimate", Ink::Orange, each.iter().map(|d| (number(d), d.usable_ah))),
         ],
@@ -79,7 +80,7 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         "",
         "capacity, Ah",
         vec![
-            band(each.iter().map(|d| (number(d), d.capacity_ah, STD_OF_95 * d.capacity_std_ah))),
+            band(each.iter().map(|d| (number(d), d.capacity_ah, OF_95 * d.capacity_std_ah))),
             Layer::line("estimate", Ink::Blue, each.iter().map(|d| (number(d), d.capacity_ah))),
         ],
     );
@@ -87,7 +88,7 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         "",
         "resistance, times new",
         vec![
-            band(each.iter().map(|d| (number(d), d.resistance_ratio, STD_OF_95 * d.resistance_ratio_std))),
+            band(each.iter().map(|d| (number(d), d.resistance_ratio, OF_95 * d.resistance_ratio_std))),
             Layer::line("estimate", Ink::Green, each.iter().map(|d| (number(d), d.resistance_ratio))),
         ],
     );

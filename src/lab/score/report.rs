@@ -23,10 +23,6 @@ pub struct ScoreReport {
     pub scores: Vec<CaseScore>,
 }
 
-/// Columns of the table of SOC errors.
-const SOC_HEADS: [&str; 11] =
-    ["file", "case", "RMSE", "mean", "max", "converged", "in 95 %", "+/-", "NIS", "resets", "samples"];
-
 /// Columns of the table of capacity errors.
 #[rustfmt::skip]
 fn life_heads(below: &str) -> [&str; 12] {
@@ -120,7 +116,11 @@ impl ScoreReport {
             out += &format!(
                 "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min\n"
             );
-            out += &text_table(&SOC_HEADS, self.soc_rows(), 2);
+            out += &text_table(
+                &["file", "case", "RMSE", "mean", "max", "converged", "in 95 %", "+/-", "NIS", "resets", "samples"],
+                self.soc_rows(),
+                2,
+            );
         }
         if self.scores.iter().any(|score| score.life.is_some()) {
             out += &format!("\nusable capacity after {} discharges\n", settings.skip_cycles);

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::STD_OF_95;
+use crate::OF_95;
 
 /// An estimate this near the truth is right, points (percent of full).
 pub const CONVERGED_POINTS: f64 = 2.0;
@@ -32,7 +32,7 @@ impl SocSample {
 
     /// Half of the 95 % interval, points.
     pub(super) fn half_width_points(&self) -> f64 {
-        100.0 * STD_OF_95 * self.soc_std
+        100.0 * OF_95 * self.soc_std
     }
 }
 

@@ -44,8 +44,8 @@ fn moved_as(part: &MeasuredPart) -> Vec<f64> {
 
 /// Uniform in [0, 1).
 fn uniform(generator: &mut ChaCha8Rng) -> f64 {
-    const UNIT: f64 = 1.0 / (1_u64 << 53) as f64;
-    (generator.next_u64() >> 11) as f64 * UNIT
+    let unit = 1.0 / (1_u64 << 53) as f64;
+    (generator.next_u64() >> 11) as f64 * unit
 }
 
 #[cfg(test)]

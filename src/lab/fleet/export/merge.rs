@@ -135,7 +135,7 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
 
 /// The first few names.
 fn some_of(names: &[&str]) -> String {
-    const SHOWN: usize = 8;
-    let more = if names.len() > SHOWN { ", ..." } else { "" };
-    names[..names.len().min(SHOWN)].join(", ") + more
+    let shown: usize = 8;
+    let more = if names.len() > shown { ", ..." } else { "" };
+    names[..names.len().min(shown)].join(", ") + more
 }

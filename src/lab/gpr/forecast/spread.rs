@@ -6,8 +6,8 @@
 //! 95 % quantile of ratio / spread over all judged windows, each with a spread computed without it and the windows that
 //! overlap it. Half the interval is factor x spread x standard deviation.
 
-/// Half width of a Gaussian 95 % interval, standard deviations.
-pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
+use crate::regress::GAUSSIAN;
+
 /// Nearest judged windows that determine the spread at a place.
 const NEAR: usize = 20;
 /// Weight of the mean of all among them, in windows.
