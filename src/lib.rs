@@ -90,7 +90,8 @@
 //! | a package: its files; its program and processor; all of them | `/systemd/tree`; `/systemd/program`, `/systemd/architectures`; `/systemd/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //! | what a score is asked for, its tables and document | `lab/score/request.rs`, `lab/score/report.rs`; the cell's configuration: `lab/single_cell.rs` |
-//! | a column of a measured file, the Battery Data Format | `lab/measured.rs` |
+//! | a column of a CSV log or measured file, the Battery Data Format | `host/io/csv_log.rs` (`SampleColumns`) |
+//! | a column of a table of capacities (history, cycles, truth, reference) | `lab/capacity_table.rs` |
 //! | a class or function of the Python module | `python/NAME.rs`, its type in `python/packwatch/_packwatch.pyi` |
 //!
 //! # Invariants

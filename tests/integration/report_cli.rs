@@ -120,7 +120,7 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
     assert!(page.contains("reference 1.900 Ah"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
     let printed = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
-    assert!(printed.contains("measured.csv:2: column capacity_ah: found \"much\", must be a number"), "{printed}");
+    assert!(printed.contains("measured.csv:2: column capacity_ah: found \"much\", must be Ah above 0"), "{printed}");
     assert!(bad(&["report", "-o", &place.path("b.html"), "--state", &place.path("none")]).contains("no history there"));
     assert!(bad(&["report", "-c", &config(), &log, "-o", &log]).contains("is read, cannot be written too"));
 }
