@@ -151,10 +151,10 @@ class Store:
         database = sqlite3.connect(f"file:{folder / 'packwatch.db'}?mode=ro", uri=True, timeout=10)
         self.integrity = database.execute("PRAGMA integrity_check").fetchone()[0]
         self.half_cycles = database.execute("SELECT moment, cell, mode, charge_ah FROM half_cycle ORDER BY moment, cell").fetchall()
-        self.capacities = database.execute("SELECT seq, cell, capacity_ah, hash FROM capacity ORDER BY seq").fetchall()
-        rows = database.execute("SELECT seq, rule, severity, cell, change, hash FROM alarm ORDER BY seq").fetchall()
-        self.alarms = [(seq, RULES.index(rule) + 1, SEVERITIES[severity], 2047 if cell is None else cell, change, hash)
-                       for seq, rule, severity, cell, change, hash in rows]
+        self.capacities = database.execute("SELECT seq, cell, capacity_ah FROM capacity ORDER BY seq").fetchall()
+        rows = database.execute("SELECT seq, rule, severity, cell, change FROM alarm ORDER BY seq").fetchall()
+        self.alarms = [(seq, RULES.index(rule) + 1, SEVERITIES[severity], 2047 if cell is None else cell, change)
+                       for seq, rule, severity, cell, change in rows]
         database.close()
 
     def counts(self) -> tuple[int, int, int]:

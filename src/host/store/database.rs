@@ -30,25 +30,12 @@ use super::stamp::Stamp;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::monitor::{EventKind, LearnedCell};
 
-/// "pkwt": marks the file for file(1).
-const APPLICATION_ID: i32 = 0x706B_7774;
 /// The format that this program reads and writes.
 pub(super) const FORMAT: i32 = 1;
-/// Bytes of a page: a commit changes few bytes, and whole pages are written.
-const PAGE_BYTES: u32 = 1024;
-/// Pages in the write-ahead log after which SQLite copies them into the main file: half a megabyte, some fifty commits.
-const AUTOCHECKPOINT_PAGES: u32 = 512;
-/// SQLite truncates a larger log to this, bytes.
-const MAX_LOG_BYTES: u32 = 1 << 20;
-/// Memory for pages, KiB.
-const CACHE_KIB: u32 = 256;
 /// Longest wait of a commit for a reader that locks the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
 /// Longest check of the file at the start; damage beyond it is found when that part is read.
 const MAX_CHECK: Duration = Duration::from_secs(2);
-/// Virtual machine steps between two readings of the clock during that check.
-const CHECK_STEPS: i32 = 10_000;
-
 /// The tables other than those of [`HistoryTable`].
 const TABLES: &str = "
 CREATE TABLE meta (id INTEGER PRIMARY KEY CHECK (id = 1), segments INTEGER NOT NULL, vehicle TEXT) STRICT;
@@ -284,31 +271,36 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
             format!("CREATE TABLE {} (seq INTEGER PRIMARY KEY, moment INTEGER NOT NULL{columns}) STRICT", table.name());
         transaction.execute(&sql, [])?;
     }
-    transaction.pragma_update(None, "application_id", APPLICATION_ID)?;
+    // "pkwt": marks the file for file(1).
+    transaction.pragma_update(None, "application_id", 0x706B_7774)?;
     transaction.pragma_update(None, "user_version", FORMAT)?;
     transaction.commit()
 }
 
 /// Settings of the connection, and of the file while it is new.
 fn prepare(connection: &Connection) -> rusqlite::Result<()> {
-    connection.pragma_update(None, "page_size", PAGE_BYTES)?;
+    // Bytes: a commit changes few of them, and whole pages are written.
+    connection.pragma_update(None, "page_size", 1024)?;
     let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
     if mode != "wal" {
         // A file system without shared memory. As safe, but every commit is written and synced twice.
         tracing::warn!(mode, "the file system does not support a write-ahead log: the database writes more");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
-    connection.pragma_update(None, "cache_size", -i64::from(CACHE_KIB))?;
+    // KiB.
+    connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;
-    connection.query_row(&format!("PRAGMA journal_size_limit = {MAX_LOG_BYTES}"), [], |_| Ok(()))?;
-    connection.query_row(&format!("PRAGMA wal_autocheckpoint = {AUTOCHECKPOINT_PAGES}"), [], |_| Ok(()))
+    // At half a megabyte of log, some fifty commits, SQLite copies it into the main file; a log of more than 1 MiB is truncated.
+    connection.query_row("PRAGMA journal_size_limit = 1048576", [], |_| Ok(()))?;
+    connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }
 
 /// Checks the file, for a bounded time.
 fn check(connection: &mut Connection) -> Result<(), OpenError> {
     let started = Instant::now();
-    connection.progress_handler(CHECK_STEPS, Some(move || started.elapsed() > MAX_CHECK))?;
+    // Reads the clock every 10,000 steps of SQLite's virtual machine.
+    connection.progress_handler(10_000, Some(move || started.elapsed() > MAX_CHECK))?;
     let found = connection.query_row("PRAGMA quick_check(1)", [], |row| row.get::<_, String>(0));
     connection.progress_handler(0, None::<fn() -> bool>)?;
     match found {

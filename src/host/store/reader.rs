@@ -136,7 +136,7 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read to the end.
     pub fn verify(&self) -> Result<ChainReport, String> {
-        segments::verify(&self.connection).map_err(|error| self.named(&error))
+        self.at_once(segments::verify)
     }
 
     /// What contradicts the chain's end as it was noted elsewhere; `None` = nothing.
@@ -144,7 +144,13 @@ impl HistoryReader {
     /// # Errors
     /// When the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
-        segments::contradiction(&self.connection, noted).map_err(|error| self.named(&error))
+        self.at_once(|connection| segments::contradiction(connection, noted))
+    }
+
+    /// Reads several times from the file as it is now, whatever a daemon writes meanwhile.
+    fn at_once<T>(&self, read: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, String> {
+        let snapshot = self.connection.unchecked_transaction();
+        snapshot.and_then(|snapshot| read(&snapshot)).map_err(|error| self.named(&error))
     }
 
     /// The stored snapshot; `None` = there is none, or it is damaged.

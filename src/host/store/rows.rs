@@ -78,7 +78,7 @@ impl HistoryTable {
         }
     }
 
-    /// Its columns, the cell (from 0) first, without the moment, the sequence number and the hash.
+    /// Its columns, the cell (from 0) first, without the moment and the number.
     pub const fn columns(self) -> &'static [&'static str] {
         match self {
             Self::HalfCycle => &[

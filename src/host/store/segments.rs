@@ -78,10 +78,17 @@ impl Segment {
     /// The segment for rows of this moment: this one, or a new one after it.
     pub(super) fn at(self, connection: &Connection, stamp: &Stamp) -> rusqlite::Result<Self> {
         let day = stamp.wall_ns.div_euclid(NS_PER_DAY);
-        if self.id > 0 && self.day == day && self.last < self.first + MAX_ROWS - 1 {
+        if self.id > 0 && self.day == day && self.last.saturating_sub(self.first) < MAX_ROWS - 1 {
             return Ok(self);
         }
-        let next = Self { id: self.id + 1, day, first: self.last + 1, half_cycles: 0, is_deleted: false, ..self };
+        let next = Self {
+            id: self.id.saturating_add(1),
+            day,
+            first: self.last.saturating_add(1),
+            half_cycles: 0,
+            is_deleted: false,
+            ..self
+        };
         connection.execute("UPDATE meta SET segments = ?1", [next.id])?;
         Ok(next)
     }
@@ -94,9 +101,9 @@ impl Segment {
         moment: &[Value],
         values: &[Value],
     ) -> rusqlite::Result<()> {
-        self.last += 1;
+        self.last = self.last.saturating_add(1);
         self.hash = link(&self.hash, table, self.last, moment.iter().chain(values));
-        self.half_cycles += i64::from(table == HistoryTable::HalfCycle);
+        self.half_cycles = self.half_cycles.saturating_add((table == HistoryTable::HalfCycle).into());
         let places: String = (0..values.len()).map(|_| ", ?").collect();
         let sql =
             format!("INSERT INTO {} (seq, moment, {}) VALUES (?, ?{places})", table.name(), table.columns().join(", "));
@@ -118,7 +125,7 @@ impl Segment {
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
         let mut rows: BTreeMap<(i64, HistoryTable), Vec<Value>> = BTreeMap::new();
         // A damaged number must not fill the memory.
-        let last = last.min(self.first + MAX_ROWS + backlog::MAX_ROWS as i64);
+        let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
             let sql = format!(
                 "SELECT r.seq, m.id, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r LEFT JOIN moment m ON m.id = \
@@ -206,7 +213,7 @@ pub(super) fn delete_oldest(
             )?
             .exists(params![newest.id, horizon_ns, SANE_WALL_NS, BootId::REPLAY.0])
     };
-    if newest.last - oldest.first < max_rows && !horizon_ns.map_or(Ok(false), is_old)? {
+    if newest.last.saturating_sub(oldest.first) < max_rows && !horizon_ns.map_or(Ok(false), is_old)? {
         return Ok(());
     }
     for table in HistoryTable::ALL {
@@ -260,11 +267,11 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
         if report.broken.is_none() {
             report.broken = judge(connection, &before, &segment)?;
         }
-        let rows = segment.last - before.last;
+        let rows = segment.last.saturating_sub(before.last);
         if segment.is_deleted {
-            report.deleted_rows += rows;
+            report.deleted_rows = report.deleted_rows.saturating_add(rows);
         } else if report.broken.is_none() {
-            report.good_rows += rows;
+            report.good_rows = report.good_rows.saturating_add(rows);
         }
         newest = segment;
     }
@@ -280,9 +287,9 @@ fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqli
     let Segment { id, first, last, is_deleted, hash, .. } = *segment;
     let broken = |expected, found| Some(BrokenSegment { segment: id, rows: [first, last], expected, found });
     // Segments are deleted from the oldest on.
-    let is_continued = id == before.id + 1 && first == before.last + 1 && last >= first;
-    if !is_continued || (is_deleted && !before.is_deleted && before.id > 0) {
-        let expected = format!("segment {} from row {} on", before.id + 1, before.last + 1);
+    let [next, row] = [before.id, before.last].map(|number| number.saturating_add(1));
+    if (id, first) != (next, row) || last < first || (is_deleted && !before.is_deleted && before.id > 0) {
+        let expected = format!("segment {next} from row {row} on");
         let state = if is_deleted { ", deleted" } else { "" };
         return Ok(broken(expected, format!("segment {id} from row {first} to {last}{state}")));
     }
@@ -305,8 +312,8 @@ fn judge_number(
     let stored: i64 = connection.query_row(&format!("SELECT {}", counts.join(" + ")), [], |row| row.get(0))?;
     let of = |segments: i64, rows: i64| format!("{segments} segments, {rows} rows");
     Ok((noted != newest.id || stored != rows).then(|| BrokenSegment {
-        segment: newest.id + 1,
-        rows: [newest.last + 1; 2],
+        segment: newest.id.saturating_add(1),
+        rows: [newest.last.saturating_add(1); 2],
         expected: of(noted, rows),
         found: of(newest.id, stored),
     }))

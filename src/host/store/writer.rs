@@ -182,6 +182,8 @@ impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         self.reserve.make();
+        // One that fails is opened again, and then reported.
+        self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);
             let PendingWrite { batches, state, sets_aside, ticket, stop } = work;
