@@ -12,11 +12,11 @@
 //! | | [`sample`] | plausibility of readings, alignment of values of different times and rates |
 //! | | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
 //! | | [`health`] | charge/discharge transitions, capacity, recharge period, usable capacity, remaining life |
-//! | | [`findings`] | each cell against its pack: leaks, contacts, weak cells, channels |
+//! | | [`cell_faults`] | each cell against its pack: leaks, contacts, weak cells, channels |
 //! | | [`alarm`] | alarm rules over named values, debounce, hysteresis, latch |
 //! | | [`monitor`] | wires the stages above: `Input` in, `Outputs` out, snapshot and restore |
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
-//! | | [`doctor`] | judges wiring and configuration from the frames of a bus |
+//! | | [`wiring`] | what signals show of themselves (`evidence`); judges wiring and configuration from the frames of a bus |
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | `src/host` | [`config`] | TOML to checked settings, all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, files of results and events |
@@ -78,7 +78,7 @@
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
 //! | what an OBDb signal set becomes | `lab/import/obdb.rs`, one signal: `lab/import/obdb/signal.rs` |
 //! | what a BPX file becomes | `lab/import/bpx/curve.rs` (open-circuit voltage), `lab/import/bpx/circuit.rs` (resistances) |
-//! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `lab/discover/words.rs` (names); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
+//! | which signals `discover` proposes, and why | `lab/discover/judge.rs` (points), `core/wiring/evidence/label.rs` (names, units); fields without a definition: `lab/discover/raw.rs` (answers), `lab/discover/fields.rs` (messages) |
 //! | a finding of the doctor | `core/wiring/judge` |
 //! | how well a cell model is known, what measurement is advised | `core/cell/model_bands.rs`, `core/cell/model_bands/advice.rs` |
 //! | what a cell model file holds | `host/config/cell_model/keys.rs`, `read.rs` (read), `host/config/cell_model/write.rs` (written) |

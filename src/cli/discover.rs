@@ -15,9 +15,10 @@ use crate::config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource, Record};
 use crate::io::result_file::{ResultFile, check_place};
-use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection, Quantity};
+use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection};
 use crate::lab::import::obdb::ObdbSettings;
 use crate::replay::ReplayProgress;
+use crate::wiring::evidence::PackQuantity;
 use packwatch_host::failure::Failure;
 
 /// Candidates shown of a quantity.
@@ -187,7 +188,7 @@ fn page(discovery: &Discovery) -> String {
     for remark in &discovery.remarks {
         text += &format!("{remark}\n");
     }
-    for quantity in Quantity::ALL {
+    for quantity in PackQuantity::ALL {
         text += &format!("\n{}\n", quantity.name());
         let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
         let rows: Vec<Vec<String>> = found.take(SHOWN).map(row).collect();

@@ -16,7 +16,7 @@ use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 use crate::io::csv_log::CsvOptions;
 use crate::replay::ReplayProgress;
-use crate::wiring::{Finding, Report, Severity, Topic};
+use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
 
 /// Longest time to listen, s: a day.
@@ -103,7 +103,7 @@ fn source_name(args: &Args, survey: &Survey) -> String {
     args.logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
-fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
+fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
     let csv = CsvOptions {
         columns: args.columns.clone(),
         charge_positive: args.csv_sign == CsvSign::Charge,
@@ -120,14 +120,14 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     let (mut report, counts) = result.map_err(|error| Failure::new(error.to_string()))?;
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();
-        let mut finding = Finding::new(Severity::Note, Topic::Interface, "the log has bad lines");
+        let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has bad lines");
         finding.seen = format!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
         report.add(finding);
     }
     Ok(report)
 }
 
-fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
+fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
     let wanted_s = args.seconds.unwrap_or(DEFAULT_SECONDS);
     let bar = progress_bar((1000.0 * wanted_s) as u64, "listening {bar:32} {msg} (Ctrl-C ends early)");
     let result = wiring_check::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
@@ -139,13 +139,13 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
 }
 
 /// The faults of the configuration as one finding; `None` = there is none.
-fn invalid(faults: &[String]) -> Option<Finding> {
+fn invalid(faults: &[String]) -> Option<WiringFinding> {
     let (first, others) = faults.split_first()?;
     let title = match others.len() {
         0 => "the configuration is invalid".to_owned(),
         _ => format!("the configuration is invalid: {} faults", faults.len()),
     };
-    let mut finding = Finding::new(Severity::Error, Topic::Configuration, title);
+    let mut finding = WiringFinding::new(Severity::Error, Topic::Configuration, title);
     finding.seen.clone_from(first);
     finding.why = "packwatch run does not start with it; the parts that can be read are judged below".to_owned();
     finding.advice = Some("packwatch check shows every fault".to_owned()).filter(|_| !others.is_empty());
@@ -154,7 +154,7 @@ fn invalid(faults: &[String]) -> Option<Finding> {
 }
 
 /// Adds the configuration's own faults and warnings, and to every change its line.
-fn complete(report: &mut Report, survey: &Survey) {
+fn complete(report: &mut WiringReport, survey: &Survey) {
     if let Some(finding) = invalid(&survey.faults) {
         report.add(finding);
         // A wrong layout in the DBC is the cause of faults, not their effect.
@@ -165,7 +165,7 @@ fn complete(report: &mut Report, survey: &Survey) {
         }
     }
     for warning in survey.config.iter().flat_map(|config| &config.warnings) {
-        let mut finding = Finding::new(Severity::Warning, Topic::Configuration, "the configuration is unlikely");
+        let mut finding = WiringFinding::new(Severity::Warning, Topic::Configuration, "the configuration is unlikely");
         finding.seen.clone_from(warning);
         finding.why = "packwatch run starts with it; packwatch check reports it too".to_owned();
         report.add(finding);
@@ -177,7 +177,7 @@ fn complete(report: &mut Report, survey: &Survey) {
     }
 }
 
-fn json(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
+fn json(report: &WiringReport, config: &Path, source: &str) -> Result<(), Failure> {
     let document = serde_json::json!({
         "config": config.display().to_string(),
         "source": source,

@@ -43,7 +43,7 @@
 //! | how far two cell models are apart | `cell/model_comparison.rs` |
 //! | how a model of another cell is found | `cell/model_check.rs` |
 //! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
-//! | a finding of the doctor | `wiring/judge/` |
+//! | a finding of the doctor; what values, names and bits say about a signal (`discover` too) | `wiring/judge/`; `wiring/evidence/` |
 //! | a scenario of the simulator | `sim/scenario.rs` |
 //!
 //! # Invariants

@@ -1,4 +1,4 @@
-//! The doctor's loops: logs replayed, or interfaces listened to, into the core's [`Doctor`] and, where the configuration
+//! The doctor's loops: logs replayed, or interfaces listened to, into the core's [`WiringObserver`] and, where the configuration
 //! is good, a [`Monitor`] in addition.
 //!
 //! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early, with a report of what was seen so far.
@@ -20,7 +20,7 @@ use crate::io::socket::Tap;
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::BusIndex;
-use crate::wiring::{Doctor, Report};
+use crate::wiring::{WiringObserver, WiringReport};
 
 pub use survey::{Survey, survey};
 
@@ -33,7 +33,7 @@ const REPORT_EVERY: u64 = 4096;
 
 /// Progress of a diagnosis.
 #[derive(Debug, Clone, Copy)]
-pub struct DiagnosisProgress {
+pub struct CheckProgress {
     /// Bytes of the logs read.
     pub bytes: u64,
     /// Frames taken.
@@ -70,7 +70,7 @@ impl Interrupt {
 
 /// The doctor and the monitor.
 struct Session {
-    doctor: Doctor,
+    observer: WiringObserver,
     monitor: Option<Monitor>,
     out: Outputs,
     configured: usize,
@@ -79,7 +79,7 @@ struct Session {
 impl Session {
     fn new(survey: &Survey) -> Self {
         Self {
-            doctor: Doctor::new(survey.plan.clone()),
+            observer: WiringObserver::new(survey.plan.clone()),
             monitor: survey.config.as_ref().map(|config| Monitor::new(config.monitor.clone())),
             out: Outputs { want_estimates: true, ..Outputs::default() },
             configured: survey.plan.interfaces.len(),
@@ -90,15 +90,15 @@ impl Session {
         let Some(input) = record.input() else { return };
         let bus = match input {
             Input::Frame { time, bus, frame } | Input::SecuredFrame { time, bus, frame, .. } => {
-                self.doctor.handle_frame(time, bus, frame);
+                self.observer.handle_frame(time, bus, frame);
                 Some(bus)
             }
             Input::Bus { bus, event, .. } => {
-                self.doctor.handle_bus(bus, event);
+                self.observer.handle_bus(bus, event);
                 Some(bus)
             }
             Input::UnknownGap { .. } => {
-                self.doctor.handle_gap();
+                self.observer.handle_gap();
                 None
             }
             _ => None,
@@ -113,17 +113,17 @@ impl Session {
     }
 
     fn forward_estimates(&mut self) {
-        self.out.estimates.iter().for_each(|estimate| self.doctor.handle_estimate(estimate));
+        self.out.estimates.iter().for_each(|estimate| self.observer.handle_estimate(estimate));
         self.out.clear();
     }
 
     /// Ends the input and returns the report.
-    fn finish(mut self) -> Report {
+    fn finish(mut self) -> WiringReport {
         if let Some(monitor) = &mut self.monitor {
             monitor.settle(&mut self.out);
             self.forward_estimates();
         }
-        self.doctor.finish()
+        self.observer.finish()
     }
 }
 
@@ -137,8 +137,8 @@ pub fn replay(
     csv: CsvOptions,
     limit_s: Option<f64>,
     interrupt: &Interrupt,
-    each: &mut dyn FnMut(DiagnosisProgress),
-) -> Result<(Report, LogCounts), LogError> {
+    each: &mut dyn FnMut(CheckProgress),
+) -> Result<(WiringReport, LogCounts), LogError> {
     let encoder = InputEncoder::new(&survey.input).with_answers(&survey.answers);
     let mut protector = InputProtector::new(&survey.plan.guards);
     let mut source = LogSource::new(
@@ -160,19 +160,19 @@ pub fn replay(
     let mut records = 0_u64;
     while let Some(record) = source.next_record()? {
         for name in source.interfaces().iter().skip(known) {
-            session.doctor.add_interface(name);
+            session.observer.add_interface(name);
         }
         known = source.interfaces().len();
         session.feed(&record);
         records += 1;
-        let is_over = limit_s.is_some_and(|limit_s| session.doctor.seconds() >= limit_s)
+        let is_over = limit_s.is_some_and(|limit_s| session.observer.seconds() >= limit_s)
             && !matches!(record, Record::UnknownGap { .. });
         if is_over || interrupt.is_set() {
             break;
         }
         if records.is_multiple_of(REPORT_EVERY) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
-            each(DiagnosisProgress { bytes, frames: session.doctor.frames(), seconds: session.doctor.seconds() });
+            each(CheckProgress { bytes, frames: session.observer.frames(), seconds: session.observer.seconds() });
         }
     }
     Ok((session.finish(), source.counts().clone()))
@@ -194,14 +194,14 @@ pub fn listen(
     survey: &Survey,
     duration: Duration,
     interrupt: &Interrupt,
-    each: &mut dyn FnMut(DiagnosisProgress),
-) -> std::io::Result<Report> {
+    each: &mut dyn FnMut(CheckProgress),
+) -> std::io::Result<WiringReport> {
     let clock = MappedClock::new(Reading::now());
     let mut session = Session::new(survey);
     let mut names: Vec<String> = survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect();
     for name in can_interfaces(clock) {
         if !names.contains(&name) && names.len() < usize::from(u8::MAX) {
-            session.doctor.add_interface(&name);
+            session.observer.add_interface(&name);
             names.push(name);
         }
     }
@@ -216,10 +216,10 @@ pub fn listen(
         }
         received.sort_by_key(Record::time);
         received.drain(..).for_each(|record| session.feed(&record));
-        each(DiagnosisProgress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
+        each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
         std::thread::sleep(READ_PERIOD);
     }
-    session.doctor.handle_listened(began.elapsed().as_secs_f64());
+    session.observer.handle_listened(began.elapsed().as_secs_f64());
     Ok(session.finish())
 }
 
@@ -232,12 +232,12 @@ impl BusListener {
         match Tap::open(&self.name, clock) {
             Ok((tap, is_up)) => {
                 self.tap = Some(tap);
-                session.doctor.handle_bus(self.bus, if is_up { BusEvent::Up } else { BusEvent::Down });
+                session.observer.handle_bus(self.bus, if is_up { BusEvent::Up } else { BusEvent::Down });
             }
             Err(error) if error.raw_os_error() == Some(Errno::EAFNOSUPPORT as i32) => {
                 return Err(std::io::Error::other(format!("{}: this kernel has no SocketCAN: {error}", self.name)));
             }
-            Err(_) => session.doctor.handle_bus(self.bus, BusEvent::Missing),
+            Err(_) => session.observer.handle_bus(self.bus, BusEvent::Missing),
         }
         Ok(())
     }
@@ -250,17 +250,17 @@ impl BusListener {
                 Ok(true) => {}
                 Ok(false) => break,
                 Err(error) if error.raw_os_error() == Some(Errno::ENETDOWN as i32) => {
-                    session.doctor.handle_bus(self.bus, BusEvent::Down);
+                    session.observer.handle_bus(self.bus, BusEvent::Down);
                 }
                 Err(_) => {
-                    session.doctor.handle_bus(self.bus, BusEvent::Missing);
+                    session.observer.handle_bus(self.bus, BusEvent::Missing);
                     self.tap = None;
                     break;
                 }
             }
         }
         if received.len() > before {
-            session.doctor.handle_bus(self.bus, BusEvent::Up);
+            session.observer.handle_bus(self.bus, BusEvent::Up);
         }
     }
 }

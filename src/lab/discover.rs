@@ -14,11 +14,9 @@ mod fields;
 pub(crate) mod groups;
 mod judge;
 mod raw;
-mod series;
 mod signals;
 #[cfg(test)]
 mod tests;
-pub(crate) mod words;
 
 use serde::Serialize;
 
@@ -27,29 +25,12 @@ use crate::can::dbc::Database;
 use crate::error::LabError;
 use crate::import::obdb::{self, ObdbSettings};
 use crate::quantity::{BusIndex, Timestamp};
+use crate::wiring::evidence::PackQuantity;
 use capture::Capture;
 use configuration::Writer;
 use signals::{Descriptions, LogSignal};
 
 pub use configuration::{PackConfiguration, PackSettings};
-
-/// What is looked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Quantity {
-    /// Pack current, A.
-    Current,
-    /// Pack voltage, V.
-    PackVoltage,
-    /// Voltages of single cells, V.
-    CellVoltage,
-    /// Temperatures of the pack, degrees Celsius.
-    Temperature,
-    /// The battery controller's state of charge, %.
-    Soc,
-    /// The battery controller's state of health, %.
-    Soh,
-}
 
 /// What a positive current means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -65,7 +46,7 @@ pub enum PositiveDirection {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Candidate {
     /// The quantity.
-    pub quantity: Quantity,
+    pub quantity: PackQuantity,
     /// 1 = best of its quantity.
     pub rank: usize,
     /// Interface that carries it.
@@ -114,34 +95,6 @@ pub struct Discovery {
 pub struct Discoverer {
     capture: Capture,
     descriptions: Descriptions,
-}
-
-impl Quantity {
-    /// Every quantity, in the order of the output.
-    pub const ALL: [Self; 6] =
-        [Self::Current, Self::PackVoltage, Self::CellVoltage, Self::Temperature, Self::Soc, Self::Soh];
-
-    /// In words.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Current => "pack current",
-            Self::PackVoltage => "pack voltage",
-            Self::CellVoltage => "cell voltages",
-            Self::Temperature => "temperatures",
-            Self::Soc => "state of charge",
-            Self::Soh => "state of health",
-        }
-    }
-
-    /// Unit of its values.
-    pub fn unit(self) -> &'static str {
-        match self {
-            Self::Current => "A",
-            Self::PackVoltage | Self::CellVoltage => "V",
-            Self::Temperature => "degC",
-            Self::Soc | Self::Soh => "%",
-        }
-    }
 }
 
 impl PositiveDirection {

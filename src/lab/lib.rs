@@ -1,7 +1,7 @@
 //! Offline work on measured files: fit of cell models, scores against truth, remaining useful life, Gaussian
 //! processes, reports and plots.
 
-pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim};
+pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 

@@ -23,7 +23,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("alarm", &["quantity"], Core::Pure),
     ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "cell_faults", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
-    ("wiring", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
+    ("wiring", &["quantity", "filter", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("config", CORE, Core::Shell),
     ("token_bucket", &["quantity"], Core::Shell),

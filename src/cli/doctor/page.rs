@@ -4,7 +4,7 @@ use std::io::IsTerminal as _;
 use std::path::Path;
 
 use crate::cli::common::output;
-use crate::wiring::{Change, Finding, Report, Severity};
+use crate::wiring::{Change, Severity, WiringFinding, WiringReport};
 use packwatch_host::failure::Failure;
 
 /// Width of the text without a terminal.
@@ -33,7 +33,7 @@ impl Paint {
 }
 
 /// Prints the report.
-pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
+pub(super) fn print(report: &WiringReport, config: &Path, source: &str) -> Result<(), Failure> {
     let is_terminal = std::io::stdout().is_terminal();
     let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
     let width = if is_terminal {
@@ -44,7 +44,7 @@ pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), 
     output::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
 }
 
-fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Paint) -> String {
+fn render(report: &WiringReport, config: &Path, source: &str, width: usize, paint: Paint) -> String {
     let (config, seconds, frames) = (config.display(), report.seconds, report.frames);
     let mut page = format!("{source} with {config}: {seconds:.0} s, {frames} frames\n\n");
     page.push_str(&format!("{}\n", paint.bold(&summary(report))));
@@ -68,7 +68,7 @@ fn proposal(change: &Change) -> String {
 }
 
 /// The report in one sentence.
-fn summary(report: &Report) -> String {
+fn summary(report: &WiringReport) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
     let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
     const CONSEQUENCES: &str = "Begin with the first: the others may be its consequences.";
@@ -83,7 +83,7 @@ fn summary(report: &Report) -> String {
     }
 }
 
-fn show(finding: &Finding, width: usize, paint: Paint, page: &mut String) {
+fn show(finding: &WiringFinding, width: usize, paint: Paint, page: &mut String) {
     let (label, colour) = match finding.severity {
         Severity::Error => ("ERROR", "1;31"),
         Severity::Warning => ("WARNING", "1;33"),
@@ -187,8 +187,8 @@ mod tests {
 
     #[test]
     fn of_many_consequences_the_first_are_shown_and_the_rest_counted() {
-        let mut report = Report::default();
-        let mut finding = Finding::new(Severity::Error, Topic::Layout, "off");
+        let mut report = WiringReport::default();
+        let mut finding = WiringFinding::new(Severity::Error, Topic::Layout, "off");
         finding.consequences = (1..=30).map(|n| format!("cell {n} is odd")).collect();
         report.add(finding);
         let page = render(&report, Path::new("pack.toml"), "can0", 80, Paint(false));
@@ -198,8 +198,8 @@ mod tests {
 
     #[test]
     fn of_many_changes_the_first_are_shown_and_the_rest_counted() {
-        let mut report = Report::default();
-        let mut finding = Finding::new(Severity::Error, Topic::Unit, "off");
+        let mut report = WiringReport::default();
+        let mut finding = WiringFinding::new(Severity::Error, Topic::Unit, "off");
         finding.changes = vec![change("1"); 12];
         report.add(finding);
         let page = render(&report, Path::new("pack.toml"), "can0", 80, Paint(false));

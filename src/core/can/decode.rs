@@ -85,7 +85,10 @@ impl Binding {
     }
 
     /// Whether the payload carries the signal.
-    pub(crate) fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
+    ///
+    /// # Errors
+    /// A selector cannot be read.
+    pub fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
         for test in &self.mux {
             let code = test.plan.raw(payload)?;
             if !test.allows(code) {
@@ -95,8 +98,11 @@ impl Binding {
         Ok(true)
     }
 
-    /// The value in the program's unit and sign, or why there is none.
-    pub(crate) fn value(&self, payload: &[u8]) -> Result<f64, Fault> {
+    /// The value in the program's unit and sign.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub fn value(&self, payload: &[u8]) -> Result<f64, Fault> {
         if !self.not_available.is_empty() && self.not_available.contains(&self.plan.raw(payload)?) {
             return Err(Fault::NotAvailable);
         }

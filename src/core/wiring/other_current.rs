@@ -3,9 +3,9 @@
 //! Buses of one vehicle use the same identifier for different messages, or carry those of several packs. Read as the configured
 //! current, one of them may be what the voltages follow.
 
-use super::response::Slope;
-use super::response::{BLOCKS_S, VoltageResponse, best_response};
-use super::series::Series;
+use super::evidence::Series;
+use super::evidence::Slope;
+use super::evidence::response::{BLOCKS_S, VoltageResponse, best_response};
 use crate::can::decode::Binding;
 use crate::can::signal::SignalLayout;
 use crate::quantity::Timestamp;

@@ -1,4 +1,4 @@
-//! The doctor's report: findings with their evidence, reason and the line to change.
+//! The report on a wiring: findings with their evidence, reason and the line to change.
 
 use serde::Serialize;
 
@@ -81,7 +81,7 @@ pub struct Change {
 
 /// One finding.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Finding {
+pub struct WiringFinding {
     /// Severity.
     pub severity: Severity,
     /// Subject.
@@ -102,20 +102,20 @@ pub struct Finding {
 
 /// Result of a diagnosis.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Report {
+pub struct WiringReport {
     /// Seconds listened; of a record, the time from the first frame to the last without sleep.
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,
     /// Most severe first, then causes before effects.
-    pub findings: Vec<Finding>,
+    pub findings: Vec<WiringFinding>,
     /// What is in order.
     pub fine: Vec<String>,
     /// What could not be judged, and what to do.
     pub unjudged: Vec<String>,
 }
 
-impl Finding {
+impl WiringFinding {
     /// A finding without lines to change.
     pub fn new(severity: Severity, topic: Topic, title: impl Into<String>) -> Self {
         let (seen, why) = (String::new(), String::new());
@@ -149,10 +149,10 @@ impl Finding {
     }
 }
 
-impl Report {
+impl WiringReport {
     /// Adds a finding in the order of `findings`, and returns it there.
-    pub fn add(&mut self, finding: Finding) -> &mut Finding {
-        let key = |f: &Finding| (f.severity, f.topic);
+    pub fn add(&mut self, finding: WiringFinding) -> &mut WiringFinding {
+        let key = |f: &WiringFinding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
         self.findings.insert(at, finding);
         &mut self.findings[at]
@@ -160,11 +160,11 @@ impl Report {
 
     /// Moves further findings of a topic, and its consequences, below its first finding, by their titles. What the further
     /// ones advise is added to its advice.
-    pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&Finding) -> bool) {
+    pub(super) fn fold(&mut self, cause: Topic, is_consequence: impl Fn(&WiringFinding) -> bool) {
         let Some(first) = self.findings.iter().position(|finding| finding.topic == cause) else { return };
-        let is_moved = |finding: &mut Finding| finding.topic == cause || is_consequence(finding);
-        let moved: Vec<Finding> = self.findings.extract_if(first + 1.., is_moved).collect();
-        let before: Vec<Finding> = self.findings.extract_if(..first, |finding| is_consequence(finding)).collect();
+        let is_moved = |finding: &mut WiringFinding| finding.topic == cause || is_consequence(finding);
+        let moved: Vec<WiringFinding> = self.findings.extract_if(first + 1.., is_moved).collect();
+        let before: Vec<WiringFinding> = self.findings.extract_if(..first, |finding| is_consequence(finding)).collect();
         let Some(finding) = self.findings.iter_mut().find(|finding| finding.topic == cause) else { return };
         for other in before.into_iter().chain(moved) {
             let advice = other.advice.filter(|_| other.topic == cause);
@@ -186,9 +186,9 @@ mod tests {
 
     #[test]
     fn consequences_and_further_findings_of_a_cause_are_below_its_first() {
-        let mut report = Report::default();
+        let mut report = WiringReport::default();
         let mut add = |topic, title: &str, advice: &str| {
-            report.add(Finding::new(Severity::Error, topic, title)).advice(advice);
+            report.add(WiringFinding::new(Severity::Error, topic, title)).advice(advice);
         };
         add(Topic::Interface, "other", "");
         add(Topic::CellCount, "count", "not this");
@@ -204,13 +204,13 @@ mod tests {
 
     #[test]
     fn findings_are_sorted_by_severity_then_cause_before_effect() {
-        let mut report = Report::default();
-        report.add(Finding::new(Severity::Note, Topic::Interface, "n"));
+        let mut report = WiringReport::default();
+        report.add(WiringFinding::new(Severity::Note, Topic::Interface, "n"));
         assert!(!report.has_findings());
-        report.add(Finding::new(Severity::Warning, Topic::Silent, "w"));
-        report.add(Finding::new(Severity::Error, Topic::CellModel, "late"));
-        report.add(Finding::new(Severity::Error, Topic::Unit, "early"));
-        report.add(Finding::new(Severity::Error, Topic::Unit, "early, second"));
+        report.add(WiringFinding::new(Severity::Warning, Topic::Silent, "w"));
+        report.add(WiringFinding::new(Severity::Error, Topic::CellModel, "late"));
+        report.add(WiringFinding::new(Severity::Error, Topic::Unit, "early"));
+        report.add(WiringFinding::new(Severity::Error, Topic::Unit, "early, second"));
         let titles: Vec<&str> = report.findings.iter().map(|finding| finding.title.as_str()).collect();
         assert_eq!(titles, ["early", "early, second", "late", "w", "n"]);
         assert!(report.has_findings());

@@ -9,9 +9,10 @@ use std::fmt::Write as _;
 use super::capture::{AnswerKey, Capture};
 use super::fields::{self, MessageField};
 use super::signals::{Descriptions, LogSignal, SignalOrigin};
-use super::{Candidate, Discovery, PositiveDirection, Quantity, raw};
+use super::{Candidate, Discovery, PositiveDirection, raw};
 use crate::can::CanId;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
+use crate::wiring::evidence::PackQuantity;
 
 /// Readings may be this many of their periods old.
 const PERIODS: f64 = 3.0;
@@ -106,13 +107,13 @@ impl Writer<'_> {
         found.collect()
     }
 
-    fn best(&self, quantity: Quantity) -> Option<&Candidate> {
+    fn best(&self, quantity: PackQuantity) -> Option<&Candidate> {
         self.discovery.candidates.iter().find(|candidate| candidate.quantity == quantity)
     }
 
     fn select(&self) -> Result<Selection<'_>, Vec<String>> {
         let mut questions = Vec::new();
-        let current = self.best(Quantity::Current);
+        let current = self.best(PackQuantity::Current);
         if current.is_none() {
             questions.push("which signal is the pack current? the log shows none".to_owned());
         }
@@ -123,9 +124,10 @@ impl Writer<'_> {
                 current.signal
             ));
         }
-        let groups = self.discovery.candidates.iter().filter(|candidate| candidate.quantity == Quantity::CellVoltage);
+        let groups =
+            self.discovery.candidates.iter().filter(|candidate| candidate.quantity == PackQuantity::CellVoltage);
         let cells = groups.filter_map(|group| Some((group, self.row(group)?))).next();
-        let pack = self.best(Quantity::PackVoltage);
+        let pack = self.best(PackQuantity::PackVoltage);
         let voltage = match (cells, pack, self.settings.cells) {
             (Some((group, count)), _, _) => Some((group, count)),
             (None, Some(pack), Some(count)) => Some((pack, count)),
@@ -146,9 +148,9 @@ impl Writer<'_> {
             return Err(questions);
         };
         // A field without a name may be a temperature, and may be anything.
-        let temperature = self.best(Quantity::Temperature).filter(|candidate| !self.is_raw(candidate));
-        let soc = self.best(Quantity::Soc).map(|candidate| ("reported_soc", candidate));
-        let soh = self.best(Quantity::Soh).map(|candidate| ("reported_soh", candidate));
+        let temperature = self.best(PackQuantity::Temperature).filter(|candidate| !self.is_raw(candidate));
+        let soc = self.best(PackQuantity::Soc).map(|candidate| ("reported_soc", candidate));
+        let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
         let reported = soc.into_iter().chain(soh).collect();
         Ok(Selection { current, positive, voltage, cells, temperature, reported })
     }
@@ -237,7 +239,7 @@ impl Writer<'_> {
         self.input("[input.current]", selection.current, &selection.current.signal, &positive, text);
         let first = self.numbers(selection.voltage).and_then(|numbers| numbers.first().copied()).unwrap_or(1);
         match selection.voltage.quantity {
-            Quantity::CellVoltage => {
+            PackQuantity::CellVoltage => {
                 let first = format!("first = {first}\n");
                 self.input("[input.cell_voltage]", selection.voltage, &selection.voltage.signal, &first, text);
                 self.compare_sum(selection, open);
@@ -265,16 +267,18 @@ impl Writer<'_> {
     fn input(&self, table: &str, candidate: &Candidate, signal: &str, more: &str, text: &mut String) {
         let _ = write!(text, "\n# {}\n{table}\nsignal = {}\n", plain(&candidate.reasons.join("; ")), quoted(signal));
         let _ = write!(text, "interface = {}\n{more}", quoted(&candidate.interface));
-        let scale = self.signal(candidate.members[0]).scale;
-        if scale != 1.0 {
-            let _ = writeln!(text, "scale = {scale}");
+        let (scale, offset) = self.signal(candidate.members[0]).conversion;
+        for (key, value) in [("scale", scale), ("offset", offset)] {
+            if value != if key == "scale" { 1.0 } else { 0.0 } {
+                let _ = writeln!(text, "{key} = {value}");
+            }
         }
     }
 
     fn compare_sum(&self, selection: &Selection<'_>, open: &mut Vec<String>) {
-        let Some(pack) = self.best(Quantity::PackVoltage) else { return };
-        let sum: f64 = selection.voltage.members.iter().map(|index| self.signal(*index).series.mean()).sum();
-        let pack_v = self.signal(pack.members[0]).series.mean();
+        let Some(pack) = self.best(PackQuantity::PackVoltage) else { return };
+        let sum: f64 = selection.voltage.members.iter().map(|index| self.signal(*index).series.extent.mean()).sum();
+        let pack_v = self.signal(pack.members[0]).series.extent.mean();
         if (pack_v / sum - 1.0).abs() > SUM_TOLERANCE {
             open.push(format!(
                 "{} is {pack_v:.1} V, the cells are {sum:.1} V together: are all cells there?",
@@ -364,8 +368,11 @@ impl Writer<'_> {
         ];
         for (name, candidate) in named {
             let Some(candidate) = candidate else { continue };
-            let period_s =
-                candidate.members.iter().map(|index| self.signal(*index).series.period_s).fold(0.0, f64::max);
+            let period_s = candidate
+                .members
+                .iter()
+                .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
+                .fold(0.0, f64::max);
             let age_s = (PERIODS * period_s).max(MIN_AGE_S).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }

@@ -12,12 +12,12 @@
 use std::collections::BTreeSet;
 
 use super::capture::{Capture, MessageKey, Payloads};
-use super::series::{Relation, Series};
 use super::signals::{LogSignal, SignalOrigin};
-use super::words::{Dimension, Words};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
+use crate::can::unit::Quantity;
+use crate::wiring::evidence::{Series, SignalLabel, Slope};
 
 /// Payloads to judge a message by.
 const MIN_PAYLOADS: usize = 20;
@@ -117,12 +117,12 @@ impl<'a> Samples<'a> {
     fn values(&self, layout: &SignalLayout, page: Option<u8>) -> Series {
         let Ok(plan) = layout.plan() else { return Series::default() };
         let of_page = self.payloads.iter().filter(|(_, data)| page.is_none() || data.first().copied() == page);
-        Series::collect(of_page.map(|(time_s, data)| (*time_s, plan.decode(data).ok())), 0)
+        Series::of(of_page.map(|(time_s, data)| (*time_s, plan.decode(data).ok())))
     }
 }
 
 fn swing(series: &Series) -> f64 {
-    (series.high() - series.low()) / series.high()
+    series.extent.range() / series.extent.max
 }
 
 /// Layouts of 16 bits at every byte and 12 bits at every half byte, both byte orders.
@@ -167,7 +167,7 @@ fn signal(
     layout: SignalLayout,
     series: Series,
 ) -> LogSignal {
-    let dimension = if unit == "A" { Dimension::Current } else { Dimension::Voltage };
+    let quantity = if unit == "A" { Quantity::Current } else { Quantity::Voltage };
     let (full_name, unit) = (format!("{}.{name}", message_name(key.1)), unit.to_owned());
     let signal = Signal {
         name,
@@ -183,12 +183,10 @@ fn signal(
         name: full_name,
         bus: key.0,
         origin: SignalOrigin::Field(Box::new(MessageField { id: key.1, page, signal })),
-        dimension,
-        words: Words::new(""),
-        is_pack_message: false,
+        label: SignalLabel::unnamed(quantity),
         series,
         is_read_signed: false,
-        scale: 1.0,
+        conversion: (1.0, 0.0),
     }
 }
 
@@ -202,12 +200,12 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     let mut found = Vec::new();
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        let is_alive = codes.bad == 0 && codes.distinct() >= MIN_DISTINCT && swing(&codes) <= MAX_SWING;
+        let is_alive = codes.bad() == 0 && codes.distinct() >= MIN_DISTINCT && swing(&codes) <= MAX_SWING;
         if !is_alive || codes.is_counter() {
             continue;
         }
         for factor in PACK_SCALES {
-            if codes.low() * factor >= PACK_V.0 && codes.high() * factor <= PACK_V.1 {
+            if codes.extent.min * factor >= PACK_V.0 && codes.extent.max * factor <= PACK_V.1 {
                 let layout = SignalLayout { factor, ..layout };
                 let series = samples.values(&layout, None);
                 found.push(signal(samples.key, None, format!("Voltage_{}", place(&layout)), "V", layout, series));
@@ -227,34 +225,30 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
                 continue;
             }
             let others = voltages.iter().filter(|voltage| !shares_bits(voltage, samples.key.1, &layout));
-            let related = others.filter_map(|voltage| Some((voltage.series.relation(&codes)?, voltage.series.mean())));
+            let related = others
+                .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
             let best = related
-                .filter(|(relation, _)| is_strong(relation))
-                .max_by(|a, b| a.0.correlation.abs().total_cmp(&b.0.correlation.abs()));
-            let Some((relation, mean_v)) = best else { continue };
+                .filter(|(slope, _)| slope.correlation().abs() >= MIN_CORRELATION && slope.strength() >= MIN_STRENGTH)
+                .max_by(|a, b| a.0.correlation().abs().total_cmp(&b.0.correlation().abs()));
+            let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
-                let unusual = (relation.slope.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
+                let unusual = (slope.ohm.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
                 if *factor == CURRENT_SCALES[0] { unusual - CUSTOMARY } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
             let layout = SignalLayout { factor: factor.unwrap_or(1.0), ..layout };
             let series = samples.values(&layout, None);
             let name = format!("Current_{}", place(&layout));
-            found.push((relation.correlation.abs(), signal(samples.key, None, name, "A", layout, series)));
+            found.push((slope.correlation().abs(), signal(samples.key, None, name, "A", layout, series)));
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
     found.into_iter().take(MAX_CURRENTS).map(|(_, signal)| signal).collect()
 }
 
-fn is_strong(relation: &Relation) -> bool {
-    let strength = relation.correlation.abs();
-    strength >= MIN_CORRELATION && strength * (relation.steps as f64).sqrt() >= MIN_STRENGTH
-}
-
 /// Whether a field overlaps with a layout of the same message, on whatever interface: gateways repeat messages.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
-    matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && overlap(&own.signal.layout, layout))
+    matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }
 
 impl LogSignal {
@@ -265,17 +259,6 @@ impl LogSignal {
             SignalOrigin::Dbc(_) | SignalOrigin::Defined(_) | SignalOrigin::Raw(..) => None,
         }
     }
-}
-
-/// Whether two fields have a bit in common.
-pub(super) fn overlap(a: &SignalLayout, b: &SignalLayout) -> bool {
-    let mask = |layout: &SignalLayout| {
-        let mut payload = [0_u8; 8];
-        let all = SignalLayout { value_type: ValueType::Unsigned, factor: 1.0, ..*layout };
-        let written = all.plan().is_ok_and(|plan| plan.encode_raw(&mut payload, plan.all_ones()).is_ok());
-        if written { u64::from_be_bytes(payload) } else { 0 }
-    };
-    mask(a) & mask(b) != 0
 }
 
 /// Rows of neighbours in messages and pages, all of one form, numbered through.
@@ -320,9 +303,9 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
 
 /// Whether a row may be of the same pack as the cells so far.
 fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)]) -> bool {
-    cells
-        .first()
-        .is_none_or(|first| first.bus == key.0 && (first.series.mean() - row[0].1.mean()).abs() <= MAX_SPREAD_V)
+    cells.first().is_none_or(|first| {
+        first.bus == key.0 && (first.series.extent.mean() - row[0].1.extent.mean()).abs() <= MAX_SPREAD_V
+    })
 }
 
 /// The pages of a message: the values of its first byte where they count up; otherwise the message as a whole.
@@ -342,8 +325,9 @@ fn row(
     let mut row: Vec<(SignalLayout, Series)> = Vec::new();
     for layout in layouts {
         let series = samples.values(&layout, page);
-        let is_cell = series.low() >= CELL_V.0 && series.high() <= CELL_V.1 && series.bad == 0;
-        let is_near = row.first().is_none_or(|first| (series.mean() - first.1.mean()).abs() <= MAX_SPREAD_V);
+        let is_cell = series.extent.min >= CELL_V.0 && series.extent.max <= CELL_V.1 && series.bad() == 0;
+        let is_near =
+            row.first().is_none_or(|first| (series.extent.mean() - first.1.extent.mean()).abs() <= MAX_SPREAD_V);
         if !is_cell || !is_near {
             break;
         }

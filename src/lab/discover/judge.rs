@@ -1,34 +1,17 @@
-//! Which signal is which quantity: points for names, units, ranges and behaviour, each with its reason in words.
+//! Which signal is which quantity: points for names and units ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), ranges and
+//! behaviour, each with its reason in words.
 //!
 //! The points are weights of evidence, chosen on three cars: what contradicts a quantity excludes it (range), a unit and a name
-//! count 2 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
+//! count 1 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
-use super::fields::overlap;
 use super::groups::{SignalGroup, groups};
 use super::raw;
-use super::series::{Relation, Series};
 use super::signals::{LogSignal, SignalOrigin};
-use super::words::Dimension;
-use super::{Candidate, PositiveDirection, Quantity};
+use super::{Candidate, PositiveDirection};
+use crate::can::unit::Quantity;
 use crate::quantity::BusIndex;
+use crate::wiring::evidence::{PackQuantity, Score, Series, Slope};
 
-/// Candidates with fewer points are not shown.
-const MIN_POINTS: f64 = 2.5;
-/// Candidates kept of a quantity.
-const MAX_CANDIDATES: usize = 10;
-/// Voltages and currents that are compared with each other: the best of each by name, unit and range.
-const MAX_COMPARED: usize = 40;
-/// Groups of cells that are compared with currents.
-const MAX_GROUPS: usize = 5;
-/// Correlation of changes that counts.
-const MIN_CORRELATION: f64 = 0.5;
-/// Correlation times the root of the number of changes: standard deviations from chance.
-const MIN_STRENGTH: f64 = 2.0;
-const MIN_STRENGTH_RAW: f64 = 4.0;
-/// Plausible resistance, ohms per V of the pack: 400 V have 4 milliohm to 4 ohm.
-const OHM_PER_V: (f64, f64) = (1e-5, 1e-2);
-/// Deviation of the sum of the cells from a pack voltage that still counts.
-const SUM_TOLERANCE: f64 = 0.02;
 /// Share of readings that must be values.
 const MIN_VALID: f64 = 0.8;
 
@@ -39,8 +22,7 @@ pub(super) struct Evidence {
     pub(super) members: Vec<usize>,
     name: String,
     bus: BusIndex,
-    points: f64,
-    reasons: Vec<String>,
+    score: Score,
     low: f64,
     high: f64,
     positive: Option<PositiveDirection>,
@@ -49,19 +31,28 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    fn new(index: usize, signal: &LogSignal) -> Self {
-        let (low, high) = (signal.series.low(), signal.series.high());
+    /// What the label says; `None` = it says another quantity, or the values are outside the range (both ends included).
+    fn new(index: usize, signal: &LogSignal, quantity: PackQuantity, range: (f64, f64)) -> Option<Self> {
+        let (low, high) = (signal.series.extent.min, signal.series.extent.max);
+        let mut score = signal.label.score(quantity).filter(|_| low >= range.0 && high <= range.1)?;
+        // A field without a name is here because of its values.
+        if signal.is_unnamed() {
+            score = Score::default();
+        }
+        // Temperatures and charge of a pack hardly change within minutes.
+        let points = match quantity {
+            PackQuantity::Temperature | PackQuantity::Soh => 0.0,
+            PackQuantity::Soc => -0.5,
+            PackQuantity::Current | PackQuantity::PackVoltage | PackQuantity::CellVoltage => -1.5,
+        };
+        let is_constant = signal.series.is_constant() && (!signal.is_unnamed() || points == 0.0);
+        score.add(points, is_constant, "it never changes in this log");
         let (members, name, bus) = (vec![index], signal.name.clone(), signal.bus);
-        Self { members, name, bus, points: 0.0, reasons: Vec::new(), low, high, positive: None, is_sum: false }
+        Some(Self { members, name, bus, score, low, high, positive: None, is_sum: false })
     }
 
     fn add(&mut self, points: f64, holds: bool, reason: &str) {
-        if holds {
-            self.points += points;
-            if !reason.is_empty() {
-                self.reasons.push(reason.to_owned());
-            }
-        }
+        self.score.add(points, holds, reason);
     }
 
     /// Whether the values stay within the range of a pack at work.
@@ -69,22 +60,15 @@ impl Evidence {
         self.high - self.low <= 0.35 * self.high
     }
 
-    /// Evidence of every quantity: where the signal is, and whether it is a measurement.
-    fn add_place(&mut self, signal: &LogSignal) {
-        let words = &signal.words;
-        self.add(2.0, words.says_pack(), "its name says battery");
-        self.add(1.0, signal.is_pack_message && !words.says_pack(), "its message says battery");
-        self.add(-3.0, words.says_elsewhere(), "its name says another device");
-        self.add(-3.0, words.says_no_measurement(), "its name says limit, request or count");
-        self.add(-1.5, signal.series.is_constant(), "it never changes in this log");
+    fn has_both_signs(&self) -> bool {
+        self.low < 0.0 && self.high > 0.0
     }
 }
 
 /// Candidates of every quantity, best first.
 pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Candidate> {
     let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
-    let usable: Vec<usize> =
-        (0..signals.len()).filter(|index| signals[*index].series.valid_share() >= MIN_VALID).collect();
+    let usable: Vec<usize> = (0..signals.len()).filter(|index| signals[*index].is_mostly_valid()).collect();
     let mut voltages: Vec<Evidence> = usable.iter().filter_map(|index| voltage(*index, &signals[*index])).collect();
     let mut currents: Vec<Evidence> = usable.iter().filter_map(|index| current(*index, &signals[*index])).collect();
     sort(&mut voltages);
@@ -102,12 +86,12 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String]) -> Vec<Ca
         usable.iter().filter_map(|index| judge(*index, &signals[*index])).collect::<Vec<_>>()
     };
     let all = [
-        (Quantity::Current, currents),
-        (Quantity::PackVoltage, voltages),
-        (Quantity::CellVoltage, cells),
-        (Quantity::Temperature, temperatures),
-        (Quantity::Soc, percents(soc)),
-        (Quantity::Soh, percents(soh)),
+        (PackQuantity::Current, currents),
+        (PackQuantity::PackVoltage, voltages),
+        (PackQuantity::CellVoltage, cells),
+        (PackQuantity::Temperature, temperatures),
+        (PackQuantity::Soc, percents(soc)),
+        (PackQuantity::Soh, percents(soh)),
     ];
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
@@ -125,15 +109,17 @@ fn partition(signal: &LogSignal) -> String {
 }
 
 fn sort(evidence: &mut [Evidence]) {
-    evidence.sort_by(|a, b| b.points.total_cmp(&a.points).then_with(|| (a.bus, &a.name).cmp(&(b.bus, &b.name))));
+    evidence.sort_by(|a, b| {
+        b.score.points.total_cmp(&a.score.points).then_with(|| (a.bus, &a.name).cmp(&(b.bus, &b.name)))
+    });
 }
 
-fn ranked(quantity: Quantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
+fn ranked(quantity: PackQuantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
     sort(&mut evidence);
     // A field is there once, with the best of its scales.
     let mut known = std::collections::BTreeSet::new();
     evidence.retain(|evidence| known.insert((evidence.bus, evidence.name.clone())));
-    let good = evidence.into_iter().filter(|evidence| evidence.points >= MIN_POINTS).take(MAX_CANDIDATES);
+    let good = evidence.into_iter().filter(|evidence| evidence.score.points >= 2.5).take(10);
     let candidate = |(rank, evidence): (usize, Evidence)| Candidate {
         quantity,
         rank: rank + 1,
@@ -142,32 +128,19 @@ fn ranked(quantity: Quantity, mut evidence: Vec<Evidence>, interfaces: &[String]
         signals: evidence.members.len(),
         low: evidence.low,
         high: evidence.high,
-        points: evidence.points,
+        points: evidence.score.points,
         positive: evidence.positive,
-        reasons: evidence.reasons,
+        reasons: evidence.score.reasons,
         members: evidence.members,
     };
     good.enumerate().map(candidate).collect()
 }
 
 fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= 15.0 && evidence.high <= 1000.0;
-    if !fits || !matches!(signal.dimension, Dimension::Voltage | Dimension::None) {
-        return None;
-    }
-    let is_named = signal.dimension == Dimension::Voltage || signal.words.says_voltage();
-    if !is_named {
-        return None;
-    }
+    let mut evidence = Evidence::new(index, signal, PackQuantity::PackVoltage, (15.0, 1000.0))?;
     if signal.is_unnamed() {
         return Some(raw_voltage(evidence, signal));
     }
-    evidence.add(2.0, signal.dimension == Dimension::Voltage, "unit V");
-    evidence.add(2.0, signal.words.says_voltage(), "its name says voltage");
-    evidence.add_place(signal);
-    evidence.add(-3.0, signal.words.says_cell(), "its name says cell");
-    evidence.add(-2.0, signal.words.says_extreme(), "its name says extreme");
     evidence.add(1.0, evidence.is_steady(), "range of a pack at work");
     evidence.add(-1.0, evidence.high < 60.0, "");
     Some(evidence)
@@ -175,11 +148,10 @@ fn voltage(index: usize, signal: &LogSignal) -> Option<Evidence> {
 
 /// A field without a name: what a pack's voltage looks like.
 fn raw_voltage(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
-    let Series { values, .. } = &signal.series;
-    let (low, high) = (evidence.low, evidence.high);
-    evidence.add(2.0, (250.0..=850.0).contains(&signal.series.mean()), "a usual voltage of a pack");
+    let (series, low, high) = (&signal.series, evidence.low, evidence.high);
+    evidence.add(2.0, (250.0..=850.0).contains(&series.extent.mean()), "a usual voltage of a pack");
     evidence.add(1.5, high - low <= 0.05 * high && high > low, "changes by little");
-    evidence.add(1.5, 2 * signal.series.distinct() >= values.len().min(100), "its last digits are alive");
+    evidence.add(1.5, 2 * series.distinct() >= series.values.kept().len().min(100), "its last digits are alive");
     evidence.add(-1.5, high == low, "it never changes in this log");
     let step = signal.field().map_or(0.0, |field| field.factor);
     evidence.add(-1.0, step > 0.2, "its steps would be coarse");
@@ -194,7 +166,7 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
         // A shorter field may be cut out of a longer one.
         let is_long = matches!(&signal.origin, SignalOrigin::Field(own) if own.signal.layout.length_bits > 12);
         evidence.add(0.5, is_long, "");
-        evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
+        evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
         return evidence;
     };
     // A number of 24 or 32 bits that needs 16 of them is one on purpose.
@@ -204,13 +176,17 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let points = if field.length == 32 { 3.0 } else { 2.0 };
     evidence.add(points, is_extended, &format!("a number of {} bits with a sign", field.length));
     evidence.add(-1.0, evidence.high - evidence.low < 1.0, "hardly moves");
-    evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
-    let is_calm = evidence.high - evidence.low <= 600.0;
-    evidence.add(1.0, is_calm, "");
+    evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
+    evidence.add(1.0, evidence.high - evidence.low <= 600.0, "");
     evidence
 }
 
 impl LogSignal {
+    fn is_mostly_valid(&self) -> bool {
+        let (good, bad) = (self.series.count() as f64, self.series.bad() as f64);
+        good >= MIN_VALID * (good + bad)
+    }
+
     /// Whether nothing but its values says what it is.
     fn is_unnamed(&self) -> bool {
         matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
@@ -219,7 +195,7 @@ impl LogSignal {
     /// Whether two fields of one answer or message overlap.
     fn shares_bits(&self, other: &Self) -> bool {
         if let (SignalOrigin::Field(own), SignalOrigin::Field(others)) = (&self.origin, &other.origin) {
-            return own.id == others.id && overlap(&own.signal.layout, &others.signal.layout);
+            return own.id == others.id && own.signal.layout.overlaps(&others.signal.layout);
         }
         let (SignalOrigin::Raw(own, _), SignalOrigin::Raw(others, _)) = (&self.origin, &other.origin) else {
             return false;
@@ -238,73 +214,56 @@ impl LogSignal {
 }
 
 fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= -2000.0 && evidence.high <= 2000.0;
-    let is_named = signal.dimension == Dimension::Current
-        || (signal.dimension == Dimension::None && signal.words.says_current() && signal.words.says_pack());
-    if !fits || !is_named {
-        return None;
-    }
+    let mut evidence = Evidence::new(index, signal, PackQuantity::Current, (-2000.0, 2000.0))?;
     if signal.is_unnamed() {
         return Some(raw_current(evidence, signal));
     }
-    evidence.add(2.0, signal.dimension == Dimension::Current, "unit A");
-    evidence.add(2.0, signal.words.says_current(), "its name says current");
-    evidence.add_place(signal);
-    evidence.add(-2.0, signal.words.says_extreme(), "its name says extreme");
-    evidence.add(1.0, evidence.low < 0.0 && evidence.high > 0.0, "takes both signs");
+    evidence.add(1.0, evidence.has_both_signs(), "takes both signs");
     evidence.add(0.0, signal.is_read_signed, "its definition says unsigned, its values are of a signed number");
     evidence.add(-1.5, evidence.low == 0.0 && evidence.high == 0.0, "is 0 all the time");
     Some(evidence)
 }
 
+/// Voltages of one cell, V.
+const CELL_V: (f64, f64) = (1.5, 4.5);
+
 fn single_cell(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= 1.5 && evidence.high <= 4.5;
-    if !fits || !matches!(signal.dimension, Dimension::Voltage | Dimension::None) || !signal.words.says_cell() {
-        return None;
-    }
-    evidence.add(1.0, signal.dimension == Dimension::Voltage, "unit V");
-    evidence.add(2.0, true, "its name says cell, its values are of one cell");
-    evidence.add(1.0, signal.words.says_extreme(), "an extreme of the cells, no cell of its own");
-    evidence.add_place(signal);
+    let mut evidence = Evidence::new(index, signal, PackQuantity::CellVoltage, CELL_V)?;
+    evidence.add(1.0, signal.label.says_extreme(), "an extreme of the cells, no cell of its own");
     Some(evidence)
 }
 
 fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     let is_cell = |index: &usize| {
-        let signal = &signals[*index];
-        let has_unit = matches!(signal.dimension, Dimension::Voltage | Dimension::None);
-        has_unit
-            && signal.series.low() >= 1.5
-            && signal.series.high() <= 4.5
-            && signal.series.valid_share() >= MIN_VALID
+        let LogSignal { label, series, .. } = &signals[*index];
+        label.may_measure(Quantity::Voltage)
+            && series.extent.min >= CELL_V.0
+            && series.extent.max <= CELL_V.1
+            && signals[*index].is_mostly_valid()
     };
     let members: Vec<usize> = group.members.iter().map(|(_, index)| *index).filter(is_cell).collect();
     if members.len() < 3 {
         return None;
     }
     let first = &signals[members[0]];
-    let mut evidence = Evidence::new(members[0], first);
-    evidence.name.clone_from(&group.pattern);
-    (evidence.low, evidence.high) = ends(members.iter().map(|index| &signals[*index].series));
-    let mean: Vec<f64> = members.iter().map(|index| signals[*index].series.mean()).collect();
-    let spread = mean.iter().copied().fold(f64::MIN, f64::max) - mean.iter().copied().fold(f64::MAX, f64::min);
+    let (low, high) = ends(members.iter().map(|index| &signals[*index].series));
+    let means = || members.iter().map(|index| signals[*index].series.extent.mean());
+    let spread = means().fold(f64::MIN, f64::max) - means().fold(f64::MAX, f64::min);
     let (together, is_moving) = moves_together(&members, signals);
     let manner = if is_moving { ", that move together" } else { "" };
-    let (low, high, count) = (evidence.low, evidence.high, members.len());
-    evidence.add(2.0, true, &format!("{count} values of {low:.3} to {high:.3} V{manner}"));
-    evidence.add(2.0, count >= 8, "");
-    evidence.add(2.0, spread <= 0.3, "");
-    evidence.add(-2.0, spread > 0.6, &format!("they differ by {spread:.2} V"));
-    evidence.add(2.0 * together.max(0.0), is_moving, "");
-    evidence.add(1.0, first.dimension == Dimension::Voltage, "unit V");
-    evidence.add(2.0, first.words.says_cell(), "the name says cell");
-    evidence.add(1.0, first.words.says_pack() || first.is_pack_message, "");
-    let left_out = group.members.len() - count;
-    evidence.add(0.0, left_out > 0, &format!("{left_out} more of this name have no plausible values"));
-    evidence.members = members;
-    Some(evidence)
+    let (count, left_out) = (members.len(), group.members.len() - members.len());
+    let mut score = Score::default();
+    score.add(2.0, true, &format!("{count} values of {low:.3} to {high:.3} V{manner}"));
+    score.add(2.0, count >= 8, "");
+    score.add(2.0, spread <= 0.3, "");
+    score.add(-2.0, spread > 0.6, &format!("they differ by {spread:.2} V"));
+    score.add(2.0 * together.max(0.0), is_moving, "");
+    score.add(1.0, first.label.has_unit_of(Quantity::Voltage), "unit V");
+    score.add(2.0, first.label.says_cell(), "the name says cell");
+    score.add(1.0, first.label.is_of_pack(), "");
+    score.add(0.0, left_out > 0, &format!("{left_out} more of this name have no plausible values"));
+    let (name, bus) = (group.pattern.clone(), first.bus);
+    Some(Evidence { members, name, bus, score, low, high, positive: None, is_sum: false })
 }
 
 /// Mean correlation of the first members' changes with the first one's, and whether there are changes at all.
@@ -312,7 +271,7 @@ fn moves_together(members: &[usize], signals: &[LogSignal]) -> (f64, bool) {
     let first = &signals[members[0]].series;
     let others = members.iter().skip(1).take(8);
     let found: Vec<f64> =
-        others.filter_map(|index| Some(signals[*index].series.relation(first)?.correlation)).collect();
+        others.filter_map(|index| Some(Slope::between(&signals[*index].series, first)?.correlation())).collect();
     let mean = found.iter().sum::<f64>() / found.len().max(1) as f64;
     (mean, mean >= 0.3)
 }
@@ -336,62 +295,32 @@ fn temperature_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evide
 }
 
 fn temperature(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= -40.0 && evidence.high <= 90.0;
-    if !fits || signal.dimension != Dimension::Temperature {
-        return None;
-    }
-    let is_raw = signal.is_unnamed();
-    evidence.add(2.0, !is_raw, "unit degC");
-    evidence.add(1.5, is_raw, "may be a temperature: its scale is a guess");
-    evidence.add(1.0, signal.words.says_temperature(), "its name says temperature");
-    evidence.add_place(signal);
-    // Temperatures of a pack hardly change within minutes.
-    evidence.add(1.5, signal.series.is_constant(), "");
-    evidence.add(1.0, signal.words.says_cell(), "its name says cell");
+    let mut evidence = Evidence::new(index, signal, PackQuantity::Temperature, (-40.0, 90.0))?;
+    evidence.add(1.5, signal.is_unnamed(), "may be a temperature: its scale is a guess");
     evidence.add(1.0, signal.series.largest_step() <= 2.0, "changes slowly");
     evidence.add(-2.0, evidence.low <= -39.0 || (evidence.low == 0.0 && evidence.high == 0.0), "may be no value");
     Some(evidence)
 }
 
 fn soc(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= 0.0 && evidence.high <= 105.0 && signal.words.says_soc() && !signal.words.says_soh();
-    if !fits || !matches!(signal.dimension, Dimension::Percent | Dimension::None) {
-        return None;
-    }
-    evidence.add(3.0, true, "its name says state of charge");
-    evidence.add(1.0, signal.dimension == Dimension::Percent, "unit %");
-    evidence.add_place(signal);
-    evidence.add(1.0, signal.series.is_constant(), "");
-    evidence.add(-1.0, signal.words.says_dash(), "the dashboard's, not the battery controller's");
-    evidence.add(-1.0, signal.words.says_extreme(), "an extreme of the cells");
+    let mut evidence = Evidence::new(index, signal, PackQuantity::Soc, (0.0, 105.0))?;
     evidence.add(1.0, signal.series.largest_step() <= 1.0, "changes slowly");
     evidence.add(-2.0, evidence.high == 0.0, "is 0 all the time");
     Some(evidence)
 }
 
 fn soh(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal);
-    let fits = evidence.low >= 40.0 && evidence.high <= 110.0 && signal.words.says_soh();
-    if !fits || !matches!(signal.dimension, Dimension::Percent | Dimension::None) {
-        return None;
-    }
-    evidence.add(3.0, true, "its name says state of health");
-    evidence.add(1.0, signal.dimension == Dimension::Percent, "unit %");
-    evidence.add_place(signal);
-    evidence.add(1.5, signal.series.is_constant(), "");
-    Some(evidence)
+    Evidence::new(index, signal, PackQuantity::Soh, (40.0, 110.0))
 }
 
 /// Compares every pack voltage with the sum of every group of cells.
 fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[LogSignal]) {
     for group in cells.iter_mut().filter(|group| group.members.len() >= 8) {
-        let sum: f64 = group.members.iter().map(|index| signals[*index].series.mean()).sum();
+        let sum: f64 = group.members.iter().map(|index| signals[*index].series.extent.mean()).sum();
         let mut is_found = false;
         for voltage in voltages.iter_mut().filter(|voltage| voltage.is_steady()) {
-            let mean = signals[voltage.members[0]].series.mean();
-            if (mean / sum - 1.0).abs() <= SUM_TOLERANCE {
+            let mean = signals[voltage.members[0]].series.extent.mean();
+            if (mean / sum - 1.0).abs() <= 0.02 {
                 voltage.is_sum = true;
                 voltage.add(4.0, true, &format!("the sum of {} is {sum:.1} V", group.name));
                 if !is_found {
@@ -415,48 +344,50 @@ fn compare_currents(
     let is_known =
         |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);
-    for current in currents.iter_mut().take(MAX_COMPARED) {
-        let related = |voltage: &Evidence| relation(&signals[voltage.members[0]], &signals[current.members[0]]);
-        let compared = voltages.iter_mut().take(MAX_COMPARED).chain(cells.iter_mut().take(MAX_GROUPS));
+    for current in currents.iter_mut().take(40) {
+        let related = |voltage: &Evidence| response(&signals[voltage.members[0]], &signals[current.members[0]]);
+        let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
         let compared = compared.filter(|voltage| !has_known || is_known(voltage));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
         // A voltage that is likely by itself is better evidence than one that is not.
-        let weight = |relation: Relation, voltage: &Evidence| relation.correlation.abs() + 0.05 * voltage.points;
+        let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
-        let Some((Relation { slope, correlation, .. }, voltage)) = best else { continue };
-        let (direction, verb) = match slope < 0.0 {
+        let Some((slope, voltage)) = best else { continue };
+        let correlation = slope.correlation();
+        let (direction, verb) = match slope.ohm > 0.0 {
             true => (PositiveDirection::Discharge, "falls"),
             false => (PositiveDirection::Charge, "rises"),
         };
         let text = format!(
             "{} {verb} by {:.4} V per A (correlation {correlation:.2}): positive is {}",
             voltage.name,
-            slope.abs(),
+            slope.ohm.abs(),
             direction.name()
         );
         current.add(3.0 * correlation.abs(), true, &text);
         current.positive = Some(direction);
         let text = format!("{verb} when {} rises (correlation {correlation:.2})", current.name);
-        if !voltage.reasons.iter().any(|reason| reason.contains("(correlation")) {
+        if !voltage.score.reasons.iter().any(|reason| reason.contains("(correlation")) {
             voltage.add(3.0 * correlation.abs(), true, &text);
         }
     }
 }
 
 /// How a voltage changes with a current, if that is the way of a pack and no coincidence.
-fn relation(voltage: &LogSignal, current: &LogSignal) -> Option<Relation> {
+fn response(voltage: &LogSignal, current: &LogSignal) -> Option<Slope> {
     let shares_bits = voltage.shares_bits(current);
-    let relation = voltage.series.relation(&current.series).filter(|_| !shares_bits)?;
-    let per_volt = relation.slope.abs() / voltage.series.mean();
+    let slope = Slope::between(&voltage.series, &current.series).filter(|_| !shares_bits)?;
+    // 400 V have 4 milliohm to 4 ohm.
+    let is_plausible = (1e-5..=1e-2).contains(&(slope.ohm.abs() / voltage.series.extent.mean()));
     // Many fields without names are compared: some agree by chance.
     let is_raw = voltage.is_unnamed() || current.is_unnamed();
-    let strength = relation.correlation.abs();
-    let is_significant =
-        strength * (relation.steps as f64).sqrt() >= if is_raw { MIN_STRENGTH_RAW } else { MIN_STRENGTH };
-    let is_plausible = (OHM_PER_V.0..=OHM_PER_V.1).contains(&per_volt);
-    (is_plausible && is_significant && strength >= MIN_CORRELATION).then_some(relation)
+    let correlation = slope.correlation().abs();
+    let is_significant = slope.strength() >= if is_raw { 4.0 } else { 2.0 };
+    (is_plausible && is_significant && correlation >= 0.5).then_some(slope)
 }
 
 fn ends<'a>(series: impl Iterator<Item = &'a Series>) -> (f64, f64) {
-    series.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), one| (low.min(one.low()), high.max(one.high())))
+    series.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), one| {
+        (low.min(one.extent.min), high.max(one.extent.max))
+    })
 }

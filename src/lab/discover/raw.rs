@@ -8,12 +8,12 @@
 use std::collections::BTreeMap;
 
 use super::capture::{AnswerKey, Answers};
-use super::series::Series;
 use super::signals::{LogSignal, SignalOrigin};
-use super::words::{Dimension, Words};
 use crate::can::CanId;
+use crate::can::unit::Quantity;
 use crate::import::{DiagnosticSignal, NumberRange};
 use crate::quantity::BusIndex;
+use crate::wiring::evidence::{Series, SignalLabel};
 
 /// Name of a cell, before its number.
 pub(super) const CELL: &str = "Cell";
@@ -117,28 +117,26 @@ fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> Diagno
 
 fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<LogSignal> {
     let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, form.value(data)));
-    let series = Series::collect(readings, answers.payloads.len());
-    let dimension = match form.unit.as_str() {
-        "degC" => Dimension::Temperature,
-        "A" => Dimension::Current,
-        _ => Dimension::Voltage,
+    let series = Series::of(readings);
+    let quantity = match form.unit.as_str() {
+        "degC" => Quantity::Temperature,
+        "A" => Quantity::Current,
+        _ => Quantity::Voltage,
     };
     // Cells are numbered through all answers, other fields are named by their answer.
     let mut form = form;
     if !form.name.starts_with(CELL) {
         form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
     }
-    (series.values.len() >= MIN_ANSWERS).then(|| LogSignal {
+    (series.count() >= MIN_ANSWERS as u64).then(|| LogSignal {
         name: format!("{}.{}", table_name(key), form.name),
         bus: key.bus,
         // Places say nothing about a meaning.
-        words: Words::new(""),
-        is_pack_message: false,
+        label: SignalLabel::unnamed(quantity),
         origin: SignalOrigin::Raw(*key, Box::new(form)),
-        dimension,
         series,
         is_read_signed: false,
-        scale: 1.0,
+        conversion: (1.0, 0.0),
     })
 }
 
@@ -149,17 +147,16 @@ pub(super) fn table_name(key: &AnswerKey) -> String {
 }
 
 fn is_plausible(signal: &LogSignal) -> bool {
-    let (SignalOrigin::Raw(_, field), Series { values, .. }) = (&signal.origin, &signal.series) else { return false };
-    let within = |low: f64, high: f64| values.iter().all(|value| (low..=high).contains(value));
-    match signal.dimension {
-        Dimension::Voltage => within(PACK_V.0, PACK_V.1) && signal.series.high() < SIGN_16 * field.factor,
-        Dimension::Current => within(-MAX_CURRENT_A, MAX_CURRENT_A) && !signal.series.is_constant(),
-        Dimension::Temperature => {
-            // 0 and 0xFF all the time are no value.
-            let is_absent = values.iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
-            within(-35.0, 75.0) && signal.series.largest_step() <= 2.0 && !is_absent
-        }
-        Dimension::Percent | Dimension::None | Dimension::Other => false,
+    let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
+    let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
+    if label.has_unit_of(Quantity::Voltage) {
+        within(PACK_V.0, PACK_V.1) && series.extent.max < SIGN_16 * field.factor
+    } else if label.has_unit_of(Quantity::Current) {
+        within(-MAX_CURRENT_A, MAX_CURRENT_A) && !series.is_constant()
+    } else {
+        // 0 and 0xFF all the time are no value.
+        let is_absent = series.values.kept().iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
+        within(-35.0, 75.0) && series.largest_step() <= 2.0 && !is_absent
     }
 }
 
@@ -172,7 +169,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
         for first in 0..bytes {
             let row = temperature_row(key, answers, (first, bytes), distance, offset);
             let values: std::collections::BTreeSet<u64> =
-                row.iter().flat_map(|signal| &signal.series.values).map(|value| value.to_bits()).collect();
+                row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
             // Equal constants are rather bytes of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
             if row.len() >= MIN_SENSORS && weight > best_weight {
@@ -204,7 +201,8 @@ fn temperature_row(
         (form.name, form.offset) = (format!("Row{first}Sensor{}", row.len() + 1), offset);
         let next = signal(key, answers, form).filter(is_plausible);
         let is_near = |signal: &LogSignal| {
-            row.first().is_none_or(|first| (signal.series.mean() - first.series.mean()).abs() <= MAX_SPREAD_C)
+            row.first()
+                .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= MAX_SPREAD_C)
         };
         match next.filter(is_near) {
             Some(signal) => row.push(signal),

@@ -4,18 +4,15 @@
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
 use super::fields::{self, MessageField};
 use super::raw;
-use super::series::Series;
-use super::words::{Dimension, Words, dimension};
 use crate::can::dbc::{Database, Message, Signal};
-use crate::can::signal::SignalPlan;
+use crate::can::decode::Binding;
+use crate::can::unit::{Quantity, SignalUnit};
 use crate::import::{DiagnosticSignal, DiagnosticTable};
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Channel};
+use crate::wiring::evidence::{Series, SignalLabel};
 
 /// Fewest valid values of a signal; fewer are a coincidence.
-const MIN_VALUES: usize = 2;
-
-/// Most remarks.
-const MAX_REMARKS: usize = 20;
+const MIN_VALUES: u64 = 2;
 
 /// Where a signal is described.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,17 +34,14 @@ pub(super) struct LogSignal {
     pub(super) name: String,
     pub(super) bus: BusIndex,
     pub(super) origin: SignalOrigin,
-    pub(super) dimension: Dimension,
-    /// Words of the signal's own name.
-    pub(super) words: Words,
-    /// Whether the message's name places it at the traction battery.
-    pub(super) is_pack_message: bool,
+    /// What its names and unit say.
+    pub(super) label: SignalLabel,
     /// Values in V, A, degrees Celsius, per cent, or as they are.
     pub(super) series: Series,
     /// Its definition says unsigned, its values are of a signed number.
     pub(super) is_read_signed: bool,
-    /// Factor from the description's unit to V, A, degrees Celsius or per cent.
-    pub(super) scale: f64,
+    /// Factor and offset from the description's unit to V, A, degrees Celsius or per cent.
+    pub(super) conversion: (f64, f64),
 }
 
 /// Descriptions that the user gave.
@@ -81,16 +75,16 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<Lo
         signals.extend(fields::signals(capture));
     }
     let (usable, empty): (Vec<LogSignal>, Vec<LogSignal>) = signals.into_iter().partition(has_values);
-    let remarks = empty.iter().filter_map(remark).take(MAX_REMARKS).collect();
+    let remarks = empty.iter().filter_map(remark).take(20).collect();
     (usable, remarks)
 }
 
 /// What is wrong with a voltage or current of the battery that is in the log and never has a value.
 fn remark(signal: &LogSignal) -> Option<String> {
-    let is_battery = signal.words.says_pack() || signal.is_pack_message;
-    let is_wanted = matches!(signal.dimension, Dimension::Voltage | Dimension::Current);
-    let readings = signal.series.bad;
-    (is_battery && is_wanted && readings >= MIN_VALUES).then(|| {
+    let LogSignal { label, series, .. } = signal;
+    let is_wanted = label.has_unit_of(Quantity::Voltage) || label.has_unit_of(Quantity::Current);
+    let readings = series.bad();
+    (label.is_of_pack() && is_wanted && readings >= MIN_VALUES).then(|| {
         format!(
             "{}: all {readings} readings are outside its range or not available: is its definition right?",
             signal.name
@@ -104,42 +98,29 @@ fn is_answer(table: &DiagnosticTable, key: &AnswerKey) -> bool {
         == (key.response, key.extension, key.service, key.identifier)
 }
 
+/// Factor and offset from a unit to V, A, degrees Celsius or per cent.
+fn conversion(unit: &str) -> (f64, f64) {
+    SignalUnit::parse(unit).map_or((1.0, 0.0), |unit| (unit.factor, unit.offset))
+}
+
 fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Message) -> Vec<LogSignal> {
-    let is_pack_message = Words::new(&message.name).says_pack();
     let of_signal = |signal: &Signal| {
-        let plan = signal.layout.plan().ok().filter(|_| signal.layout.length_bits > 2)?;
-        let selectors = signal.conditions.iter().map(|condition| {
-            Some((message.signals.get(condition.selector)?.layout.plan().ok()?, condition.ranges.as_slice()))
-        });
-        let selectors = selectors.collect::<Option<Vec<_>>>()?;
-        let absent = signal.not_available_codes();
-        let present: Vec<_> = payloads.iter().filter(|(_, payload)| holds(&selectors, payload)).collect();
-        let (dimension, scale) = dimension(&signal.unit);
-        let count = present.len();
-        let readings = present.into_iter().map(|(time_s, payload)| {
-            let is_absent = plan.raw(payload).is_ok_and(|code| absent.contains(&code));
-            (time_s, plan.decode(payload).ok().filter(|_| !is_absent).map(|value| value * scale))
-        });
+        // The channel says nothing about the reading.
+        let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
+        let conversion = conversion(&signal.unit);
+        (binding.scale, binding.offset) = conversion;
+        let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
         Some(LogSignal {
             name: format!("{}.{}", message.name, signal.name),
             bus: key.0,
             origin: SignalOrigin::Dbc(file),
-            dimension,
-            words: Words::new(&signal.name),
-            is_pack_message,
-            series: Series::collect(readings, count),
+            label: SignalLabel::new(&message.name, &signal.name, &signal.unit),
+            series: Series::of(present.map(|(time_s, payload)| (time_s, binding.value(payload).ok()))),
             is_read_signed: false,
-            scale,
+            conversion,
         })
     };
-    message.signals.iter().filter_map(of_signal).collect()
-}
-
-/// Whether the multiplexors select the signal.
-fn holds(selectors: &[(SignalPlan, &[(u64, u64)])], payload: &[u8]) -> bool {
-    selectors.iter().all(|(plan, ranges)| {
-        plan.raw(payload).is_ok_and(|code| ranges.iter().any(|(low, high)| (*low..=*high).contains(&code)))
-    })
+    message.signals.iter().filter(|signal| signal.layout.length_bits > 2).filter_map(of_signal).collect()
 }
 
 fn of_definition(
@@ -149,20 +130,20 @@ fn of_definition(
     table: &DiagnosticTable,
     signal: &DiagnosticSignal,
 ) -> Vec<LogSignal> {
-    let (dimension, scale) = dimension(&signal.unit);
+    let conversion = conversion(&signal.unit);
     let each = (0..signal.count()).map(|n| {
         let single = signal.of_series(n);
-        let (series, is_read_signed) = values(answers, &single, scale, dimension);
+        let label = SignalLabel::new(&table.name, &single.name, &signal.unit);
+        let (series, is_read_signed) = values(answers, &single, conversion, label.has_unit_of(Quantity::Current));
+        let name = format!("{}.{}", table.name, single.name);
         LogSignal {
-            name: format!("{}.{}", table.name, single.name),
+            name,
             bus: key.bus,
             origin: SignalOrigin::Defined(index),
-            dimension,
-            words: Words::new(&single.name),
-            is_pack_message: Words::new(&table.name).says_pack(),
+            label,
             series,
             is_read_signed,
-            scale,
+            conversion,
         }
     });
     each.collect()
@@ -170,20 +151,20 @@ fn of_definition(
 
 /// Values of a defined signal. A current that its definition calls unsigned is read as a signed number where that brings
 /// values at both ends of its codes together: a few negative amperes look like thousands.
-fn values(answers: &Answers, signal: &DiagnosticSignal, scale: f64, dimension: Dimension) -> (Series, bool) {
+fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
-        let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, signal.value(data).map(|v| v * scale)));
-        Series::collect(readings, answers.payloads.len())
+        let value = |data: &[u8]| signal.value(data).map(|value| value * conversion.0 + conversion.1);
+        Series::of(answers.payloads.iter().map(|(time_s, data)| (time_s, value(data))))
     };
     let series = collect(signal);
-    if signal.signed || dimension != Dimension::Current || series.is_constant() {
+    if signal.signed || !is_current || series.is_constant() {
         return (series, false);
     }
     let signed = collect(&signal.as_signed());
-    let is_nearer = signed.bad <= series.bad && signed.high() - signed.low() < (series.high() - series.low()) / 4.0;
+    let is_nearer = signed.bad() <= series.bad() && signed.extent.range() < series.extent.range() / 4.0;
     if is_nearer { (signed, true) } else { (series, false) }
 }
 
 fn has_values(signal: &LogSignal) -> bool {
-    signal.series.values.len() >= MIN_VALUES
+    signal.series.count() >= MIN_VALUES
 }

@@ -36,7 +36,7 @@ fn frame(id: u32, data: &[u8]) -> Frame {
     Frame::classic(CanId::standard(id).unwrap(), data).unwrap()
 }
 
-fn names(discovery: &Discovery, quantity: Quantity) -> Vec<&str> {
+fn names(discovery: &Discovery, quantity: PackQuantity) -> Vec<&str> {
     let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
     found.map(|candidate| candidate.signal.as_str()).collect()
 }
@@ -72,12 +72,12 @@ fn the_sign_of_a_current_follows_from_the_voltage() {
         let best = &discovery.candidates[0];
         assert_eq!(
             (best.quantity, best.signal.as_str(), best.positive),
-            (Quantity::Current, "HV_Pack.Amps", Some(positive))
+            (PackQuantity::Current, "HV_Pack.Amps", Some(positive))
         );
         assert!(best.reasons.iter().any(|reason| reason.contains("0.1000 V per A")), "{:?}", best.reasons);
-        assert_eq!(names(&discovery, Quantity::PackVoltage)[0], "HV_Pack.Volts");
-        assert_eq!(names(&discovery, Quantity::Temperature), ["HV_Pack.ModuleTemp"], "multiplexed");
-        assert_eq!(names(&discovery, Quantity::Soc), ["HV_Pack.SOC"], "multiplexed");
+        assert_eq!(names(&discovery, PackQuantity::PackVoltage)[0], "HV_Pack.Volts");
+        assert_eq!(names(&discovery, PackQuantity::Temperature), ["HV_Pack.ModuleTemp"], "multiplexed");
+        assert_eq!(names(&discovery, PackQuantity::Soc), ["HV_Pack.SOC"], "multiplexed");
     }
 }
 
@@ -131,14 +131,14 @@ fn answers(seconds: i32, is_asked: bool) -> Discoverer {
 fn cells_current_and_voltage_are_found_in_answers_without_a_definition() {
     let discoverer = answers(60, true);
     let discovery = discover(&discoverer);
-    let cells = discovery.candidates.iter().find(|candidate| candidate.quantity == Quantity::CellVoltage).unwrap();
+    let cells = discovery.candidates.iter().find(|candidate| candidate.quantity == PackQuantity::CellVoltage).unwrap();
     assert_eq!((cells.signal.as_str(), cells.signals), ("Answer7BB.Cell{n}", 96));
     assert!(
         cells.reasons[0].contains("96 values") && cells.reasons[0].contains("move together"),
         "{:?}",
         cells.reasons
     );
-    let voltages = names(&discovery, Quantity::PackVoltage);
+    let voltages = names(&discovery, PackQuantity::PackVoltage);
     assert!(voltages.iter().take(3).any(|name| *name == "Answer7BB.D2101_Voltage_12"), "{voltages:?}");
     let current = &discovery.candidates[0];
     assert_eq!(
@@ -211,8 +211,8 @@ fn answers_with_extended_addresses_are_read() {
         }
     }
     let discovery = discover(&discoverer);
-    assert_eq!((discovery.answers, names(&discovery, Quantity::Soc)), (1, vec!["I3.HVBAT_SOC"]));
-    let soc = discovery.candidates.iter().find(|candidate| candidate.quantity == Quantity::Soc).unwrap();
+    assert_eq!((discovery.answers, names(&discovery, PackQuantity::Soc)), (1, vec!["I3.HVBAT_SOC"]));
+    let soc = discovery.candidates.iter().find(|candidate| candidate.quantity == PackQuantity::Soc).unwrap();
     assert_eq!((soc.low, soc.high), (51.2, 53.1));
 }
 

@@ -8,27 +8,10 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use crate::can::dbc::{Database, Message, Signal};
+use crate::can::unit::SignalUnit;
 use crate::discover::groups::groups;
-use crate::discover::words::{Dimension, Words, dimension};
 use crate::error::LabError;
-
-/// Further candidates in comments.
-const FURTHER: usize = 4;
-/// Fewest points of a candidate: a unit, and a name that says quantity or battery.
-const MIN_POINTS: f64 = 3.0;
-/// Largest value that a cell voltage's bits may hold and still be one of a cell, V.
-const MAX_CELL_V: f64 = 10.0;
-
-/// An input of the configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum InputKind {
-    Current,
-    CellVoltage,
-    PackVoltage,
-    Temperature,
-    Soc,
-    Soh,
-}
+use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
 /// A candidate: points and name.
 type Ranked = (f64, String);
@@ -38,7 +21,7 @@ type Ranked = (f64, String);
 /// # Errors
 /// No signal looks like a current or a voltage of a battery.
 pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
-    let mut candidates: BTreeMap<InputKind, Vec<Ranked>> = BTreeMap::new();
+    let mut candidates: BTreeMap<PackQuantity, Vec<Ranked>> = BTreeMap::new();
     for message in &database.messages {
         for signal in &message.signals {
             for (kind, points) in judge(message, signal) {
@@ -46,13 +29,13 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
             }
         }
     }
-    let cells = candidates.remove(&InputKind::CellVoltage).unwrap_or_default();
-    candidates.insert(InputKind::CellVoltage, with_patterns(cells));
+    let cells = candidates.remove(&PackQuantity::CellVoltage).unwrap_or_default();
+    candidates.insert(PackQuantity::CellVoltage, with_patterns(cells));
     for ranked in candidates.values_mut() {
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
     }
     let is_empty = |kind| candidates.get(&kind).is_none_or(Vec::is_empty);
-    if is_empty(InputKind::Current) && is_empty(InputKind::PackVoltage) && is_empty(InputKind::CellVoltage) {
+    if is_empty(PackQuantity::Current) && is_empty(PackQuantity::PackVoltage) && is_empty(PackQuantity::CellVoltage) {
         let what = format!("{file}: no signal of {} messages looks like a battery's", database.messages.len());
         return Err(LabError::Data(what));
     }
@@ -60,41 +43,22 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
 }
 
 /// What a signal may be, with its points.
-fn judge(message: &Message, signal: &Signal) -> Vec<(InputKind, f64)> {
-    let words = Words::new(&signal.name);
-    let (dimension, scale) = dimension(&signal.unit);
-    if signal.layout.length_bits < 4 {
-        return Vec::new();
-    }
-    let mut place = f64::from(words.says_pack()) * 2.0 - f64::from(words.says_no_measurement()) * 3.0;
-    place += f64::from(Words::new(&message.name).says_pack() && !words.says_pack());
-    place -= f64::from(words.says_elsewhere()) * 3.0;
-    let extreme = f64::from(words.says_extreme());
-    let named = |unit: Dimension, says: bool, points: f64| {
-        let fits = dimension == unit || dimension == Dimension::None && says;
-        let by_name = 2.0 * f64::from(says);
-        fits.then_some(2.0 * f64::from(dimension == unit) + by_name + points)
+fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
+    let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
+    let largest = largest(signal) * SignalUnit::parse(&signal.unit).map_or(1.0, |unit| unit.factor);
+    let points = |quantity| {
+        let points = label.score(quantity)?.points;
+        let (fits, points) = match quantity {
+            // More than any cell has: the sum of some.
+            PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
+            PackQuantity::CellVoltage => (largest <= 10.0, points),
+            PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
+            PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
+        };
+        // A unit, and a name that says quantity or battery.
+        (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
-    let largest = largest(signal) * scale;
-    let is_cell = words.says_cell() && largest <= MAX_CELL_V;
-    let found = [
-        (InputKind::Current, named(Dimension::Current, words.says_current(), place - 2.0 * extreme)),
-        (InputKind::CellVoltage, named(Dimension::Voltage, is_cell, place - extreme).filter(|_| is_cell)),
-        (
-            InputKind::PackVoltage,
-            named(Dimension::Voltage, words.says_voltage(), place - 2.0 * extreme)
-                .filter(|_| largest > 60.0 && !words.says_cell()),
-        ),
-        (
-            InputKind::Temperature,
-            named(Dimension::Temperature, words.says_temperature(), place)
-                .filter(|_| dimension == Dimension::Temperature),
-        ),
-        (InputKind::Soc, named(Dimension::Percent, words.says_soc(), place - extreme).filter(|_| words.says_soc())),
-        (InputKind::Soh, named(Dimension::Percent, words.says_soh(), place).filter(|_| words.says_soh())),
-    ];
-    let good = found.into_iter().filter_map(|(kind, points)| Some((kind, points?)));
-    good.filter(|(_, points)| *points >= MIN_POINTS).collect()
+    PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
 /// Largest value: the stated one, else the largest of the bits.
@@ -121,7 +85,7 @@ fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     ranked
 }
 
-fn text(file: &str, candidates: &BTreeMap<InputKind, Vec<Ranked>>) -> String {
+fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String {
     let name: String = file.chars().filter(|c| !c.is_control()).collect();
     let mut text = format!(
         "# Likely battery signals of {name}, by name, unit and range alone, written by `packwatch import dbc`.\n\
@@ -129,40 +93,39 @@ fn text(file: &str, candidates: &BTreeMap<InputKind, Vec<Ranked>>) -> String {
          [input]\ndbc = [{}]\n",
         toml::Value::String(file.to_owned())
     );
-    let has_cells =
-        candidates.get(&InputKind::CellVoltage).is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
+    let has_cells = candidates
+        .get(&PackQuantity::CellVoltage)
+        .is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
     for (kind, ranked) in candidates {
         // Only one of the two voltages may be there.
         let is_active = match kind {
-            InputKind::CellVoltage => has_cells,
-            InputKind::PackVoltage => !has_cells,
+            PackQuantity::CellVoltage => has_cells,
+            PackQuantity::PackVoltage => !has_cells,
             _ => true,
         };
         let Some((_, best)) = ranked.first() else { continue };
         let mark = if is_active { "" } else { "# " };
-        let _ = write!(text, "\n{mark}{}\n{mark}signal = \"{best}\"\n", kind.table());
-        if *kind == InputKind::Current {
+        let _ = write!(text, "\n{mark}{}\n{mark}signal = \"{best}\"\n", table(*kind));
+        if *kind == PackQuantity::Current {
             text.push_str(
                 "positive = \"?\"                  # charge or discharge: what does a positive value mean?\n",
             );
         }
-        for (_, other) in ranked.iter().skip(1).take(FURTHER) {
+        for (_, other) in ranked.iter().skip(1).take(4) {
             let _ = writeln!(text, "# or: {other}");
         }
     }
     text
 }
 
-impl InputKind {
-    fn table(self) -> &'static str {
-        match self {
-            Self::Current => "[input.current]",
-            Self::CellVoltage => "[input.cell_voltage]",
-            Self::PackVoltage => "[input.pack_voltage]",
-            Self::Temperature => "[[input.temperature]]",
-            Self::Soc => "[input.reported_soc]",
-            Self::Soh => "[input.reported_soh]",
-        }
+fn table(quantity: PackQuantity) -> &'static str {
+    match quantity {
+        PackQuantity::Current => "[input.current]",
+        PackQuantity::CellVoltage => "[input.cell_voltage]",
+        PackQuantity::PackVoltage => "[input.pack_voltage]",
+        PackQuantity::Temperature => "[[input.temperature]]",
+        PackQuantity::Soc => "[input.reported_soc]",
+        PackQuantity::Soh => "[input.reported_soh]",
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::{LazyLock, Mutex};
 
 use assert_cmd::Command;
 use packwatch::io::csv_log::CsvOptions;
-use packwatch::wiring::{Doctor, Report};
+use packwatch::wiring::{WiringObserver, WiringReport};
 use packwatch::wiring_check::{self, Interrupt};
 
 /// A kind of healthy pack.
@@ -230,13 +230,13 @@ impl Broken {
     }
 
     /// One that has heard nothing yet.
-    pub(crate) fn doctor(&self) -> Doctor {
+    pub(crate) fn doctor(&self) -> WiringObserver {
         let folder = tempfile::tempdir().unwrap();
-        Doctor::new(wiring_check::survey(&self.write(folder.path())).unwrap().plan)
+        WiringObserver::new(wiring_check::survey(&self.write(folder.path())).unwrap().plan)
     }
 
     /// What the doctor says.
-    pub(crate) fn report(&self) -> Report {
+    pub(crate) fn report(&self) -> WiringReport {
         let folder = tempfile::tempdir().unwrap();
         let path = self.write(folder.path());
         let survey = wiring_check::survey(&path).unwrap();

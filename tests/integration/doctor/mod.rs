@@ -12,7 +12,7 @@ mod missed;
 use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
 use missed::MISSED;
-use packwatch::wiring::{Report, Severity, Topic};
+use packwatch::wiring::{Severity, Topic, WiringReport};
 
 /// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
 fn first_seed() -> u64 {
@@ -32,7 +32,7 @@ const HEALTHY: &[(Bench, u64)] = &[
     (Bench::Day, 1),
 ];
 
-fn findings(report: &Report) -> Vec<String> {
+fn findings(report: &WiringReport) -> Vec<String> {
     let reported = report.findings.iter().filter(|finding| finding.severity != Severity::Note);
     reported
         .map(|finding| format!("{:?} {:?} {} | {}", finding.severity, finding.topic, finding.title, finding.seen))

@@ -2,7 +2,7 @@
 //! charge against the configured one.
 
 use super::context::{Judge, SignalSeries, find, warning};
-use super::words::number;
+use super::text::number;
 use crate::quantity::Channel;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
@@ -26,7 +26,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 
 /// Signals of the DBC beside the configured ones, with their median values.
 fn beside<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<(SignalSeries<'d>, f64)> {
-    let all = judge.plan.beside.iter().zip(&judge.doctor.beside);
+    let all = judge.plan.beside.iter().zip(&judge.observed.beside);
     let wanted = all.filter(|(signal, _)| signal.binding.channel == channel);
     wanted.filter_map(|signal| Some((signal, signal.1.values.median()?))).collect()
 }
@@ -71,7 +71,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
 }
 
 fn states_of_charge(judge: &mut Judge<'_>) {
-    let configured = judge.plan.signals.iter().zip(&judge.doctor.series);
+    let configured = judge.plan.signals.iter().zip(&judge.observed.series);
     let mut configured = configured.filter(|(signal, _)| signal.binding.channel == Channel::ReportedSoc);
     let Some((own, own_soc)) = configured.find_map(|(signal, series)| Some((signal, series.values.median()?))) else {
         return;

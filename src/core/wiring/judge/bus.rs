@@ -1,14 +1,14 @@
 //! Interfaces, identifiers, error frames, foreign senders, end-to-end checks.
 
 use super::context::{Judge, error, find, note, warning};
-use super::words::{count, number, seconds};
+use super::text::{count, number, seconds};
 use crate::can::CanId;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::guard::GuardConfig;
 use crate::quantity::BusIndex;
+use crate::wiring::observer::{BusStats, ProtectionStats};
 use crate::wiring::plan::MessagePlan;
-use crate::wiring::report::{Finding, Severity, Topic};
-use crate::wiring::watch::{BusStats, ProtectionStats};
+use crate::wiring::report::{Severity, Topic, WiringFinding};
 
 /// Error classes of linux/can/error.h.
 const CLASS_ACK: u32 = 0x20;
@@ -44,14 +44,14 @@ fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
 
 /// The other interface that carries most of the wanted identifiers, with their number.
 fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
-    let others = judge.doctor.buses.iter().enumerate().filter(|(other, _)| *other != index);
+    let others = judge.observed.buses.iter().enumerate().filter(|(other, _)| *other != index);
     let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));
     // Of several with as many the first.
     counted.filter(|(_, count)| *count > 0).rev().max_by_key(|(_, count)| *count)
 }
 
 fn interface(judge: &mut Judge<'_>, index: usize) {
-    let (bus, wanted) = (&judge.doctor.buses[index], messages_of(judge, bus_index(index)));
+    let (bus, wanted) = (&judge.observed.buses[index], messages_of(judge, bus_index(index)));
     if bus.error_frames > 0 {
         error_frames(judge, bus);
     }
@@ -83,14 +83,14 @@ fn silent_interface(judge: &mut Judge<'_>, bus: &BusStats, table: &str) {
             "is the vehicle awake? then check the plug, the bit rate, and that CAN_H and CAN_L are not exchanged",
         ),
     };
-    let busy = judge.doctor.buses.iter().filter(|other| other.frames > 0).map(|other| other.name.as_str());
+    let busy = judge.observed.buses.iter().filter(|other| other.frames > 0).map(|other| other.name.as_str());
     let busy: Vec<&str> = busy.collect();
     let others = if busy.is_empty() {
         "no other interface had any".to_owned()
     } else {
         format!("{} had some, none of this pack", busy.join(", "))
     };
-    let span = seconds(judge.doctor.seconds());
+    let span = seconds(judge.observed.seconds());
     error(judge, Topic::Interface, format!("{} {state}", bus.name))
         .seen(format!("no frame on {} in {span}; {others}", bus.name))
         .why("the configured signals are expected there")
@@ -126,7 +126,7 @@ fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
 
 /// Messages that came in another form or on another bus.
 fn messages(judge: &mut Judge<'_>, index: usize) {
-    let (bus, wanted) = (&judge.doctor.buses[index], messages_of(judge, bus_index(index)));
+    let (bus, wanted) = (&judge.observed.buses[index], messages_of(judge, bus_index(index)));
     let is_fd = |message: &&&MessagePlan| bus.ids.get(&message.id).is_some_and(|stats| stats.fd > 0);
     let fd: Vec<&str> = wanted.iter().filter(is_fd).map(|message| message.name.as_str()).collect();
     if !judge.plan.interfaces[index].fd && !fd.is_empty() {
@@ -182,7 +182,7 @@ fn on_other_bus(judge: &mut Judge<'_>, message: &MessagePlan) -> Option<()> {
 
 /// Another node sends with an identifier of the daemon's frames.
 fn conflicts(judge: &mut Judge<'_>) {
-    let buses = &judge.doctor.buses;
+    let buses = &judge.observed.buses;
     for output in &judge.plan.outputs {
         for bus in output.buses.iter().filter_map(|bus| buses.get(bus.index())) {
             let Some(stats) = bus.ids.get(&output.id) else { continue };
@@ -200,7 +200,7 @@ fn protection(judge: &mut Judge<'_>) {
     let plan = judge.plan;
     for (index, guard) in plan.guards.iter().enumerate() {
         let key = (guard.bus, guard.id);
-        let Some(stats) = judge.doctor.protected.get(&key) else { continue };
+        let Some(stats) = judge.observed.protected.get(&key) else { continue };
         let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
         let name = message.map_or("commands", |message| message.name.as_str());
         let all = stats.good + stats.bad;
@@ -218,11 +218,11 @@ fn protection(judge: &mut Judge<'_>) {
 }
 
 fn why_failing<'f>(
-    finding: &'f mut Finding,
+    finding: &'f mut WiringFinding,
     table: &str,
     guard: &GuardConfig,
     stats: &ProtectionStats,
-) -> &'f mut Finding {
+) -> &'f mut WiringFinding {
     let Protection { profile, data_id } = guard.check.protection;
     let fits = |protection: Protection| stats.payloads.iter().all(|p| protection.verified_counter(p).is_some());
     let profiles = [Profile::P01A, Profile::P01C, Profile::P05];
@@ -261,8 +261,8 @@ fn why_failing<'f>(
 
 /// Rate and identifiers of every interface with frames.
 fn traffic(judge: &mut Judge<'_>) {
-    for bus in judge.doctor.buses.iter().filter(|bus| bus.frames > 0) {
-        let per_s = bus.frames as f64 / judge.doctor.seconds().max(1e-3);
+    for bus in judge.observed.buses.iter().filter(|bus| bus.frames > 0) {
+        let per_s = bus.frames as f64 / judge.observed.seconds().max(1e-3);
         let per_s = number(if per_s >= 10.0 { per_s.round() } else { (per_s * 100.0).round() / 100.0 });
         let (ids, errors) = (bus.ids.len() as u64, if bus.error_frames == 0 { ", no error frames" } else { "" });
         judge.fine(format!("{}: {per_s} frames a second with {}{errors}", bus.name, count(ids, "identifier")));

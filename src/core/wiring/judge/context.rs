@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 
 use crate::can::CanId;
 use crate::cell::CellModel;
+use crate::filter::median;
 use crate::quantity::BusIndex;
+use crate::wiring::evidence::Series;
+use crate::wiring::observer::{BusStats, WiringObserver};
 use crate::wiring::plan::{Kind, Plan, SignalPlan};
-use crate::wiring::report::{Finding, Report, Severity, Topic};
-use crate::wiring::series::{Series, median};
-use crate::wiring::watch::{BusStats, Doctor};
+use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 
 /// A pack's current stays below this many times its capacity.
 pub(super) const MAX_C_RATE: f64 = 30.0;
@@ -22,9 +23,9 @@ pub(super) type SignalSeries<'d> = (&'d SignalPlan, &'d Series);
 
 /// State of the judgement.
 pub(super) struct Judge<'d> {
-    pub(super) doctor: &'d Doctor,
+    pub(super) observed: &'d WiringObserver,
     pub(super) plan: &'d Plan,
-    pub(super) report: Report,
+    pub(super) report: WiringReport,
     /// Messages whose absence is explained.
     pub(super) explained: BTreeSet<(BusIndex, CanId)>,
     /// Factor that converts the voltages as configured to V.
@@ -38,17 +39,17 @@ pub(super) struct Judge<'d> {
 }
 
 /// Adds an error; its texts follow.
-pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Error, topic, title)
 }
 
 /// Adds a warning; its texts follow.
-pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Warning, topic, title)
 }
 
 /// Adds a note; its texts follow.
-pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Note, topic, title)
 }
 
@@ -58,16 +59,16 @@ pub(super) fn find<'j>(
     severity: Severity,
     topic: Topic,
     title: impl Into<String>,
-) -> &'j mut Finding {
-    judge.report.add(Finding::new(severity, topic, title))
+) -> &'j mut WiringFinding {
+    judge.report.add(WiringFinding::new(severity, topic, title))
 }
 
 impl<'d> Judge<'d> {
-    pub(super) fn new(doctor: &'d Doctor) -> Self {
-        let report = Report { seconds: doctor.seconds(), frames: doctor.frames, ..Report::default() };
+    pub(super) fn new(observed: &'d WiringObserver) -> Self {
+        let report = WiringReport { seconds: observed.seconds(), frames: observed.frames, ..WiringReport::default() };
         Self {
-            doctor,
-            plan: &doctor.plan,
+            observed,
+            plan: &observed.plan,
             report,
             explained: BTreeSet::new(),
             voltage_factor: 1.0,
@@ -92,7 +93,7 @@ impl<'d> Judge<'d> {
 
     /// Signals of a kind.
     pub(super) fn signals(&self, kind: Kind) -> Vec<SignalSeries<'d>> {
-        let all = self.plan.signals.iter().zip(&self.doctor.series);
+        let all = self.plan.signals.iter().zip(&self.observed.series);
         all.filter(|(signal, _)| Kind::of(signal.binding.channel) == kind).collect()
     }
 
@@ -162,7 +163,7 @@ impl<'d> Judge<'d> {
     }
 
     pub(super) fn bus(&self, bus: BusIndex) -> Option<&'d BusStats> {
-        self.doctor.buses.get(bus.index())
+        self.observed.buses.get(bus.index())
     }
 
     pub(super) fn interface(&self, bus: BusIndex) -> &'d str {
@@ -171,7 +172,7 @@ impl<'d> Judge<'d> {
 
     /// Another interface that carries the identifier.
     pub(super) fn other_bus(&self, bus: BusIndex, id: CanId) -> Option<&'d BusStats> {
-        let buses = self.doctor.buses.iter().enumerate();
+        let buses = self.observed.buses.iter().enumerate();
         buses.filter(|(index, _)| *index != bus.index()).map(|(_, other)| other).find(|b| b.ids.contains_key(&id))
     }
 }

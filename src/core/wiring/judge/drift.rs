@@ -2,7 +2,7 @@
 
 use super::context::Judge;
 use crate::cell::CellModel;
-use crate::wiring::response::SteadyRun;
+use crate::wiring::evidence::response::SteadyRun;
 
 /// A drift is trusted from this many standard deviations.
 const SURE: f64 = 6.0;
@@ -27,7 +27,7 @@ impl Drift {
     pub(super) fn of(judge: &Judge<'_>) -> Option<Self> {
         let model = judge.plan.pack.model.as_ref()?;
         let (mut xx, mut xy, mut variance, mut seconds, mut expected_v) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for run in &judge.doctor.fast_response().runs {
+        for run in &judge.observed.fast_response().runs {
             let expected = expected_drift_v(judge, model, run);
             let (measured, std) = (run.drift_v * judge.voltage_factor, run.drift_std_v * judge.voltage_factor);
             xx += expected * expected;

@@ -2,12 +2,12 @@
 
 use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
+use super::text::{milli, number, percent, seconds, toml};
 use super::unit::unit_of;
-use super::words::{milli, number, percent, seconds, toml};
 use super::{frozen, model};
+use crate::wiring::evidence::Slope;
 use crate::wiring::plan::SignalPlan;
-use crate::wiring::report::{Finding, Severity, Topic};
-use crate::wiring::response::Slope;
+use crate::wiring::report::{Severity, Topic, WiringFinding};
 
 /// Smallest step of the current that is judged, of the capacity.
 const SMALLEST_STEP: f64 = 0.02;
@@ -19,7 +19,7 @@ const ODD_RATIO: f64 = 2.5;
 const FEWER_STRINGS_RATIO: f64 = 2.0;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
-    if judge.doctor.frames == 0 || judge.is_mixed_up {
+    if judge.observed.frames == 0 || judge.is_mixed_up {
         return;
     }
     frozen::check(judge);
@@ -59,7 +59,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 
 /// The pack's slope as ohm per cell, after the factors found: the strings share the current.
 fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
-    let slope = judge.doctor.slope()?;
+    let slope = judge.observed.slope()?;
     let by = judge.voltage_factor / judge.current_factor * f64::from(judge.plan.pack.strings.max(1));
     let largest_a = slope.largest_a * judge.current_factor;
     Some(Slope { ohm: slope.ohm * by, std_ohm: slope.std_ohm * by, largest_a, ..slope })
@@ -97,7 +97,7 @@ fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str)
 
 fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     let Some(model) = &judge.plan.pack.model else { return };
-    let (fast, slow) = judge.model_ohm(model, judge.doctor.slope_block_s());
+    let (fast, slow) = judge.model_ohm(model, judge.observed.slope_block_s());
     let ohm = slope.ohm.abs();
     let is_large = slope.largest_a >= SMALLEST_STEP * judge.pack_ah() || ohm > slow;
     if slope.r2 < EXPLAINED || !is_large {
@@ -148,7 +148,7 @@ fn power_of_ten(ratio: f64) -> f64 {
 /// The power of ten by which the current is off, by its steps; `None` = unknown, or 1.
 pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
     let slope = cell_slope(judge)?;
-    let (fast, slow) = judge.model_ohm(judge.plan.pack.model.as_ref()?, judge.doctor.slope_block_s());
+    let (fast, slow) = judge.model_ohm(judge.plan.pack.model.as_ref()?, judge.observed.slope_block_s());
     let factor = power_of_ten(slope.ohm.abs() / (fast * slow).sqrt());
     (slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED && factor != 1.0).then_some(factor)
 }
@@ -168,7 +168,7 @@ pub(super) fn wrong_unit_or_cell<'j>(
     signal: &SignalPlan,
     factor: f64,
     severity: Severity,
-) -> &'j mut Finding {
+) -> &'j mut WiringFinding {
     let times = number(factor.max(1.0 / factor));
     let size = if factor < 1.0 { "larger" } else { "smaller" };
     let is_ampere = unit_of(&signal.unit).is_some_and(|(_, unit, _)| unit == 1.0) && signal.scale == 1.0;

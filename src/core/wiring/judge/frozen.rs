@@ -1,12 +1,11 @@
 //! Signals that stand still while others move, cells that respond unlike the others, and cells with one voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
-use super::words::{channels, count, milli, number, ranges};
+use super::text::{channels, count, milli, number, ranges};
 use crate::quantity::Channel;
+use crate::wiring::evidence::{Series, Slope};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
-use crate::wiring::response::Slope;
-use crate::wiring::series::Series;
 
 /// Fewest readings to judge a signal by.
 const FEWEST_READINGS: u64 = 20;
@@ -46,7 +45,7 @@ fn voltages(judge: &mut Judge<'_>) {
 
 fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     let noise_v = judge.median_of(Kind::Voltage, Series::noise).unwrap_or(0.0);
-    let step_v = judge.doctor.fast_response().largest_voltage_step() * judge.voltage_factor;
+    let step_v = judge.observed.fast_response().largest_voltage_step() * judge.voltage_factor;
     let is_step = step_v > (10.0 * noise_v / judge.cells_per_reading() * judge.voltage_factor).max(0.008);
     if series.count() < FEWEST_READINGS || series.extent.changes > 0 || !is_step {
         return;
@@ -81,7 +80,7 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     if voltages.iter().any(|voltage| step_v(voltage) > COARSE_V) {
         return;
     }
-    let [fast, slow] = judge.doctor.responses().each_ref().map(|response| response.equal_cells.groups(FEWEST_BLOCKS));
+    let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(FEWEST_BLOCKS));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
         let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));
         let members: Vec<_> = voltages.iter().filter(is_member).collect();
@@ -101,10 +100,10 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
 /// Cells with a voltage that does not follow the current as the others do.
 pub(super) fn check_response(judge: &mut Judge<'_>) {
     let is_clear = |slope: &Slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED;
-    let Some(common) = judge.doctor.slope().filter(is_clear) else { return };
+    let Some(common) = judge.observed.slope().filter(is_clear) else { return };
     let cells = if judge.plan.pack.is_total { 0 } else { usize::from(judge.plan.pack.cells) };
     let odd = (0..cells.min(judge.signals(Kind::Voltage).len())).filter_map(|cell| {
-        let slope = judge.doctor.slope_of(cell)?;
+        let slope = judge.observed.slope_of(cell)?;
         let ratio = slope.ohm / common.ohm;
         let is_sure = (slope.ohm - common.ohm).abs() > SURE * slope.std_ohm.max(common.std_ohm);
         (is_sure && !(0.33..=3.0).contains(&ratio) && slope.points >= FEWEST_STEPS).then_some((cell + 1, ratio))

@@ -25,22 +25,22 @@ mod model;
 mod other_bus;
 mod presence;
 mod swapped;
+mod text;
 mod timing;
 mod unit;
 mod values;
-mod words;
 
+use super::observer::WiringObserver;
 use super::plan::Kind;
-use super::report::{Finding, Report, Topic};
-use super::watch::Doctor;
+use super::report::{Topic, WiringFinding, WiringReport};
 use context::Judge;
 
 /// Seconds of frames below which periods and cells are not judged.
 const SHORT_S: f64 = 5.0;
 
-impl Doctor {
+impl WiringObserver {
     /// Judges everything received.
-    pub fn finish(mut self) -> Report {
+    pub fn finish(mut self) -> WiringReport {
         self.end_blocks();
         let mut judge = Judge::new(&self);
         bus::check(&mut judge);
@@ -56,7 +56,7 @@ impl Doctor {
         timing::check(&mut judge);
         let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < SHORT_S {
-            let span = words::seconds(awake_s);
+            let span = text::seconds(awake_s);
             judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));
         }
         fold(&mut judge);
@@ -79,7 +79,7 @@ fn fold(judge: &mut Judge<'_>) {
     // A wrong temperature explains other temperatures only.
     let explains_all = judge.wrong_layouts.iter().any(|kind| *kind != Kind::Temperature);
     if !judge.wrong_layouts.is_empty() {
-        let is_consequence = |finding: &Finding| {
+        let is_consequence = |finding: &WiringFinding| {
             OF_VALUES.contains(&finding.topic) && (explains_all || finding.title.starts_with("temperature"))
         };
         judge.report.fold(Topic::Layout, is_consequence);

@@ -2,11 +2,11 @@
 
 use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
-use super::words::{milli, number, percent, seconds, toml};
+use super::text::{milli, number, percent, seconds, toml};
 use crate::cell::CellModel;
+use crate::wiring::evidence::Series;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::Topic;
-use crate::wiring::series::Series;
 
 pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
     if let Some(model) = &judge.plan.pack.model {
@@ -20,7 +20,7 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
     let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
-    let mut rests = judge.doctor.fast_response().rests.iter().map(|rest| rest.end_v);
+    let mut rests = judge.observed.fast_response().rests.iter().map(|rest| rest.end_v);
     let highest = rests.clone().fold(f64::NAN, f64::max);
     let lowest = rests.clone().fold(f64::NAN, f64::min);
     let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
@@ -70,7 +70,7 @@ fn chemistry(voltage_v: f64) -> &'static str {
 
 /// A steady current near zero that is not zero.
 fn offset(judge: &mut Judge<'_>) {
-    let rests = &judge.doctor.fast_response().rests;
+    let rests = &judge.observed.fast_response().rests;
     let Some((signal, _)) = judge.current() else { return };
     let Some(longest) = rests.iter().max_by(|a, b| a.seconds.total_cmp(&b.seconds)) else { return };
     let (offset_a, dead_band_a) = (longest.current_a, judge.plan.pack.dead_band_a);
@@ -106,7 +106,7 @@ fn noise(judge: &mut Judge<'_>) {
 /// Share of voltages the estimator rejected.
 pub(super) fn check_estimator(judge: &mut Judge<'_>) {
     const FEWEST: u64 = 200;
-    let stats = &judge.doctor.estimator;
+    let stats = &judge.observed.estimator;
     if stats.estimates < FEWEST {
         return;
     }

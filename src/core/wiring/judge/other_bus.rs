@@ -1,18 +1,17 @@
 //! The current's message on another interface: which of the two the voltages follow.
 
 use super::context::{EXPLAINED, Judge, error, warning};
-use super::words::number;
+use super::text::number;
 use crate::quantity::BusIndex;
+use crate::wiring::evidence::{Series, Slope};
 use crate::wiring::other_current::OtherCurrent;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
-use crate::wiring::response::Slope;
-use crate::wiring::series::Series;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };
-    let others = judge.doctor.other_currents.iter().filter(|(_, other)| other.series.count() > 0);
-    let here = judge.doctor.slope();
+    let others = judge.observed.other_currents.iter().filter(|(_, other)| other.series.count() > 0);
+    let here = judge.observed.slope();
     for (bus, other) in others {
         let there = other.slope().filter(is_clear);
         match (here.is_some_and(|slope| is_clear(&slope)), there) {

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 
 use super::context::{Judge, error, find};
+use super::text::{channels, number, seconds};
 use super::values;
-use super::words::{channels, number, seconds};
 use crate::can::CanId;
 use crate::quantity::{BusIndex, Channel};
+use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
-use crate::wiring::series::Series;
 
 /// Why there is no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -27,7 +27,7 @@ enum Absence {
 type Absent<'d> = (&'d SignalPlan, Absence);
 
 pub(super) fn check(judge: &mut Judge<'_>) {
-    let all = judge.plan.signals.iter().zip(&judge.doctor.series);
+    let all = judge.plan.signals.iter().zip(&judge.observed.series);
     let unexplained = all.filter(|(s, _)| !judge.explained.contains(&(s.binding.bus, s.binding.id)));
     let absent = unexplained.filter_map(|(signal, series)| Some((signal, absence(judge, signal, series)?)));
     let is_explained = |(signal, absence): &Absent<'_>| {
@@ -131,7 +131,7 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
     let (bus, id) = (signals[0].binding.bus, signals[0].binding.id);
     match absence {
         Absence::Message => {
-            format!("did not come on {} in {}", judge.interface(bus), seconds(judge.doctor.seconds()))
+            format!("did not come on {} in {}", judge.interface(bus), seconds(judge.observed.seconds()))
         }
         Absence::Page => format!("came, but never with the page of {what}"),
         Absence::NotAvailable => "came, and always said \"signal not available\"".to_owned(),
@@ -180,7 +180,7 @@ fn more_cells(judge: &mut Judge<'_>) {
     let plan = judge.plan;
     let is_alike =
         |series: &Series| series.values.median().is_some_and(|v| (v - median_v).abs() < 0.15 * median_v.abs());
-    let further = plan.more_cells.iter().zip(&judge.doctor.more_cells).filter(|(_, series)| is_alike(series));
+    let further = plan.more_cells.iter().zip(&judge.observed.more_cells).filter(|(_, series)| is_alike(series));
     let further: Vec<&str> = further.map(|(signal, _)| signal.name.as_str()).collect();
     if further.is_empty() || plan.pack.is_total {
         return;

@@ -1,13 +1,13 @@
 //! One signal in another's place: by the units of the DBC, and by the values.
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
+use super::text::{channel, number};
 use super::unit::unit_of;
 use super::values::is_impossible;
-use super::words::{channel, number};
 use crate::quantity::Channel;
+use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
-use crate::wiring::series::Series;
 
 /// Temperatures a pack in use may have, degrees C.
 const PLAUSIBLE_C: (f64, f64) = (-45.0, 95.0);

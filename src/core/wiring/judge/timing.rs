@@ -1,10 +1,10 @@
 //! Periods: against the age from which readings are stale, and against the DBC's cycle times.
 
 use super::context::{Judge, SignalSeries, find, warning};
-use super::words::{count, percent, seconds, toml};
+use super::text::{count, percent, seconds, toml};
+use crate::filter::median;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
-use crate::wiring::series::median;
 
 /// A period this many times the DBC's is a finding.
 const SLOWER: f64 = 2.0;
@@ -34,7 +34,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 /// Messages that lose frames: the gaps of each of their signals are multiples of its cycle.
 fn lost(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
-        let signals = judge.plan.signals.iter().zip(&judge.doctor.series);
+        let signals = judge.plan.signals.iter().zip(&judge.observed.series);
         let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
         let losses: Vec<(f64, f64)> = of_message.filter_map(|(_, series)| series.loss.share()).collect();
         let Some(share) = median(losses.iter().map(|(share, _)| *share)).filter(|share| *share >= LOST) else {
@@ -98,7 +98,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(stats) = judge.bus(message.bus).and_then(|bus| bus.ids.get(&message.id)) else { continue };
         // The pages of a multiplexed message may come in bursts of any length.
         let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
-        let (span_s, awake_s) = (stats.last.since(stats.first), judge.doctor.awake_s);
+        let (span_s, awake_s) = (stats.last.since(stats.first), judge.observed.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
         let period_s = span_s / (stats.count.max(2) - 1) as f64;
         if stats.count < 10 || period_s < SLOWER * cycle_s {

@@ -2,13 +2,14 @@
 
 use super::context::{Judge, MAX_C_RATE, SignalSeries, error, find};
 use super::electrical;
+use super::text::{channels, number, percent, toml};
 use super::unit::unit_of;
-use super::words::{channels, number, percent, toml};
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::quantity::Channel;
+use crate::wiring::evidence::layout::{AlternativeReading, LAYOUT_FAULTS};
+use crate::wiring::evidence::{Extent, Series};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
-use crate::wiring::series::{AlternativeReading, Extent, LAYOUT_FAULTS, Series};
 
 /// Factors by which a unit may be wrong.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];

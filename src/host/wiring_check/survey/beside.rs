@@ -9,9 +9,7 @@ use crate::can::unit::{Quantity, SignalUnit};
 use crate::config::{Databases, NamedSignal, RawTables, ResolvedSignal};
 use crate::quantity::{BusIndex, Channel};
 use crate::wiring::SignalPlan;
-
-/// Most signals that are followed, on all interfaces together.
-const MAX_SIGNALS: usize = 64;
+use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
 /// The comparable signals.
 pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedSignal<'_>]) -> Vec<SignalPlan> {
@@ -26,29 +24,18 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
             Some(plan)
         })
     });
-    bound.take(MAX_SIGNALS).collect()
+    // On all interfaces together.
+    bound.take(64).collect()
 }
 
 /// What a signal is by its name and unit; `None` = nothing to compare.
 fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Channel> {
-    let unit = SignalUnit::parse(&signal.unit);
-    let name = format!("{}{}", message.name, signal.name).to_ascii_lowercase().replace('_', "");
-    let own = signal.name.to_ascii_lowercase().replace('_', "");
-    let has = |text: &str, words: &[&str]| words.iter().any(|word| text.contains(word));
-    if has(&own, &["min", "max", "lim", "target", "request", "avg", "cell", "aux", "12v", "lv"]) {
-        return None;
-    }
-    let is_volt = unit.is_some_and(|unit| unit.quantity == Quantity::Voltage);
-    let is_share = signal.unit.is_empty() || unit.is_some_and(|unit| unit.quantity == Quantity::PERCENTAGE);
-    let is_pack = |text: &str| has(text, &["pack", "total", "batt", "stack", "hv", "bms"]);
-    let is_elsewhere =
-        has(&own, &["link", "dcdc", "iso", "contactor", "charg"]) || own.contains("dc") && !is_pack(&own);
-    if is_volt && !is_elsewhere && (is_pack(&own) || is_pack(&name) && has(&own, &["volt", "sum"])) {
+    let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
+    let is = |quantity| !label.says_extreme() && label.score(quantity).is_some_and(|score| score.points >= 3.0);
+    if is(PackQuantity::PackVoltage) && label.has_unit_of(Quantity::Voltage) && label.is_of_pack() {
         (!raw.is_pack_total()).then_some(Channel::PackVoltage)
-    } else if is_share && (own.ends_with("soc") || own.starts_with("soc") || has(&own, &["stateofcharge"])) {
-        Some(Channel::ReportedSoc)
     } else {
-        None
+        is(PackQuantity::Soc).then_some(Channel::ReportedSoc)
     }
 }
 

@@ -5,18 +5,10 @@
 //! ones that are caught up with are not missing. A sender without a cycle differs from one that loses frames by its gaps,
 //! which are not multiples.
 
-use super::series::median;
+use crate::filter::median;
 
-/// Gaps from which the cycle is taken.
-const FIRST: usize = 16;
-/// Fewest gaps to judge by.
-const FEWEST: u32 = 30;
 /// Longest gap that counts as loss, cycles: a longer one is a pause.
 const LONGEST: f64 = 5.0;
-/// A gap is a multiple of the cycle within this fraction of the cycle.
-const TOLERANCE: f64 = 0.4;
-/// Share of the gaps that must be multiples.
-const REGULAR: f64 = 0.9;
 
 /// Counts of a signal.
 #[derive(Debug, Clone, Default)]
@@ -34,7 +26,7 @@ impl LossCounter {
     pub(crate) fn push(&mut self, gap_s: f64) {
         let Some(cycle_s) = self.cycle_s else {
             self.first.push(gap_s);
-            if self.first.len() == FIRST {
+            if self.first.len() == 16 {
                 self.cycle_s = median(self.first.drain(..)).filter(|cycle_s| *cycle_s > 0.0);
             }
             return;
@@ -46,7 +38,7 @@ impl LossCounter {
         self.gaps = self.gaps.saturating_add(1);
         self.elapsed += cycles;
         let whole = cycles.round();
-        if whole >= 1.0 && (cycles - whole).abs() <= TOLERANCE {
+        if whole >= 1.0 && (cycles - whole).abs() <= 0.4 {
             self.regular = self.regular.saturating_add(1);
             // At most LONGEST.
             self.missing = self.missing.saturating_add(whole as u32 - 1);
@@ -57,7 +49,7 @@ impl LossCounter {
     pub(crate) fn share(&self) -> Option<(f64, f64)> {
         let gaps = f64::from(self.gaps);
         let missing = f64::from(self.missing).min((self.elapsed - gaps).max(0.0));
-        let is_cyclic = self.gaps >= FEWEST && f64::from(self.regular) >= REGULAR * gaps;
+        let is_cyclic = self.gaps >= 30 && f64::from(self.regular) >= 0.9 * gaps;
         self.cycle_s.filter(|_| is_cyclic).map(|cycle_s| (missing / (gaps + missing), cycle_s))
     }
 }

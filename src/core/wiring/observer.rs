@@ -1,12 +1,13 @@
-//! The doctor at work: takes frames and events, and keeps the statistics that the judgement needs.
+//! Takes frames and events, and keeps the statistics that the judgement needs.
 
 use std::collections::BTreeMap;
 
+use super::evidence::Series;
+use super::evidence::Slope;
+use super::evidence::response::{BLOCKS_S, VoltageResponse, best_response};
 use super::other_current::OtherCurrent;
 use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan};
-use super::response::{BLOCKS_S, Slope, VoltageResponse, best_response};
-use super::series::Series;
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
 use crate::can::uds::{Answer, Heard, Listener, Question};
@@ -69,9 +70,9 @@ enum SignalList {
     Beside,
 }
 
-/// Collects frames, events and estimates; [`Doctor::finish`] judges them.
+/// Collects frames, events and estimates; [`WiringObserver::finish`] judges them.
 #[derive(Debug)]
-pub struct Doctor {
+pub struct WiringObserver {
     pub(crate) plan: Plan,
     pub(crate) buses: Vec<BusStats>,
     /// As `plan.signals`.
@@ -102,8 +103,8 @@ pub struct Doctor {
     pub(crate) frames: u64,
 }
 
-impl Doctor {
-    /// A doctor without any frame.
+impl WiringObserver {
+    /// Before the first frame.
     pub fn new(plan: Plan) -> Self {
         let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>> = BTreeMap::new();
         let lists = [

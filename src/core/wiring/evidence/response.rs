@@ -9,7 +9,8 @@
 //! The largest steps and longest runs are kept: a choice by current or time alone does not bias the slope.
 
 use super::equal_cells::EqualCells;
-use super::series::median;
+use super::slope::Slope;
+use crate::filter::median;
 use crate::quantity::Timestamp;
 
 /// Times over which readings are averaged, s: the first for a load that always changes, the second for one that holds for
@@ -17,22 +18,10 @@ use crate::quantity::Timestamp;
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
 /// Blocks further apart than this do not belong together, s.
 const MAX_GAP_S: f64 = 40.0;
-/// Steps this many times the median scatter off the line are left out.
-const FAR: f64 = 8.0;
-/// Fewer large steps than this are judged against the noise between them ...
-const FEW_STEPS: usize = 5;
-/// ... when the largest is this many times the tolerance.
-const FEW_TIMES: f64 = 5.0;
 /// Most steps kept: a slope from this number is good to a few per cent.
 const MAX_STEPS: usize = 192;
-/// Most runs kept.
-const MAX_RUNS: usize = 128;
 /// Time at the start of a run that is not evaluated: the circuit's branches settle, s.
 const SETTLE_S: f64 = 20.0;
-/// Shortest part of a run that is evaluated, s.
-const MIN_RUN_S: f64 = 25.0;
-/// Most rests kept.
-const MAX_RESTS: usize = 256;
 
 /// A step of the current and of the voltages.
 #[derive(Debug, Clone)]
@@ -40,68 +29,6 @@ struct CurrentStep {
     current_a: f64,
     voltage_v: f64,
     cells_v: Vec<f32>,
-}
-
-/// A slope through the origin.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Slope {
-    pub(crate) points: usize,
-    /// -dV/dI, ohm.
-    pub(crate) ohm: f64,
-    /// Its standard deviation.
-    pub(crate) std_ohm: f64,
-    /// Share of the voltage's variance explained.
-    pub(crate) r2: f64,
-    /// Largest step of the current, A.
-    pub(crate) largest_a: f64,
-}
-
-impl Slope {
-    pub(crate) fn t(&self) -> f64 {
-        self.ohm / self.std_ohm.max(1e-12)
-    }
-
-    /// Certainty that the slope is not zero: 1 = enough. A few points can lie on a line by chance.
-    pub(crate) fn certainty(&self) -> f64 {
-        let needed = match self.points {
-            0..=4 => 15.0,
-            5..=7 => 8.0,
-            _ => 6.0,
-        };
-        self.t().abs() / needed
-    }
-
-    /// Through the points without outliers: a wrong reading must not decide.
-    fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
-        let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
-        let ratio = median(all.iter().map(|(x, y)| y / x))?;
-        let scatter = median(all.iter().map(|(x, y)| (y - ratio * x).abs()))?;
-        let near = |(x, y): &&(f64, f64)| (y - ratio * x).abs() <= FAR * scatter + 1e-3;
-        let kept: Vec<(f64, f64)> = all.iter().filter(near).copied().collect();
-        Self::fit(if 5 * kept.len() >= 4 * all.len() { &kept } else { &all })
-    }
-
-    fn fit(points: &[(f64, f64)]) -> Option<Self> {
-        let (mut xx, mut xy, mut yy, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
-        for (x, y) in points {
-            (xx, xy, yy) = (xx + x * x, xy + x * y, yy + y * y);
-            largest = largest.max(x.abs());
-        }
-        if points.len() < 3 || xx <= 0.0 {
-            return None;
-        }
-        let n = points.len() as f64;
-        let rest = (yy - xy * xy / xx).max(0.0) / (n - 1.0);
-        let r2 = if yy > 0.0 { xy * xy / (xx * yy) } else { 0.0 };
-        Some(Self {
-            points: points.len(),
-            ohm: -xy / xx,
-            // Readings have a resolution: a perfect fit of a few steps is not perfect knowledge.
-            std_ohm: (rest / xx).sqrt().max(1e-7),
-            r2,
-            largest_a: largest,
-        })
-    }
 }
 
 /// A time of steady current.
@@ -182,7 +109,7 @@ impl OpenRun {
         let seconds = self.last.since(self.from) - first_s;
         let (tt, tv, vv) =
             (self.tt - self.t * self.t / n, self.tv - self.t * self.v / n, self.vv - self.v * self.v / n);
-        if n < 5.0 || seconds < MIN_RUN_S || tt <= 0.0 {
+        if n < 5.0 || seconds < 25.0 || tt <= 0.0 {
             return None;
         }
         let slope = tv / tt;
@@ -303,11 +230,8 @@ impl VoltageResponse {
 
     fn close_run(&mut self) {
         let Some(run) = self.open_run.take().and_then(|run| run.finish()) else { return };
-        let (list, limit) = if run.current_a.abs() <= 2.0 * self.tolerance_a {
-            (&mut self.rests, MAX_RESTS)
-        } else {
-            (&mut self.runs, MAX_RUNS)
-        };
+        let (list, limit) =
+            if run.current_a.abs() <= 2.0 * self.tolerance_a { (&mut self.rests, 256) } else { (&mut self.runs, 128) };
         if list.len() < limit {
             list.push(run);
         } else if let Some(shortest) = list.iter_mut().min_by(|a, b| a.seconds.total_cmp(&b.seconds))
@@ -340,12 +264,12 @@ impl VoltageResponse {
             let steps = self.steps.iter().filter(move |step| step.current_a.abs() >= least_a);
             steps.filter_map(|step| Some((step.current_a, voltage_v(step)?))).filter(|(_, v)| v.is_finite())
         };
-        if points(0.2 * largest).count() >= FEW_STEPS {
+        if points(0.2 * largest).count() >= 5 {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
         // Small for this pack: noise, or another unit. Only steps that agree with each other count.
-        if largest < FEW_TIMES * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
+        if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
     /// Largest step of the median cell's voltage, V.
@@ -378,12 +302,6 @@ mod tests {
         assert!((slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0, "{slope:?}");
         let turned = Slope::of((0..9).map(|n| (f64::from(n) - 4.0, 0.03 * (f64::from(n) - 4.0)))).unwrap();
         assert!((turned.ohm + 0.03).abs() < 1e-9, "{turned:?}");
-    }
-
-    #[test]
-    fn a_wrong_reading_does_not_decide_the_slope() {
-        let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
-        assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
     }
 
     #[test]

@@ -1,0 +1,292 @@
+//! What the name and the unit of a signal say about it.
+//!
+//! In: message name, signal name and unit as their author wrote them. Out: points for each quantity of a pack, each with its
+//! reason in words, or `None` where the unit is that of another quantity. The points are weights chosen on three cars: a unit and a
+//! name count 2 each, a word of another device or of a limit costs 3.
+
+use serde::Serialize;
+
+use crate::can::unit::{Quantity, SignalUnit};
+
+/// What a signal of a pack may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PackQuantity {
+    /// Pack current, A.
+    Current,
+    /// Pack voltage, V.
+    PackVoltage,
+    /// Voltages of single cells, V.
+    CellVoltage,
+    /// Temperatures of the pack, degrees Celsius.
+    Temperature,
+    /// The battery controller's state of charge, %.
+    Soc,
+    /// The battery controller's state of health, %.
+    Soh,
+}
+
+/// Points for a quantity with their reasons; a reason may be empty.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Score {
+    /// Weight of the evidence; only the order matters.
+    pub points: f64,
+    /// Why, in plain words.
+    pub reasons: Vec<String>,
+}
+
+/// Name and unit of a signal.
+#[derive(Debug, Clone)]
+pub struct SignalLabel {
+    /// Words of the signal's own name, lower case: split at every change of case, at digits and at anything else.
+    words: Vec<String>,
+    /// The whole name, lower case.
+    name: String,
+    unit: LabelUnit,
+    is_pack_message: bool,
+}
+
+/// The unit of a label.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum LabelUnit {
+    Known(Quantity),
+    /// No unit is stated.
+    Missing,
+    /// Stated and not known.
+    Other,
+}
+
+// Words in names. A word with `=` must stand by itself, any other may be a part of the name.
+
+/// Words that place a signal at the traction battery.
+const PACK: &str = "batt akku pack bms traction hvb =hv accumulator";
+/// Words of other devices and of the 12 V battery.
+const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inverter invrt phase obc evse ptc heater htr \
+    compressor hvac cabin ambient coolant tpms tire front rear link solar pump fan oil igbt fet pcb cpu \
+    pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
+    screen bus line isolation relay coil contactor cont";
+/// Words of limits and requests: not a measured value.
+const NO_MEASUREMENT: &str = "limit target request =req avail possible set allowed threshold lifetime cumulative rated nominal =id \
+    =num count delta =dev deviation fault offset reserve initial";
+
+impl Score {
+    /// Adds points and their reason if it holds.
+    pub fn add(&mut self, points: f64, holds: bool, reason: &str) {
+        if holds {
+            self.points += points;
+            if !reason.is_empty() {
+                self.reasons.push(reason.to_owned());
+            }
+        }
+    }
+}
+
+impl PackQuantity {
+    /// Every quantity, in the order of reports.
+    pub const ALL: [Self; 6] =
+        [Self::Current, Self::PackVoltage, Self::CellVoltage, Self::Temperature, Self::Soc, Self::Soh];
+
+    /// In words.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Current => "pack current",
+            Self::PackVoltage => "pack voltage",
+            Self::CellVoltage => "cell voltages",
+            Self::Temperature => "temperatures",
+            Self::Soc => "state of charge",
+            Self::Soh => "state of health",
+        }
+    }
+
+    /// Unit of its values.
+    pub fn unit(self) -> &'static str {
+        match self {
+            Self::Current => "A",
+            Self::PackVoltage | Self::CellVoltage => "V",
+            Self::Temperature => "degC",
+            Self::Soc | Self::Soh => "%",
+        }
+    }
+
+    /// The quantity of its unit.
+    fn measured(self) -> Quantity {
+        match self {
+            Self::Current => Quantity::Current,
+            Self::PackVoltage | Self::CellVoltage => Quantity::Voltage,
+            Self::Temperature => Quantity::Temperature,
+            Self::Soc | Self::Soh => Quantity::PERCENTAGE,
+        }
+    }
+}
+
+impl SignalLabel {
+    /// Reads names and unit.
+    pub fn new(message: &str, signal: &str, unit: &str) -> Self {
+        let unit = match SignalUnit::parse(unit) {
+            Some(unit) => LabelUnit::Known(unit.quantity),
+            None if matches!(unit.trim(), "" | "-" | "1") => LabelUnit::Missing,
+            None => LabelUnit::Other,
+        };
+        let label = |name: &str| Self { words: words(name), name: name.to_lowercase(), unit, is_pack_message: false };
+        let is_pack_message = label(message).has(PACK);
+        Self { is_pack_message, ..label(signal) }
+    }
+
+    /// A signal without a name.
+    pub fn unnamed(quantity: Quantity) -> Self {
+        Self { words: Vec::new(), name: String::new(), unit: LabelUnit::Known(quantity), is_pack_message: false }
+    }
+
+    /// Whether one of the words is there.
+    fn has(&self, any: &str) -> bool {
+        any.split(' ').any(|wanted| match wanted.strip_prefix('=') {
+            Some(word) => self.words.iter().any(|own| own == word),
+            None => self.name.contains(wanted),
+        })
+    }
+
+    /// Whether the unit is stated and is one of this quantity.
+    pub fn has_unit_of(&self, quantity: Quantity) -> bool {
+        self.unit == LabelUnit::Known(quantity)
+    }
+
+    /// Whether the unit is one of this quantity, or none is stated.
+    pub fn may_measure(&self, quantity: Quantity) -> bool {
+        self.has_unit_of(quantity) || self.unit == LabelUnit::Missing
+    }
+
+    /// Whether the signal or its message is named like a part of the traction battery.
+    pub fn is_of_pack(&self) -> bool {
+        self.has(PACK) || self.is_pack_message
+    }
+
+    /// Whether the name says maximum or minimum.
+    pub fn says_extreme(&self) -> bool {
+        self.has("max min highest lowest")
+    }
+
+    /// Whether the name says cell.
+    pub fn says_cell(&self) -> bool {
+        self.has("cell brick cmu zelle =vc")
+    }
+
+    fn says_soc(&self) -> bool {
+        self.has("=soc stateofcharge state_of_charge socave socui socdisp")
+            || self.words.iter().any(|word| word.starts_with("soc") && word.len() <= 7)
+            || self.name.starts_with("soc")
+    }
+
+    fn says_soh(&self) -> bool {
+        self.has("soh stateofhealth state_of_health")
+    }
+
+    /// What name and unit say about a quantity; `None` = they exclude it.
+    pub fn score(&self, quantity: PackQuantity) -> Option<Score> {
+        let mut score = Score::default();
+        let has_unit = self.has_unit_of(quantity.measured());
+        if !self.may_measure(quantity.measured()) {
+            return None;
+        }
+        let (says, name) = match quantity {
+            PackQuantity::Current => (self.has("curr strom amp =i =ibat =ibatt =a"), "its name says current"),
+            PackQuantity::PackVoltage => {
+                (self.has("volt spannung =v =u vdc =vbat =vbatt =ubatt"), "its name says voltage")
+            }
+            PackQuantity::CellVoltage => (self.says_cell(), "its name says cell"),
+            PackQuantity::Temperature => (self.has("temp =t =tmp"), "its name says temperature"),
+            PackQuantity::Soc => (self.says_soc() && !self.says_soh(), "its name says state of charge"),
+            PackQuantity::Soh => (self.says_soh(), "its name says state of health"),
+        };
+        // The points of unit and name, and whether the name must say it where a unit is stated too.
+        let (unit_points, name_points, needs_name) = match quantity {
+            PackQuantity::Current | PackQuantity::PackVoltage => (2.0, 2.0, false),
+            PackQuantity::CellVoltage => (1.0, 2.0, true),
+            PackQuantity::Temperature => (2.0, 1.0, false),
+            PackQuantity::Soc | PackQuantity::Soh => (1.0, 3.0, true),
+        };
+        let needs_unit = quantity == PackQuantity::Temperature || quantity == PackQuantity::Current && !self.has(PACK);
+        if !says && (needs_name || !has_unit) || needs_unit && !has_unit {
+            return None;
+        }
+        score.add(unit_points, has_unit, &format!("unit {}", quantity.unit()));
+        score.add(name_points, says, name);
+        score.add(2.0, self.has(PACK), "its name says battery");
+        score.add(1.0, self.is_pack_message && !self.has(PACK), "its message says battery");
+        score.add(-3.0, self.has(ELSEWHERE), "its name says another device");
+        score.add(-3.0, self.has(NO_MEASUREMENT), "its name says limit, request or count");
+        match quantity {
+            PackQuantity::Current => score.add(-2.0, self.says_extreme(), "its name says extreme"),
+            PackQuantity::PackVoltage => {
+                score.add(-3.0, self.says_cell(), "its name says cell");
+                score.add(-2.0, self.says_extreme(), "its name says extreme");
+            }
+            PackQuantity::Temperature => score.add(1.0, self.says_cell(), "its name says cell"),
+            PackQuantity::Soc => {
+                let is_dash = self.has("disp =ui dash socui");
+                score.add(-1.0, is_dash, "the dashboard's, not the battery controller's");
+                score.add(-1.0, self.says_extreme(), "an extreme of the cells");
+            }
+            PackQuantity::CellVoltage | PackQuantity::Soh => {}
+        }
+        Some(score)
+    }
+}
+
+/// Splits a name where a reader splits it.
+fn words(name: &str) -> Vec<String> {
+    let chars: Vec<char> = name.chars().collect();
+    let mut words = vec![String::new()];
+    for (index, &c) in chars.iter().enumerate() {
+        let previous = index.checked_sub(1).map(|index| chars[index]);
+        let next = chars.get(index + 1);
+        let is_lower = |c: Option<char>| c.is_some_and(char::is_lowercase);
+        let begins = c.is_uppercase() && (is_lower(previous) || is_lower(next.copied()));
+        let changes = previous.is_some_and(|previous| previous.is_ascii_digit() != c.is_ascii_digit());
+        if begins || changes || !c.is_alphanumeric() {
+            words.push(String::new());
+        }
+        if let Some(word) = words.last_mut().filter(|_| c.is_alphanumeric()) {
+            word.extend(c.to_lowercase());
+        }
+    }
+    words.retain(|word| !word.is_empty());
+    words
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_split_where_a_reader_splits_them() {
+        for (name, expected) in [
+            ("IBatt", &["i", "batt"][..]),
+            ("uwe596_6_TAkkuL", &["uwe", "596", "6", "t", "akku", "l"]),
+            ("BattVoltage132", &["batt", "voltage", "132"]),
+            ("HVBAT_CMU{n}_VOLT", &["hvbat", "cmu", "n", "volt"]),
+            ("", &[]),
+        ] {
+            assert_eq!(words(name), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn words_of_other_devices_are_seen() {
+        let label = |name: &str| SignalLabel::new("", name, "");
+        assert!(label("Voltage_12V").has(ELSEWHERE) && label("RearMotorCurrent126").has(ELSEWHERE));
+        assert!(!label("SmoothBattCurrent132").has(ELSEWHERE) && !label("VBatt").has(ELSEWHERE));
+        assert!(label("SOCave292").says_soc() && !label("UI_enableVinAssociation").says_soc());
+    }
+
+    #[test]
+    fn a_unit_of_another_quantity_excludes_and_a_missing_one_needs_the_name() {
+        let points = |signal: &str, unit: &str, quantity| {
+            SignalLabel::new("Bms", signal, unit).score(quantity).map(|score| score.points)
+        };
+        assert_eq!(points("PackVoltage", "V", PackQuantity::PackVoltage), Some(6.0));
+        assert_eq!(points("PackVoltage", "A", PackQuantity::PackVoltage), None);
+        assert_eq!(points("Value", "", PackQuantity::PackVoltage), None);
+        assert_eq!(points("PackCurrent", "", PackQuantity::Current), Some(4.0));
+        assert_eq!(points("MaxPackCurrent", "A", PackQuantity::Current), Some(4.0));
+    }
+}

@@ -1,0 +1,26 @@
+//! What values, names and bits say about signals: the doctor judges the configured signals with it, `discover` scores candidates.
+//!
+//! | file | purpose |
+//! | --- | --- |
+//! | `label` | names and units: points for each quantity of a pack |
+//! | `series` | one signal: counts, periods, extent, roughness |
+//! | `sample` | extent and thinned sample of a stream |
+//! | `layout` | the same bits read with another byte order, start bit or sign |
+//! | `loss` | frames missing from a cyclic signal |
+//! | `slope` | voltage over current: sign and size of the resistance |
+//! | `response` | how the voltages of a pack follow its current: steps, steady runs, rests |
+//! | `equal_cells` | cells that always have the same voltage |
+
+mod equal_cells;
+mod label;
+pub(super) mod layout;
+mod loss;
+pub(super) mod response;
+mod sample;
+mod series;
+mod slope;
+
+pub use label::{PackQuantity, Score, SignalLabel};
+pub use sample::{Extent, ThinnedSample};
+pub use series::{Series, UnusableCounts};
+pub use slope::Slope;

@@ -1,0 +1,196 @@
+//! Statistics of one signal: counts, periods, extent and roughness of its values, and of its bits with another layout.
+//!
+//! In: payloads with their time, or values with their time. Values are in the program's unit after the configured scale and offset;
+//! no limit is applied. Memory is bounded: gaps and values are kept as a thinned sample.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::layout::AlternativeReading;
+use super::loss::LossCounter;
+use super::sample::{Extent, ThinnedSample};
+use crate::can::decode::Binding;
+use crate::can::signal::SignalLayout;
+use crate::quantity::{Fault, Timestamp};
+
+/// Frames without a value, by reason.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct UnusableCounts {
+    pub(crate) short: u64,
+    pub(crate) not_available: u64,
+    pub(crate) not_finite: u64,
+}
+
+/// Statistics of one signal.
+#[derive(Debug, Clone, Default)]
+pub struct Series {
+    /// Frames with the signal's identifier.
+    pub(crate) frames: u64,
+    pub(crate) unusable: UnusableCounts,
+    /// Values outside `plausible`.
+    pub(crate) implausible: u64,
+    plausible: Option<(f64, f64)>,
+    /// Extent of all values.
+    pub extent: Extent,
+    /// A sample of the values.
+    pub values: ThinnedSample,
+    /// The times of that sample, s.
+    pub(super) times_s: ThinnedSample,
+    /// Time between two readings, s.
+    pub(crate) gaps: ThinnedSample,
+    pub(crate) loss: LossCounter,
+    pub(crate) longest_gap_s: f64,
+    /// Gaps above the age from which a reading is stale.
+    pub(crate) stale_gaps: u64,
+    /// Absolute changes from one value to the next.
+    pub(crate) changes: ThinnedSample,
+    /// Changes no temperature can make.
+    pub(crate) jumps: u64,
+    pub(crate) alternatives: Vec<AlternativeReading>,
+    last_time: Option<Timestamp>,
+}
+
+impl Series {
+    /// `plausible`: smallest and largest plausible value; `None` = any.
+    pub(crate) fn new(layout: &SignalLayout, plausible: Option<(f64, f64)>) -> Self {
+        Self { alternatives: AlternativeReading::all(layout), plausible, ..Self::default() }
+    }
+
+    /// Takes a frame that may carry the signal. Returns its value.
+    pub(crate) fn handle(&mut self, time: Timestamp, payload: &[u8], binding: &Binding, max_age_s: f64) -> Option<f64> {
+        self.frames += 1;
+        let value = match self.value(payload, binding) {
+            Ok(value) => value?,
+            Err(fault) => {
+                self.note_unusable(fault, payload, binding);
+                return None;
+            }
+        };
+        self.push(time, value, max_age_s);
+        self.read_otherwise(payload, binding);
+        Some(value)
+    }
+
+    /// The values of a recorded signal; `None` = a reading without a value.
+    pub fn of(readings: impl Iterator<Item = (f64, Option<f64>)>) -> Self {
+        // Enough for a correlation, few enough for thousands of signals.
+        let sample = ThinnedSample::of_at_most(1500);
+        let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
+        for (time_s, value) in readings {
+            match value.filter(|value| value.is_finite()) {
+                Some(value) => series.push(Timestamp::from_secs(time_s), value, f64::INFINITY),
+                None => series.unusable.not_available += 1,
+            }
+        }
+        series
+    }
+
+    fn push(&mut self, time: Timestamp, value: f64, max_age_s: f64) {
+        let gap_s = self.note_gap(time, max_age_s);
+        if self.extent.count > 0 {
+            let change = (value - self.extent.last).abs();
+            self.changes.push(change);
+            // No temperature changes this fast.
+            self.jumps += u64::from(change > 2.0 && gap_s.is_some_and(|gap_s| gap_s <= 2.0));
+        }
+        self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
+        self.extent.push(value);
+        self.values.push(value);
+        self.times_s.push(time.secs());
+    }
+
+    fn note_unusable(&mut self, fault: Fault, payload: &[u8], binding: &Binding) {
+        let count = match fault {
+            Fault::NotAvailable => &mut self.unusable.not_available,
+            Fault::NotFinite => &mut self.unusable.not_finite,
+            _ => &mut self.unusable.short,
+        };
+        *count += 1;
+        // With another layout the payload may be long enough.
+        if fault == Fault::ShortFrame && binding.holds(payload) == Ok(true) {
+            self.read_otherwise(payload, binding);
+        }
+    }
+
+    /// Reads the bits with the other layouts.
+    fn read_otherwise(&mut self, payload: &[u8], binding: &Binding) {
+        self.alternatives.iter_mut().for_each(|other| other.handle(payload, binding.scale, binding.offset));
+    }
+
+    /// The value without the DBC's range; `Ok(None)` = the payload does not carry the signal.
+    fn value(&self, payload: &[u8], binding: &Binding) -> Result<Option<f64>, Fault> {
+        if !binding.holds(payload)? {
+            return Ok(None);
+        }
+        let raw = binding.plan.raw(payload)?;
+        // All ones outside the range customarily mean "not available", even without an entry in the value table.
+        let is_customary = raw == binding.plan.all_ones() && binding.plan.decode(payload) == Err(Fault::OutOfRange);
+        if binding.not_available.contains(&raw) || is_customary {
+            return Err(Fault::NotAvailable);
+        }
+        Ok(Some(binding.plan.physical(payload)? * binding.scale + binding.offset))
+    }
+
+    fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
+        let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
+        if let Some(gap_s) = gap_s {
+            self.gaps.push(gap_s);
+            self.loss.push(gap_s);
+            self.longest_gap_s = self.longest_gap_s.max(gap_s);
+            self.stale_gaps += u64::from(gap_s > max_age_s);
+        }
+        self.last_time = Some(time);
+        gap_s
+    }
+
+    /// Not listening: the next gap says nothing.
+    pub(crate) fn pause(&mut self) {
+        self.last_time = None;
+    }
+
+    /// Readings with a value.
+    pub fn count(&self) -> u64 {
+        self.extent.count
+    }
+
+    /// Median time from one reading to the next, s.
+    pub fn period_s(&self) -> Option<f64> {
+        self.gaps.median()
+    }
+
+    /// White part of the noise, from one reading to the next; robust where fewer than half of the readings step.
+    pub(crate) fn noise(&self) -> Option<f64> {
+        // 0.6745 sqrt(2): median of |difference of two normal variables| over their standard deviation.
+        Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
+    }
+
+    /// Readings without a value: outside the range, too short, not available.
+    pub fn bad(&self) -> u64 {
+        self.unusable.short + self.unusable.not_available + self.unusable.not_finite
+    }
+
+    /// Whether all values are equal.
+    pub fn is_constant(&self) -> bool {
+        self.extent.range() == 0.0
+    }
+
+    /// Different values among the first hundred that are kept.
+    pub fn distinct(&self) -> usize {
+        self.values.kept().iter().take(100).map(|value| value.to_bits()).collect::<BTreeSet<u64>>().len()
+    }
+
+    /// Whether it counts: most steps are the same one, other than 0.
+    pub fn is_counter(&self) -> bool {
+        let values = self.values.kept();
+        let mut steps: BTreeMap<u64, usize> = BTreeMap::new();
+        for pair in values.windows(2).take(200).filter(|pair| pair[0] != pair[1]) {
+            *steps.entry((pair[1] - pair[0]).abs().to_bits()).or_default() += 1;
+        }
+        let most = steps.values().max().copied().unwrap_or(0);
+        5 * most > 3 * values.len().saturating_sub(1).min(200)
+    }
+
+    /// Largest step between neighbours that are kept.
+    pub fn largest_step(&self) -> f64 {
+        self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)
+    }
+}

@@ -1,0 +1,136 @@
+//! Voltage over current: a slope through the origin with its certainty.
+//!
+//! In: steps of a current (A) with the steps of a voltage (V), from blocks of a stream ([`response`](super::response)) or between the
+//! kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and how much it explains.
+
+use super::series::Series;
+use crate::filter::median;
+
+/// A slope through the origin.
+#[derive(Debug, Clone, Copy)]
+pub struct Slope {
+    /// Steps.
+    pub points: usize,
+    /// -dV/dI, ohm.
+    pub ohm: f64,
+    /// Its standard deviation.
+    pub(crate) std_ohm: f64,
+    /// Share of the voltage's variance explained.
+    pub(crate) r2: f64,
+    /// Largest step of the current, A.
+    pub(crate) largest_a: f64,
+}
+
+impl Slope {
+    pub(crate) fn t(&self) -> f64 {
+        self.ohm / self.std_ohm.max(1e-12)
+    }
+
+    /// Certainty that the slope is not zero: 1 = enough. A few points can lie on a line by chance.
+    pub(crate) fn certainty(&self) -> f64 {
+        let needed = match self.points {
+            0..=4 => 15.0,
+            5..=7 => 8.0,
+            _ => 6.0,
+        };
+        self.t().abs() / needed
+    }
+
+    /// Correlation of the voltage with the current: negative where a discharge counts positive.
+    pub fn correlation(&self) -> f64 {
+        -self.ohm.signum() * self.r2.sqrt()
+    }
+
+    /// Correlation times the root of the number of steps: standard deviations from chance.
+    pub fn strength(&self) -> f64 {
+        self.correlation().abs() * (self.points as f64).sqrt()
+    }
+
+    /// How a recorded voltage changes with a recorded current, or any signal with another; `None` when they have too little in common.
+    pub fn between(voltage: &Series, current: &Series) -> Option<Self> {
+        let pairs = pairs(voltage, current);
+        // Over a longer time the charge changes too.
+        let near = pairs.windows(2).filter(|pair| pair[1].0 - pair[0].0 <= 15.0);
+        let steps: Vec<(f64, f64)> = near.map(|pair| (pair[1].2 - pair[0].2, pair[1].1 - pair[0].1)).collect();
+        let moved = steps.iter().filter(|(current_a, _)| *current_a != 0.0).count();
+        let slope = Self::fit(&steps).filter(|slope| moved >= 6 && slope.r2 > 0.0)?;
+        Some(Self { points: moved, ..slope })
+    }
+
+    /// Through the points without outliers: a wrong reading must not decide.
+    pub(super) fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
+        let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
+        let ratio = median(all.iter().map(|(x, y)| y / x))?;
+        let scatter = median(all.iter().map(|(x, y)| (y - ratio * x).abs()))?;
+        let near = |(x, y): &&(f64, f64)| (y - ratio * x).abs() <= 8.0 * scatter + 1e-3;
+        let kept: Vec<(f64, f64)> = all.iter().filter(near).copied().collect();
+        Self::fit(if 5 * kept.len() >= 4 * all.len() { &kept } else { &all })
+    }
+
+    pub(super) fn fit(points: &[(f64, f64)]) -> Option<Self> {
+        let (mut xx, mut xy, mut yy, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
+        for (x, y) in points {
+            (xx, xy, yy) = (xx + x * x, xy + x * y, yy + y * y);
+            largest = largest.max(x.abs());
+        }
+        if points.len() < 3 || xx <= 0.0 {
+            return None;
+        }
+        let n = points.len() as f64;
+        let rest = (yy - xy * xy / xx).max(0.0) / (n - 1.0);
+        let r2 = if yy > 0.0 { xy * xy / (xx * yy) } else { 0.0 };
+        Some(Self {
+            points: points.len(),
+            ohm: -xy / xx,
+            // Readings have a resolution: a perfect fit of a few steps is not perfect knowledge.
+            std_ohm: (rest / xx).sqrt().max(1e-7),
+            r2,
+            largest_a: largest,
+        })
+    }
+}
+
+/// Time (s), voltage and current: of the rarer series each reading, with the nearest of the other, if that is within 0.3 s.
+fn pairs(voltage: &Series, current: &Series) -> Vec<(f64, f64, f64)> {
+    let period_s = |series: &Series| series.period_s().unwrap_or(0.0);
+    if period_s(voltage) < period_s(current) {
+        return pairs(current, voltage).into_iter().map(|(time_s, a, v)| (time_s, v, a)).collect();
+    }
+    let (times_s, values) = (current.times_s.kept(), current.values.kept());
+    let mut at = 0;
+    let mut pairs = Vec::new();
+    for (&time_s, &value) in voltage.times_s.kept().iter().zip(voltage.values.kept()) {
+        let gap_s = |index: usize| (times_s[index] - time_s).abs();
+        while at + 1 < times_s.len() && gap_s(at + 1) <= gap_s(at) {
+            at += 1;
+        }
+        if at < times_s.len() && gap_s(at) <= 0.3 {
+            pairs.push((time_s, value, values[at]));
+        }
+    }
+    pairs
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wrong_reading_does_not_decide_the_slope() {
+        let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
+        assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
+    }
+
+    #[test]
+    fn recorded_signals_of_different_rates_give_the_resistance() {
+        let current = |time_s: f64| (3.0 * time_s).sin() * 40.0;
+        let fast = Series::of((0..2000).map(|n| f64::from(n) * 0.01).map(|t| (t, Some(current(t)))));
+        let slow =
+            Series::of((0..100).map(|n| f64::from(n) * 0.2).map(|t| (t + 0.001, Some(380.0 - 0.1 * current(t)))));
+        let slope = Slope::between(&slow, &fast).unwrap();
+        assert!((slope.ohm - 0.1).abs() < 0.005 && slope.correlation() < -0.99, "{slope:?}");
+        let turned = Slope::between(&fast, &slow).unwrap();
+        assert_eq!((turned.points, turned.correlation() < -0.99), (slope.points, true));
+    }
+}
