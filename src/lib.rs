@@ -55,7 +55,7 @@
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
 //! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/modelling.rs` (when); on another thread: `host/service/live.rs` |
-//! | what a fault of one cell looks like; from when on it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/finding.rs` |
+//! | what a fault of one cell looks like; from when on it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/fault.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |

@@ -13,7 +13,7 @@ use super::common::logs::{InputArgs, log_options};
 use super::common::output::{self, create_folder, failure, print_json, table};
 use super::common::progress::Bar;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
-use crate::cell_faults::{Diagnosis, Finding, FindingKind, UnknownImbalance};
+use crate::cell_faults::{CellFault, CellFaultDetector, CellFaultKind, UnknownImbalance};
 use crate::config::{self, Config};
 use crate::filter::ScalarGaussian;
 use crate::io::log::LogSource;
@@ -60,7 +60,7 @@ struct Page {
 /// A finding, cells counted from 1.
 #[derive(Debug, Serialize)]
 struct FindingRow {
-    kind: FindingKind,
+    kind: CellFaultKind,
     first_cell: Option<u16>,
     last_cell: Option<u16>,
     what: &'static str,
@@ -113,7 +113,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     if let Some(folder) = &args.plots {
         create_folder(folder)?;
-        chart::write_each(folder, &lab::finding_pictures::all(diagnosis)).map_err(failure)?;
+        chart::write_each(folder, &lab::cell_fault_pictures::all(diagnosis)).map_err(failure)?;
     }
     let imbalance = snapshot.imbalance().unwrap_or(Err(UnknownImbalance::NotCompared));
     let model = cell_model(Some(&snapshot), config.as_ref())?.map(|sourced| sourced.model);
@@ -142,9 +142,9 @@ fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {
     snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
 }
 
-fn page(diagnosis: &Diagnosis, pack: PackPage) -> Page {
+fn page(diagnosis: &CellFaultDetector, pack: PackPage) -> Page {
     let number = |cell: CellIndex| cell.0 + 1;
-    let row = |found: &Finding| FindingRow {
+    let row = |found: &CellFault| FindingRow {
         kind: found.kind,
         first_cell: found.cells.map(|(first, _)| number(first)),
         last_cell: found.cells.map(|(_, last)| number(last)),
@@ -172,7 +172,7 @@ fn page(diagnosis: &Diagnosis, pack: PackPage) -> Page {
     Page { version: 1, findings: diagnosis.findings().iter().map(row).collect(), pack, cells: cells.collect() }
 }
 
-fn text(diagnosis: &Diagnosis, pack: Vec<(String, String)>, page: &Page) -> String {
+fn text(diagnosis: &CellFaultDetector, pack: Vec<(String, String)>, page: &Page) -> String {
     let mut text = String::new();
     if diagnosis.findings().is_empty() {
         text += "nothing found\n";

@@ -37,7 +37,7 @@
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
 //! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
-//! | a kind of finding | `cell_faults/finding.rs` (kind, limit), `cell_faults/diagnosis.rs` (its judgement) |
+//! | a kind of finding | `cell_faults/fault.rs` (kind, limit), `cell_faults/detector.rs` (its judgement) |
 //! | what a cell has lost | `cell/loss_modes.rs` |
 //! | bands of a cell model, which measurement helps most | `cell/model_bands.rs` |
 //! | how far two cell models are apart | `cell/model_comparison.rs` |

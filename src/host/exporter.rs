@@ -30,7 +30,7 @@ use tokio::net::{TcpListener, TcpStream, UnixStream};
 use tokio::task::{JoinSet, LocalSet};
 use tokio::time::{sleep, timeout};
 
-use super::io::places::{Activity, PlaceLimits, Places};
+use super::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::client::{check_length, explain, parse};
@@ -91,7 +91,7 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     tracing::info!(%address, socket = %source.path.display(), "exporter listens");
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
-    let mut places = Places::new(PlaceLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
+    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
@@ -244,7 +244,7 @@ mod tests {
                 let _ = client.write_all(b"GET /met").await;
                 slow.push(client);
             }
-            sleep(crate::io::places::GRACE).await;
+            sleep(crate::io::connection_slots::GRACE).await;
             let began = Instant::now();
             let mut scrape = TcpStream::connect(address).await.unwrap();
             scrape.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").await.unwrap();

@@ -16,7 +16,7 @@ use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
-use crate::io::socket::Tap;
+use crate::io::socket::PassiveSocket;
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::BusIndex;
@@ -182,7 +182,7 @@ pub fn replay(
 struct BusListener {
     bus: BusIndex,
     name: String,
-    tap: Option<Tap>,
+    tap: Option<PassiveSocket>,
     look_at: Instant,
 }
 
@@ -229,7 +229,7 @@ impl BusListener {
             return Ok(());
         }
         self.look_at = Instant::now() + LOOK_PERIOD;
-        match Tap::open(&self.name, clock) {
+        match PassiveSocket::open(&self.name, clock) {
             Ok((tap, is_up)) => {
                 self.tap = Some(tap);
                 session.observer.handle_bus(self.bus, if is_up { BusEvent::Up } else { BusEvent::Down });
@@ -269,7 +269,8 @@ impl BusListener {
 fn can_interfaces(clock: MappedClock) -> Vec<String> {
     let Ok(interfaces) = nix::net::if_::if_nameindex() else { return Vec::new() };
     let names = interfaces.iter().filter_map(|interface| interface.name().to_str().ok());
-    let mut names: Vec<String> = names.filter(|name| Tap::open(name, clock).is_ok()).map(str::to_owned).collect();
+    let mut names: Vec<String> =
+        names.filter(|name| PassiveSocket::open(name, clock).is_ok()).map(str::to_owned).collect();
     names.sort_unstable();
     names
 }

@@ -6,11 +6,11 @@ pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
 mod capacity_table;
+pub mod cell_fault_pictures;
 pub mod chart;
 pub mod discover;
 pub mod error;
 mod fields;
-pub mod finding_pictures;
 pub mod fit;
 pub mod fleet;
 pub mod gpr;

@@ -7,9 +7,9 @@ use packwatch_lab::fit::{self as lab_fit, FitOutcome, FitProgress, FitRequest};
 use pyo3::prelude::*;
 
 use crate::arguments::{List, of_json};
+use crate::background_task::{self, Progress};
 use crate::cell_model::write;
 use crate::error::of_library;
-use crate::work::{self, Progress};
 
 /// A fitted model.
 #[pyclass(frozen, module = "packwatch")]
@@ -104,7 +104,7 @@ pub(crate) fn fit(
     };
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };
-    let outcome = work::run(py, shown, |work| {
+    let outcome = background_task::run(py, shown, |work| {
         // A step is a file read or a pass of the fit.
         lab_fit::run(&request, |progress: FitProgress| match progress {
             FitProgress::Read(..) | FitProgress::Pass(..) => work.advance(1),

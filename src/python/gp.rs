@@ -8,9 +8,9 @@ use packwatch_regress::{Basis, FitProgress, GprSettings, Kernel, ProgressCallbac
 use pyo3::prelude::*;
 
 use crate::arrays::{self, check_rows};
+use crate::background_task::{self, Progress};
 use crate::error::{data, of_library};
 use crate::table::{Table, reals};
-use crate::work::{self, Progress};
 
 /// A fitted process.
 #[pyclass(frozen, module = "packwatch")]
@@ -69,7 +69,7 @@ impl GaussianProcess {
             lines: &lines,
         };
         let shown = Progress { is_shown: progress, total: None, unit: "step" };
-        let model = work::run(py, shown, |work| {
+        let model = background_task::run(py, shown, |work| {
             let mut watcher = |_: FitProgress| {
                 work.advance(1);
                 ControlFlow::Continue(())

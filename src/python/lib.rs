@@ -11,12 +11,14 @@
 //! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
 //! | `cell_model.rs`, `measured.rs` | cell models, measured files |
 //! | `arrays.rs`, `error.rs`, `arguments.rs` | arrays in, exceptions, arguments shared |
-//! | `work.rs`, `turn.rs` | progress and Ctrl-C, one call of a monitor at a time |
+//! | `background_task.rs`, `exclusive_state.rs` | progress and Ctrl-C, one call of a monitor at a time |
 
 mod arguments;
 mod arrays;
+mod background_task;
 mod cell_model;
 mod error;
+mod exclusive_state;
 mod fit;
 mod gp;
 mod measured;
@@ -26,8 +28,6 @@ mod replay;
 mod rul;
 mod score;
 mod table;
-mod turn;
-mod work;
 
 use pyo3::prelude::*;
 

@@ -17,10 +17,10 @@ use pyo3::prelude::*;
 
 use crate::arguments::{cell_source, of_text};
 use crate::arrays::{self, Reals, check_rows};
+use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{config as config_error, data};
+use crate::exclusive_state::ExclusiveState;
 use crate::outputs::{Columns, Outputs, Wanted};
-use crate::turn::Turns;
-use crate::work::{self, Progress, Work};
 
 /// Rows between two reports of progress.
 const REPORT_EVERY: usize = 16_384;
@@ -30,7 +30,7 @@ const EXTENDED: u32 = 0x8000_0000;
 /// The monitor of a pack.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Monitor {
-    state: Turns,
+    state: ExclusiveState,
     interfaces: Vec<String>,
     cells: u16,
     is_pack_total: bool,
@@ -187,7 +187,12 @@ impl Monitor {
             interfaces: config.interface_names(),
             cells: sample.cells,
             is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            state: Turns::new(State { driver, columns: Columns::default(), wanted, cells: sample.cells.into() }),
+            state: ExclusiveState::new(State {
+                driver,
+                columns: Columns::default(),
+                wanted,
+                cells: sample.cells.into(),
+            }),
         }
     }
 
@@ -204,18 +209,18 @@ impl Monitor {
         py: Python<'_>,
         is_shown: bool,
         rows: usize,
-        take: impl FnOnce(&mut State, &Work) + Send,
+        take: impl FnOnce(&mut State, &BackgroundTask) + Send,
     ) -> PyResult<Outputs> {
         let progress = Progress { is_shown, total: Some(rows as u64), unit: "row" };
         let mut turn = self.state.wait(py)?;
         let state: &mut State = &mut turn;
-        work::run(py, progress, |work| take(state, work))?;
+        background_task::run(py, progress, |work| take(state, work))?;
         turn.finish(py, &self.interfaces)
     }
 }
 
 impl State {
-    fn take_rows(&mut self, time_s: &Reals, input: &RowInput, work: &Work) {
+    fn take_rows(&mut self, time_s: &Reals, input: &RowInput, work: &BackgroundTask) {
         let mut values = input.channels();
         for row in 0..time_s.rows {
             input.fill(row, &mut values);
@@ -287,7 +292,7 @@ impl RowInput {
     }
 }
 
-fn report(row: usize, work: &Work) {
+fn report(row: usize, work: &BackgroundTask) {
     if (row + 1).is_multiple_of(REPORT_EVERY) {
         work.advance(REPORT_EVERY as u64);
     }

@@ -12,9 +12,9 @@ use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
 use crate::arguments::{List, bytes, of_json};
+use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
-use crate::work::{self, Progress, Work};
 
 // The signatures below and of `Monitor` have it as a literal, which Python shows.
 const _: () = assert!(SLEEP_GAP_S == 30.0);
@@ -92,7 +92,7 @@ pub(crate) fn replay(
     }
     let config = py.detach(|| config::load(&config)).map_err(error::config)?;
     let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
-    let result = work::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
+    let result = background_task::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
     let (mut outputs, json) = result.map_err(of_replay)?;
     let outputs = outputs.finish(py, &config.interface_names())?;
     Ok(Replay { outputs: Py::new(py, outputs)?, json })
@@ -103,7 +103,7 @@ fn run(
     logs: &[PathBuf],
     reading: &LogReading,
     (sleep_gap_s, wanted): (f64, Wanted),
-    work: &Work,
+    work: &BackgroundTask,
 ) -> Result<(Columns, String), ReplayError> {
     let columns = Arc::new(Mutex::new(Columns::default()));
     let sink = Arc::clone(&columns);

@@ -8,8 +8,8 @@ use packwatch_lab::rul::{self as lab_rul, History, Threshold};
 use pyo3::prelude::*;
 
 use crate::arguments::{List, of_json};
+use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{data, of_library};
-use crate::work::{self, Progress, Work};
 
 /// An end of life: Ah, or a text like "70 %".
 #[derive(FromPyObject)]
@@ -43,7 +43,8 @@ pub(crate) fn rul<'py>(
         }
     }
     check_distinct(&files).map_err(data)?;
-    let document = work::run(py, Progress::hidden(), |work| document(&files, &thresholds, at.as_deref(), alpha, work))?;
+    let document =
+        background_task::run(py, Progress::hidden(), |work| document(&files, &thresholds, at.as_deref(), alpha, work))?;
     let document = document.map_err(of_library)?;
     of_json(py, &document)
 }
@@ -54,7 +55,7 @@ fn document(
     thresholds: &[Threshold],
     at: Option<&[f64]>,
     alpha: f64,
-    work: &Work,
+    work: &BackgroundTask,
 ) -> Result<String, LabError> {
     let progress = || work.advance(1);
     let (mut now, mut scored) = (Vec::new(), Vec::new());

@@ -6,8 +6,8 @@ use packwatch_lab::score::{ScoreReport, ScoreRequest, Start};
 use pyo3::prelude::*;
 
 use crate::arguments::{List, bytes, cell_source, of_json};
+use crate::background_task::{self, Progress};
 use crate::error::{data, of_library, of_request};
-use crate::work::{self, Progress};
 
 /// Scores of files in cases.
 #[pyclass(frozen, module = "packwatch")]
@@ -110,10 +110,10 @@ pub(crate) fn score(
 
 fn run(py: Python<'_>, request: &ScoreRequest, is_shown: bool) -> PyResult<Score> {
     let sizes: Vec<f64> = request.files.iter().map(|path| bytes(std::slice::from_ref(path)) as f64).collect();
-    let prepared = work::run(py, Progress::hidden(), |work| request.prepare(&|| work.advance(1)))?;
+    let prepared = background_task::run(py, Progress::hidden(), |work| request.prepare(&|| work.advance(1)))?;
     let prepared = prepared.map_err(of_request)?;
     let progress = Progress { is_shown, total: Some(bytes(&request.files)), unit: "B" };
-    let report = work::run(py, progress, |work| {
+    let report = background_task::run(py, progress, |work| {
         prepared.run(&|file, part| work.advance((part * sizes.get(file).copied().unwrap_or(0.0)).round() as u64))
     })?;
     report.map(Score).map_err(of_library)

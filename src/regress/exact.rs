@@ -15,10 +15,10 @@ use faer::{MatMut, MatRef};
 use rayon::prelude::*;
 
 use super::basis::Coefficients;
+use super::cross_covariance::{BLOCK_PAIRS, by_column, squares};
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, solve_lower};
-use super::pairs::{BLOCK_PAIRS, by_column, squares};
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 

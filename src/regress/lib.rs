@@ -26,6 +26,7 @@
 
 mod basis;
 mod calibration;
+mod cross_covariance;
 mod error;
 mod exact;
 mod folds;
@@ -36,7 +37,6 @@ mod linear_algebra;
 mod minimise;
 mod model;
 mod nearest;
-mod pairs;
 mod plan;
 mod saved;
 mod scale;

@@ -1,23 +1,23 @@
 //! The finding that an injected fault asks for.
 
-use packwatch::cell_faults::FindingKind;
+use packwatch::cell_faults::CellFaultKind;
 use packwatch::sim::FaultKind;
 
 /// The finding of a fault; `None` = packwatch has none for it.
-pub(crate) fn kind_of(fault: &FaultKind) -> Option<FindingKind> {
+pub(crate) fn kind_of(fault: &FaultKind) -> Option<CellFaultKind> {
     match fault {
-        FaultKind::Leak { .. } => Some(FindingKind::Leak),
-        FaultKind::Contact { .. } => Some(FindingKind::Contact),
-        FaultKind::Weak { .. } => Some(FindingKind::WeakCell),
-        FaultKind::Resistance { .. } => Some(FindingKind::HighResistance),
-        FaultKind::Module { .. } => Some(FindingKind::Module),
-        FaultKind::CurrentOffset(_) => Some(FindingKind::CurrentOffset),
-        FaultKind::CurrentGain(_) => Some(FindingKind::CurrentGain),
-        FaultKind::CurrentStuck => Some(FindingKind::CurrentFrozen),
-        FaultKind::VoltageOffset { .. } => Some(FindingKind::VoltageChannel),
-        FaultKind::VoltageStuck { .. } => Some(FindingKind::VoltageFrozen),
-        FaultKind::Swap(..) => Some(FindingKind::SwappedChannels),
-        FaultKind::Double { .. } => Some(FindingKind::DoubledChannels),
-        FaultKind::TemperatureStuck(_) | FaultKind::TemperatureOff(_) => Some(FindingKind::TemperatureSensor),
+        FaultKind::Leak { .. } => Some(CellFaultKind::Leak),
+        FaultKind::Contact { .. } => Some(CellFaultKind::Contact),
+        FaultKind::Weak { .. } => Some(CellFaultKind::WeakCell),
+        FaultKind::Resistance { .. } => Some(CellFaultKind::HighResistance),
+        FaultKind::Module { .. } => Some(CellFaultKind::Module),
+        FaultKind::CurrentOffset(_) => Some(CellFaultKind::CurrentOffset),
+        FaultKind::CurrentGain(_) => Some(CellFaultKind::CurrentGain),
+        FaultKind::CurrentStuck => Some(CellFaultKind::CurrentFrozen),
+        FaultKind::VoltageOffset { .. } => Some(CellFaultKind::VoltageChannel),
+        FaultKind::VoltageStuck { .. } => Some(CellFaultKind::VoltageFrozen),
+        FaultKind::Swap(..) => Some(CellFaultKind::SwappedChannels),
+        FaultKind::Double { .. } => Some(CellFaultKind::DoubledChannels),
+        FaultKind::TemperatureStuck(_) | FaultKind::TemperatureOff(_) => Some(CellFaultKind::TemperatureSensor),
     }
 }

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use packwatch::can::encode::InputEncoder;
-use packwatch::cell_faults::finding::{CHANNEL_V, OFFSET_PER_H};
-use packwatch::cell_faults::{Finding, FindingKind};
+use packwatch::cell_faults::fault::{CHANNEL_V, OFFSET_PER_H};
+use packwatch::cell_faults::{CellFault, CellFaultKind};
 use packwatch::config;
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
@@ -75,7 +75,7 @@ pub(crate) struct Seen {
     pub(crate) at_s: f64,
     /// Drives that have begun since the start of the fault, with the one in which it began.
     pub(crate) drives: u32,
-    pub(crate) found: Finding,
+    pub(crate) found: CellFault,
 }
 
 /// The configuration of a pack whose BMS shows which cells it bleeds, written into `folder`.
@@ -242,9 +242,9 @@ impl Case {
         }
         let asked = self.fault().and_then(|fault| kind_of(&fault.kind));
         let (offset_a, offsets_v) = sim.sensor_offsets();
-        let is_true = |found: &Finding| match (found.kind, found.cells) {
-            (FindingKind::CurrentOffset, _) => offset_a.abs() >= OFFSET_PER_H * self.size.capacity_ah,
-            (FindingKind::VoltageChannel, Some((cell, _))) => {
+        let is_true = |found: &CellFault| match (found.kind, found.cells) {
+            (CellFaultKind::CurrentOffset, _) => offset_a.abs() >= OFFSET_PER_H * self.size.capacity_ah,
+            (CellFaultKind::VoltageChannel, Some((cell, _))) => {
                 (offsets_v[cell.index()] - median(&offsets_v)).abs() >= CHANNEL_V
             }
             _ => false,
@@ -268,7 +268,7 @@ struct Looks {
 }
 
 impl Looks {
-    fn note(&mut self, at_s: f64, drives: u32, found: &[Finding]) {
+    fn note(&mut self, at_s: f64, drives: u32, found: &[CellFault]) {
         for &found in found {
             if self.known.insert((code(found.kind), found.cells), ()).is_none() {
                 self.first.push(Seen { at_s, drives, found });
@@ -294,6 +294,6 @@ impl Drives {
     }
 }
 
-fn code(kind: FindingKind) -> u8 {
+fn code(kind: CellFaultKind) -> u8 {
     kind as u8
 }

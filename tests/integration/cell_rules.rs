@@ -7,7 +7,7 @@ use packwatch::alarm::{AlarmState, Change, Rule};
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell_faults::difference::LEAK;
-use packwatch::cell_faults::{BalancingConfig, Finding, FindingKind};
+use packwatch::cell_faults::{BalancingConfig, CellFault, CellFaultKind};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Channel, Timestamp};
@@ -283,7 +283,7 @@ fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_ne
 }
 
 /// Kinds that were found, with their first and last cells.
-fn found(pack: &FaultyPack) -> Vec<(FindingKind, Option<(CellIndex, CellIndex)>)> {
+fn found(pack: &FaultyPack) -> Vec<(CellFaultKind, Option<(CellIndex, CellIndex)>)> {
     pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
 }
 
@@ -295,7 +295,7 @@ fn cells_that_a_bms_bleeds_do_not_leak() {
         let mut pack = FaultyPack::balanced(seed, quality);
         pack.run_to(14.0);
         let is_leak =
-            |event: &&Event| matches!(event.kind, EventKind::Finding(Finding { kind: FindingKind::Leak, .. }));
+            |event: &&Event| matches!(event.kind, EventKind::Finding(CellFault { kind: CellFaultKind::Leak, .. }));
         assert_eq!(pack.events.iter().filter(is_leak).collect::<Vec<_>>(), Vec::<&Event>::new(), "{quality:?} {seed}");
     }
 }
@@ -307,7 +307,7 @@ fn a_leak_is_found_although_a_bms_bleeds_the_others() {
     let mut pack = FaultyPack::simulated(config(), settings, Wiring::single(), "leak:7:20mA@day3");
     pack.sim = pack.sim.with_balancing(Balancing::usual(2.6));
     pack.run_to(5.0);
-    assert!(found(&pack).contains(&(FindingKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
+    assert!(found(&pack).contains(&(CellFaultKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
 }
 
 /// Findings of 14 days in a pack of 12 cells whose BMS balances with `Balancing::usual`; `configure` changes what the monitor knows of it.
@@ -315,7 +315,7 @@ fn found_in_balanced(
     fault: &str,
     bleed: f64,
     configure: impl Fn(MonitorConfig) -> MonitorConfig,
-) -> Vec<(FindingKind, Option<(CellIndex, CellIndex)>)> {
+) -> Vec<(CellFaultKind, Option<(CellIndex, CellIndex)>)> {
     let keys = "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nmax_age_s = 90.0\nonly_while_sent = true\n[output]\n";
     let config = configure(load(&PACK.replace("[output]\n", keys), "Temperature"));
     let mut settings = settings();
@@ -325,7 +325,7 @@ fn found_in_balanced(
     pack.sim = pack.sim.with_balancing(Balancing { bleed_a: bleed * usual.bleed_a, ..usual }).with_balancing_bits();
     pack.run_to(14.0);
     let finding = |event: &Event| match event.kind {
-        EventKind::Finding(Finding { kind, cells, .. }) => Some((kind, cells)),
+        EventKind::Finding(CellFault { kind, cells, .. }) => Some((kind, cells)),
         _ => None,
     };
     let mut found: Vec<_> = pack.events.iter().filter_map(finding).collect();
@@ -341,7 +341,7 @@ fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(Mon
 /// Without the bits only the lowest cell is one that may leak: what cell 3 loses may have been bled.
 #[test]
 fn leaks_beside_that_of_the_lowest_cell_are_found_by_the_bits_of_what_is_bled() {
-    let leak_of = |cell| (FindingKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
+    let leak_of = |cell| (CellFaultKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
     let faults = "leak:7:0.4mA@day3 leak:3:0.2mA@day3";
     assert_eq!(found_in_balanced(faults, 1.0, |config| config), [leak_of(2), leak_of(6)]);
     let without_bits = |config| MonitorConfig { balancing: None, ..config };
@@ -391,11 +391,11 @@ fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
 fn a_frozen_current_is_found_once() {
     let mut pack = FaultyPack::new("current-stuck@24h");
     pack.run_to(1.03);
-    assert_eq!(found(&pack), [(FindingKind::CurrentFrozen, None)]);
+    assert_eq!(found(&pack), [(CellFaultKind::CurrentFrozen, None)]);
     pack.restart();
     pack.run_to(1.04);
     let is_it =
-        |event: &&Event| matches!(event.kind, EventKind::Finding(Finding { kind: FindingKind::CurrentFrozen, .. }));
+        |event: &&Event| matches!(event.kind, EventKind::Finding(CellFault { kind: CellFaultKind::CurrentFrozen, .. }));
     assert_eq!(pack.events.iter().filter(is_it).count(), 1);
 }
 
@@ -411,7 +411,7 @@ fn a_detached_temperature_sensor_is_found_whatever_the_offsets() {
         let mut pack = FaultyPack::simulated(config_with_three_sensors(), settings, wiring, &fault);
         pack.run_to(12.0);
         let first = 4 * (sensor - 1);
-        let detached = (FindingKind::TemperatureSensor, Some((CellIndex(first), CellIndex(first + 3))));
+        let detached = (CellFaultKind::TemperatureSensor, Some((CellIndex(first), CellIndex(first + 3))));
         assert!(found(&pack).contains(&detached), "sensor {sensor}: {:?}", found(&pack));
     }
 }
@@ -422,9 +422,9 @@ fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() 
     for (fault, other) in [("weak:3:-12% swap:3:8@day3", 7), ("weak:3:-12% swap:3:4@day3", 3)] {
         let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, fault);
         pack.run_to(1.9);
-        assert_eq!(found(&pack), [(FindingKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
+        assert_eq!(found(&pack), [(CellFaultKind::WeakCell, Some((CellIndex(2), CellIndex(2))))]);
         pack.run_to(6.0);
-        let swapped = (FindingKind::SwappedChannels, Some((CellIndex(2), CellIndex(other))));
+        let swapped = (CellFaultKind::SwappedChannels, Some((CellIndex(2), CellIndex(other))));
         assert!(found(&pack).contains(&swapped), "{fault}: {:?}", found(&pack));
     }
 }
@@ -433,12 +433,13 @@ fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() 
 fn cells_of_a_replaced_module_are_one_finding() {
     let mut pack = FaultyPack::new("module:5-8:+15%@day2");
     pack.run_to(6.0);
-    assert_eq!(found(&pack), [(FindingKind::Module, Some((CellIndex(4), CellIndex(7))))]);
+    assert_eq!(found(&pack), [(CellFaultKind::Module, Some((CellIndex(4), CellIndex(7))))]);
 }
 
 #[test]
 fn a_contact_is_no_aged_cell_and_an_aged_cell_no_contact() {
-    for (fault, kind) in [("contact:3:+40%", FindingKind::Contact), ("resistance:3:+30%", FindingKind::HighResistance)]
+    for (fault, kind) in
+        [("contact:3:+40%", CellFaultKind::Contact), ("resistance:3:+30%", CellFaultKind::HighResistance)]
     {
         let mut pack = FaultyPack::new(fault);
         pack.run_to(3.0);

@@ -7,7 +7,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::finding::{GAIN, REPORTED, normal_cdf};
+use super::fault::{GAIN, REPORTED, normal_cdf};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{InvalidState, Timestamp};
 

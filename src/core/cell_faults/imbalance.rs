@@ -20,9 +20,9 @@
 
 use serde::Serialize;
 
-use super::diagnosis::{Diagnosis, LEAST_CELLS};
+use super::detector::{CellFaultDetector, LEAST_CELLS};
 use super::difference::{CAPACITY, RESISTANCE, SOC};
-use super::finding::FindingKind;
+use super::fault::CellFaultKind;
 use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
@@ -159,7 +159,7 @@ impl Imbalance {
     }
 }
 
-impl Diagnosis {
+impl CellFaultDetector {
     /// What the differences between the cells cost. `middle_ah`: capacity of the middle cell, Ah.
     ///
     /// # Errors
@@ -179,7 +179,7 @@ impl Diagnosis {
                 left_out.push((cell, LeftOut::NotKnown));
             } else {
                 let has = |kind| self.findings().iter().any(|found| found.kind == kind && found.is_of(cell));
-                let (leaks, is_weak) = (has(FindingKind::Leak), has(FindingKind::WeakCell));
+                let (leaks, is_weak) = (has(CellFaultKind::Leak), has(CellFaultKind::WeakCell));
                 known.push(ComparedCell { cell, soc, capacity, resistance, middle_soc, leaks, is_weak });
             }
         }
@@ -432,7 +432,7 @@ mod tests {
 
     #[test]
     fn cells_of_which_nothing_is_known_are_no_healthy_pack() {
-        assert_eq!(Diagnosis::new(2).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
-        assert_eq!(Diagnosis::new(12).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
+        assert_eq!(CellFaultDetector::new(2).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
+        assert_eq!(CellFaultDetector::new(12).imbalance(MIDDLE_AH), Err(UnknownImbalance::NotCompared));
     }
 }

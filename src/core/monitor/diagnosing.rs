@@ -10,9 +10,9 @@ use super::publisher::learned;
 use super::stages::Stages;
 use super::{Event, EventKind, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
-use crate::cell_faults::finding::OFFSET_PER_H;
+use crate::cell_faults::fault::OFFSET_PER_H;
 use crate::cell_faults::gain::Learned;
-use crate::cell_faults::{BalancingConfig, Diagnosis, FindingKind, MeanCell};
+use crate::cell_faults::{BalancingConfig, CellFaultDetector, CellFaultKind, MeanCell};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Fault, Timestamp};
 use crate::sample::CellSample;
@@ -20,7 +20,7 @@ use crate::sample::CellSample;
 /// The diagnosis stage.
 #[derive(Debug)]
 pub(super) struct Diagnosing {
-    pub(super) diagnosis: Diagnosis,
+    pub(super) diagnosis: CellFaultDetector,
     cells: usize,
     /// The cells that are compared: those in no module of another kind.
     compared: Vec<usize>,
@@ -36,7 +36,7 @@ impl Diagnosing {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
         let compared = compared.to_vec();
-        Self { diagnosis: Diagnosis::among(cells, &compared), cells, compared, is_balanced, balancing }
+        Self { diagnosis: CellFaultDetector::among(cells, &compared), cells, compared, is_balanced, balancing }
     }
 
     /// Other settings for the same cells.
@@ -46,16 +46,16 @@ impl Diagnosing {
 
     /// Forgets everything: another pack is connected.
     pub(super) fn forget(&mut self) {
-        self.diagnosis = Diagnosis::among(self.cells, &self.compared);
+        self.diagnosis = CellFaultDetector::among(self.cells, &self.compared);
     }
 
     /// The state, to be stored; `None` = the pack is too small for a comparison.
-    pub(super) fn stored(&self) -> Option<Diagnosis> {
+    pub(super) fn stored(&self) -> Option<CellFaultDetector> {
         self.diagnosis.is_active().then(|| self.diagnosis.clone())
     }
 
     /// Continues from a checked state. `away`: from when to when the daemon did not run; `None` = it continues without a break.
-    pub(super) fn restore(&mut self, stored: Option<Diagnosis>, away: Option<(Timestamp, Timestamp)>) {
+    pub(super) fn restore(&mut self, stored: Option<CellFaultDetector>, away: Option<(Timestamp, Timestamp)>) {
         let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
         self.diagnosis = stored;
         self.diagnosis.compare_only(&self.compared);
@@ -81,10 +81,11 @@ impl Diagnosing {
 
     /// Takes whether the reading of the current is frozen. No row ends without a current: the finding does not wait for one.
     pub(super) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
-        let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == FindingKind::CurrentFrozen);
+        let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == CellFaultKind::CurrentFrozen);
         if self.diagnosis.is_active() && is_frozen != is_found() {
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-            let new = self.diagnosis.note_sensor(now, FindingKind::CurrentFrozen, f64::from(u8::from(is_frozen)), size);
+            let new =
+                self.diagnosis.note_sensor(now, CellFaultKind::CurrentFrozen, f64::from(u8::from(is_frozen)), size);
             out.events.extend(new.map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
         }
     }
@@ -125,7 +126,7 @@ impl Diagnosing {
             let socs = |cell: usize| bank.filtered_soc(cell).filter(|_| bank.is_own(cell)).map(|soc| soc.mean);
             let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
             let (probability, size) = current_offset(learning, model.rated_capacity_ah);
-            reported.extend(self.diagnosis.note_sensor(now, FindingKind::CurrentOffset, probability, size));
+            reported.extend(self.diagnosis.note_sensor(now, CellFaultKind::CurrentOffset, probability, size));
             let cell = |index: usize| Learned {
                 capacity_ah: learning.capacity(index),
                 log_resistance: bank.log_resistance(index).mean,
@@ -144,7 +145,7 @@ impl Stages {
     pub(super) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.diagnosing.diagnosis;
-        let sizes = diagnosis.sizes([FindingKind::Leak, FindingKind::Contact]);
+        let sizes = diagnosis.sizes([CellFaultKind::Leak, CellFaultKind::Contact]);
         for (cell, [leak, contact]) in (0..).map(CellIndex).zip(sizes) {
             if is_new && !self.sampling.inputs_valid(cell, now) {
                 continue;

@@ -15,7 +15,7 @@ use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
 use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
-use crate::cell_faults::Finding;
+use crate::cell_faults::CellFault;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -284,7 +284,7 @@ pub enum EventKind {
         is_taken_back: bool,
     },
     /// A cell stands out from its pack in a way that shows what is wrong with it.
-    Finding(Finding),
+    Finding(CellFault),
     /// A cell's filter failed and started again from its voltage.
     FilterReset {
         /// Which cell.

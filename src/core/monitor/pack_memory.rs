@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::learning::LearningState;
 use super::modelling::ModellingState;
 use super::snapshot::StoredCell;
-use crate::cell_faults::Diagnosis;
+use crate::cell_faults::CellFaultDetector;
 use crate::quantity::InvalidState;
 
 /// Packs kept beside the connected one: more than a vehicle exchanges in turn.
@@ -39,7 +39,7 @@ pub(super) struct StoredPack {
     pub(super) modelling: Option<ModellingState>,
     /// What is known of single cells.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) diagnosis: Option<Diagnosis>,
+    pub(super) diagnosis: Option<CellFaultDetector>,
     pub(super) learning: LearningState,
 }
 

@@ -21,7 +21,7 @@ use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState, Label, ModelCheck, PackBank};
-use crate::cell_faults::{Diagnosis, Imbalance, UnknownImbalance};
+use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp, bounds};
@@ -71,7 +71,7 @@ pub struct Snapshot {
     modelling: Option<ModellingState>,
     /// `None` in states of earlier programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    diagnosis: Option<Diagnosis>,
+    diagnosis: Option<CellFaultDetector>,
     /// Since when the buses sleep.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     asleep_since: Option<Timestamp>,
@@ -394,12 +394,12 @@ impl Snapshot {
     #[must_use]
     pub fn for_restart(self) -> Self {
         let mut diagnosis = self.diagnosis;
-        diagnosis.iter_mut().for_each(Diagnosis::interrupt);
+        diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);
         Self { continuation: None, diagnosis, ..self }
     }
 
     /// What is known of single cells; `None` = the pack is too small for a comparison, or the state is of an earlier program.
-    pub fn diagnosis(&self) -> Option<&Diagnosis> {
+    pub fn diagnosis(&self) -> Option<&CellFaultDetector> {
         self.diagnosis.as_ref()
     }
 

@@ -8,7 +8,7 @@ use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
-use crate::cell_faults::{Difference, Finding};
+use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
@@ -141,7 +141,7 @@ impl Monitor {
     }
 
     /// What is wrong with single cells.
-    pub fn findings(&self) -> &[Finding] {
+    pub fn findings(&self) -> &[CellFault] {
         self.stages.diagnosing.diagnosis.findings()
     }
 

@@ -11,9 +11,9 @@ use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
 use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, daemon_path};
+use crate::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
 use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
-use crate::io::places::{Activity, PlaceLimits, Places};
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
@@ -74,7 +74,7 @@ struct ConnectionContext {
 }
 
 async fn accept(listener: UnixListener, context: ConnectionContext) {
-    let mut places = Places::new(PlaceLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_PROCESS });
+    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_PROCESS });
     let mut connections = JoinSet::new();
     loop {
         while connections.try_join_next().is_some() {}

@@ -20,7 +20,7 @@ use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
 use crate::io::record::Record;
-use crate::io::socket::Tap;
+use crate::io::socket::PassiveSocket;
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Command, J1939Config};
 use crate::quantity::{BusIndex, Timestamp};
@@ -155,7 +155,7 @@ impl AlarmReader {
 
 /// One channel during the test.
 struct MonitoredChannel {
-    tap: Tap,
+    tap: PassiveSocket,
     reader: ChannelReader,
     report: ChannelReport,
 }
@@ -279,7 +279,8 @@ fn open_alarms(
     message: &Message,
     reader: AlarmReader,
 ) -> Result<MonitoredChannel, String> {
-    let tap = Tap::open_for(&interface.name, interface.fd, &[message.id], &[]).map_err(|error| error.to_string())?;
+    let tap = PassiveSocket::open_for(&interface.name, interface.fd, &[message.id], &[])
+        .map_err(|error| error.to_string())?;
     let check = message.e2e.map(|protection| (CheckConfig::new(protection), Receiver::default()));
     let mut report = ChannelReport::new(interface, "alarm frame", message.id);
     report.protection = message.e2e.map(|_| StatusCounts::default());
@@ -289,7 +290,8 @@ fn open_alarms(
 /// Opens the channel of DM1. J1939 is classic CAN only.
 fn open_dm1(interface: &InterfaceConfig, j1939: &J1939Config) -> Result<MonitoredChannel, String> {
     let receiver = Dm1Receiver::new(j1939.node.address);
-    let tap = Tap::open_for(&interface.name, false, &[], &receiver.patterns()).map_err(|error| error.to_string())?;
+    let tap = PassiveSocket::open_for(&interface.name, false, &[], &receiver.patterns())
+        .map_err(|error| error.to_string())?;
     let [id, ..] = j1939.node.sent_ids();
     let mut report = ChannelReport::new(interface, "J1939 DM1", id);
     report.test_code = Some(j1939.test_code);

@@ -1,9 +1,9 @@
 //! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are logged
 //! once, then as a count: a bus without a partner makes thousands a second. As JSON lines, every event is written.
 
-mod words;
+mod text;
 
-pub use words::command as command_words;
+pub use text::command as command_words;
 
 use std::io::{self, Write};
 
@@ -16,7 +16,7 @@ use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
 use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
-use crate::cell_faults::Finding;
+use crate::cell_faults::CellFault;
 use crate::config::VehicleIdentity;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
@@ -101,10 +101,10 @@ impl EventLog {
                 log_learned(&event.kind);
             }
             EventKind::SignalBad { channel, fault } => {
-                tracing::warn!(channel = words::channel(channel), ?fault, "signal bad");
+                tracing::warn!(channel = text::channel(channel), ?fault, "signal bad");
             }
             EventKind::SignalGood { channel, bad_readings } => {
-                tracing::info!(channel = words::channel(channel), bad_readings, "signal good");
+                tracing::info!(channel = text::channel(channel), bad_readings, "signal good");
             }
             EventKind::Protection(change) => self.log_protection(change),
             EventKind::Flood(FloodChange { bus, id, active: true, .. }) => {
@@ -136,7 +136,7 @@ impl EventLog {
             }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::Model { .. } => log_model(&event.kind),
-            EventKind::Finding(Finding { kind, cells, size, probability, .. }) => {
+            EventKind::Finding(CellFault { kind, cells, size, probability, .. }) => {
                 let (first, last) = cells.map(|(first, last)| (number(first), number(last))).unzip();
                 let [size, size_std, probability] = [size.mean, size.std(), probability].map(rounded);
                 tracing::warn!(first, last, size, size_std, probability, "{}: {}", kind.words(), kind.advice());
@@ -155,7 +155,7 @@ impl EventLog {
                     Source::Local => "this computer",
                     Source::Bus(bus) => self.name(bus),
                 };
-                tracing::info!(source, command = words::command(&command), changed, refused, "command");
+                tracing::info!(source, command = text::command(&command), changed, refused, "command");
             }
             EventKind::BadCommand { bus, intact, reason } => {
                 let reason = reason.map(CommandRefusal::words);
@@ -348,7 +348,7 @@ fn log_learned(kind: &EventKind) {
 mod tests {
     use super::*;
     use crate::alarm::{AlarmState, Change, Rule, Severity};
-    use crate::cell_faults::FindingKind;
+    use crate::cell_faults::CellFaultKind;
     use crate::filter::ScalarGaussian;
     use crate::quantity::Mode;
 
@@ -398,8 +398,8 @@ mod tests {
     fn learned_values_are_logged_with_no_more_digits_than_they_have() {
         let (x, known, cell) = (0.7 * 2.6, Some(0.7 * 2.6), CellIndex(72));
         let (size, since) = (ScalarGaussian { mean: x, variance: x }, Timestamp::ZERO);
-        let finding = Finding {
-            kind: FindingKind::Leak,
+        let finding = CellFault {
+            kind: CellFaultKind::Leak,
             cells: Some((cell, cell)),
             since,
             reported: since,

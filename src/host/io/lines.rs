@@ -4,7 +4,7 @@
 //! [`RawLine::TooLong`] and skipped to its end. Bytes read from the file are counted for the progress bar. Compressed
 //! files are unpacked on a thread of their own; plain files need none.
 
-mod ahead;
+mod read_ahead;
 
 use std::io::{self, Cursor, Read};
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::segments::JoinedFiles;
-use ahead::ReadAhead;
+use read_ahead::ReadAhead;
 
 /// Bytes read from the file or decompressor at once; also the longest line accepted. A CAN XL line has 4,200.
 const BLOCK: usize = 256 * 1024;

@@ -17,7 +17,7 @@ use crate::alarm::{Alarm, Rule, Severity};
 use crate::can::poll::PollSilence;
 use crate::can::uds::ControllerCounts;
 use crate::cell::Chemistry;
-use crate::cell_faults::Finding;
+use crate::cell_faults::CellFault;
 use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
@@ -86,7 +86,7 @@ pub struct StatusDocument {
     pub current_frozen: bool,
     /// What is found of single cells and of the sensors, as `--events` writes it.
     #[serde(default)]
-    pub findings: Vec<Finding>,
+    pub findings: Vec<CellFault>,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
     pub latency: Latency,
     /// The store of state and history; `None` = it is off.

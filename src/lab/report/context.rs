@@ -1,7 +1,7 @@
 //! Title, configuration, reference and provenance of a page.
 
 use super::reference::Reference;
-use crate::cell_faults::{Diagnosis, Imbalance, UnknownImbalance};
+use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
 use crate::quantity::CellIndex;
@@ -18,7 +18,7 @@ pub struct PageContext<'a> {
     /// The cells' model, as it was at the end of the data; `None` = not known.
     pub model: Option<SourcedModel>,
     /// What is found of single cells; `None` = they were not compared.
-    pub diagnosis: Option<&'a Diagnosis>,
+    pub diagnosis: Option<&'a CellFaultDetector>,
     /// What the differences between the cells cost the pack; `None` = they were not compared.
     pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
     /// Measured or true values.

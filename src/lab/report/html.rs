@@ -9,7 +9,7 @@ use super::{forecast, model, raised, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 use crate::io::stamp::format_utc;
-use crate::{finding_pictures, pack_view};
+use crate::{cell_fault_pictures, pack_view};
 
 /// Most rows of a table; the pictures and `packwatch history` show all.
 const MAX_ROWS: usize = 200;
@@ -81,7 +81,7 @@ const SECTIONS: [Section; 9] = [
     Section {
         id: "findings",
         title: "Which cell is failing",
-        pictures: &finding_pictures::NAMES,
+        pictures: &cell_fault_pictures::NAMES,
         note: "Every cell beside the middle of its pack: all carry the same current, so what is common to them cancels. A cell whose \
                bar lies beyond the line is reported when it also stands out from the others.",
         none: |data| {

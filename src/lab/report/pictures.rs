@@ -14,7 +14,7 @@ use crate::alarm::Rule;
 use crate::chart::{
     self, Axis, Chart, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
 };
-use crate::{finding_pictures, model_pictures};
+use crate::{cell_fault_pictures, model_pictures};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
@@ -50,7 +50,7 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
         named("innovation", innovation(data)),
         named("coverage", coverage(data)),
     ];
-    let of_cells = context.diagnosis.into_iter().flat_map(finding_pictures::all);
+    let of_cells = context.diagnosis.into_iter().flat_map(cell_fault_pictures::all);
     of_data.into_iter().flatten().chain(of_cells).chain(of_model).collect()
 }
 

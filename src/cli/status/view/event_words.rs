@@ -3,7 +3,7 @@
 
 use serde_json::{Map, Value};
 
-use crate::cell_faults::Finding;
+use crate::cell_faults::CellFault;
 use crate::status::document::StatusDocument;
 
 /// Units at the end of a key.
@@ -31,7 +31,7 @@ pub(super) fn words(event: &Map<String, Value>, document: &StatusDocument) -> St
 }
 
 /// The finding that an event reports.
-fn finding(event: &Map<String, Value>) -> Option<Finding> {
+fn finding(event: &Map<String, Value>) -> Option<CellFault> {
     if event.get("event")? != "finding" {
         return None;
     }

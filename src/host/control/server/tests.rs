@@ -145,7 +145,7 @@ fn silent_clients_give_way_to_one_that_asks() {
         let mut next = connect(&path).await;
         let refused = line(&mut next).await;
         assert!(refused.contains("\"ok\":false") && refused.contains("try again later"), "{refused}");
-        tokio::time::sleep(crate::io::places::GRACE).await;
+        tokio::time::sleep(crate::io::connection_slots::GRACE).await;
         let began = tokio::time::Instant::now();
         let mut next = connect(&path).await;
         next.write_all(REPLACED.to_line().as_bytes()).await.unwrap();

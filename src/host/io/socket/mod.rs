@@ -2,20 +2,20 @@
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
 //!   `CanSender::open("vcan0", fd)?` then `sender.send(&frame)?`; a full transmit queue is waited for, within a limit.
-//! * `Tap`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
+//! * `PassiveSocket`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
 //! * `Link`: the daemon's task per interface: receives, sends, and survives every state of the interface.
 //!
 //! Underneath: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
 
 mod counters;
 mod link;
+mod passive_socket;
 mod raw;
 mod sender;
-mod tap;
 mod wire;
 
 pub use counters::{LinkCounts, LinkHealth, LinkState};
 pub use link::{Link, LinkConfig, LinkOutput};
+pub use passive_socket::PassiveSocket;
 pub use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
 pub use sender::CanSender;
-pub use tap::Tap;

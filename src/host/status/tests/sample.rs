@@ -3,7 +3,7 @@
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::can::poll::PollSilence;
 use crate::can::uds::ControllerCounts;
-use crate::cell_faults::{Finding, FindingKind};
+use crate::cell_faults::{CellFault, CellFaultKind};
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::filter::ScalarGaussian;
@@ -82,8 +82,8 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         poll: Some(PollStatus { silent: Some(PollSilence::OtherTester), refused: 1 }),
         intruders: Vec::new(),
         current_frozen: false,
-        findings: vec![Finding {
-            kind: FindingKind::Leak,
+        findings: vec![CellFault {
+            kind: CellFaultKind::Leak,
             cells: Some((CellIndex(0), CellIndex(0))),
             since: Timestamp::from_secs(1_799_800_000.0),
             reported: Timestamp::from_secs(1_799_900_000.0),

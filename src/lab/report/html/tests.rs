@@ -3,7 +3,7 @@
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
-use crate::cell_faults::{Diagnosis, UnknownImbalance};
+use crate::cell_faults::{CellFaultDetector, UnknownImbalance};
 use crate::health::InsufficientData;
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
@@ -130,7 +130,7 @@ fn change(rule: Rule, cell: u16, active: bool, value: f64) -> EventKind {
 #[test]
 fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
     let model = crate::config::of_label(&Label::usual(Chemistry::Nmc811Graphite, 2.6));
-    let diagnosis = Diagnosis::new(96);
+    let diagnosis = CellFaultDetector::new(96);
     let imbalance = Some(Err(UnknownImbalance::NotCompared));
     let title = "pack".into();
     let context = PageContext { title, model, diagnosis: Some(&diagnosis), imbalance, ..PageContext::default() };

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Diagnosis, inner_half};
+use super::{CellFaultDetector, inner_half};
 use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
@@ -65,7 +65,7 @@ impl Bleed {
     }
 }
 
-impl Diagnosis {
+impl CellFaultDetector {
     /// Takes a bit of the BMS, which holds until `holds_until` or the next one: whether it bleeds a cell; `None` = it cannot be read.
     pub fn handle_balancing(&mut self, cell: usize, time: Timestamp, is_bled: Option<bool>, holds_until: Timestamp) {
         let Some(watched) = self.cells.get(cell) else { return };
@@ -131,15 +131,15 @@ mod tests {
     }
 
     /// Three cells of 60 Ah with a bit of 0 at the beginning.
-    fn diagnosis() -> Diagnosis {
-        let mut diagnosis = Diagnosis::new(3);
+    fn diagnosis() -> CellFaultDetector {
+        let mut diagnosis = CellFaultDetector::new(3);
         (0..3).for_each(|cell| diagnosis.handle_balancing(cell, at(0.0), Some(false), at(10.0)));
         diagnosis
     }
 
     /// Deviation that a cell's SOC has got by what may have been bled.
-    fn lost_std(diagnosis: &mut Diagnosis, end_s: f64, balancing: BalancingConfig) -> f64 {
-        let variance = |diagnosis: &Diagnosis| diagnosis.cells[0].difference.state(SOC).variance;
+    fn lost_std(diagnosis: &mut CellFaultDetector, end_s: f64, balancing: BalancingConfig) -> f64 {
+        let variance = |diagnosis: &CellFaultDetector| diagnosis.cells[0].difference.state(SOC).variance;
         let before = variance(diagnosis);
         diagnosis.cells.iter_mut().for_each(|cell| cell.bleed.timer.begin_row(at(end_s)));
         diagnosis.remove_bled_charge(at(end_s), 60.0, Some(balancing));

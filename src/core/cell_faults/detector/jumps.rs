@@ -1,8 +1,8 @@
 //! Cells that have changed at once: exchanged, replaced with their neighbours, or each by itself.
 
-use super::{Diagnosis, Row, Watched};
+use super::{CellFaultDetector, Row, Watched};
 use crate::cell_faults::difference::{Jump, Observation, STATES};
-use crate::cell_faults::finding::{Finding, FindingKind};
+use crate::cell_faults::fault::{CellFault, CellFaultKind};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -11,7 +11,7 @@ const SAME_EVENT_S: f64 = 1800.0;
 /// Deviation within which exchanged channels explain each other, V.
 const SWAP_V: f64 = 0.008;
 
-impl Diagnosis {
+impl CellFaultDetector {
     /// Cells have changed at once: two have been exchanged, some side by side replaced, or each by itself.
     pub(super) fn handle_jumps(
         &mut self,
@@ -58,13 +58,13 @@ impl Diagnosis {
         low[a].difference.settle(&of_b);
         high[0].difference.settle(&of_a);
         let cells = Some((CellIndex(a as u16), CellIndex(b as u16)));
-        let is_same = |found: &Finding| found.kind == FindingKind::SwappedChannels && found.cells == cells;
+        let is_same = |found: &CellFault| found.kind == CellFaultKind::SwappedChannels && found.cells == cells;
         if self.findings.iter().any(is_same) {
             self.findings.retain(|found| !is_same(found));
         } else {
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-            let kind = FindingKind::SwappedChannels;
-            self.insert(Finding { kind, cells, since: time, reported: time, probability: 1.0, size });
+            let kind = CellFaultKind::SwappedChannels;
+            self.insert(CellFault { kind, cells, since: time, reported: time, probability: 1.0, size });
         }
         for cell in [a, b] {
             self.cells[cell].jumped = None;

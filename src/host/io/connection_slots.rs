@@ -16,7 +16,7 @@ pub(crate) const GRACE: Duration = Duration::from_millis(250);
 
 /// Connections at once.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct PlaceLimits {
+pub(crate) struct SlotLimits {
     /// Of all clients.
     pub total: usize,
     /// Of one client.
@@ -25,13 +25,13 @@ pub(crate) struct PlaceLimits {
 
 /// The places; a client is known by `K`.
 #[derive(Debug)]
-pub(crate) struct Places<K> {
-    limits: PlaceLimits,
-    taken: Vec<Place<K>>,
+pub(crate) struct ConnectionSlots<K> {
+    limits: SlotLimits,
+    taken: Vec<Slot<K>>,
 }
 
 #[derive(Debug)]
-struct Place<K> {
+struct Slot<K> {
     client: K,
     activity: Activity,
     task: AbortHandle,
@@ -66,9 +66,9 @@ impl Activity {
     }
 }
 
-impl<K: PartialEq> Places<K> {
+impl<K: PartialEq> ConnectionSlots<K> {
     /// Places without a connection.
-    pub(crate) fn new(limits: PlaceLimits) -> Self {
+    pub(crate) fn new(limits: SlotLimits) -> Self {
         Self { limits, taken: Vec::new() }
     }
 
@@ -84,11 +84,11 @@ impl<K: PartialEq> Places<K> {
 
     /// Notes the connection for which there is room.
     pub(crate) fn take(&mut self, client: K, activity: Activity, task: AbortHandle) {
-        self.taken.push(Place { client, activity, task });
+        self.taken.push(Slot { client, activity, task });
     }
 
-    fn close_idlest(&mut self, now: Instant, is_eligible: impl Fn(&Place<K>) -> bool) -> bool {
-        let idle = |place: &Place<K>| place.activity.idle_since().filter(|since| now.duration_since(*since) >= GRACE);
+    fn close_idlest(&mut self, now: Instant, is_eligible: impl Fn(&Slot<K>) -> bool) -> bool {
+        let idle = |place: &Slot<K>| place.activity.idle_since().filter(|since| now.duration_since(*since) >= GRACE);
         let places = self.taken.iter().enumerate().filter(|(_, place)| is_eligible(place));
         let idlest = places.filter_map(|(at, place)| Some((idle(place)?, at))).min();
         idlest.map(|(_, at)| self.taken.swap_remove(at).task.abort()).is_some()
@@ -100,7 +100,11 @@ mod tests {
     use super::*;
 
     /// A connection that never ends by itself.
-    fn connect(places: &mut Places<u32>, client: u32, now: Instant) -> Option<(Activity, tokio::task::JoinHandle<()>)> {
+    fn connect(
+        places: &mut ConnectionSlots<u32>,
+        client: u32,
+        now: Instant,
+    ) -> Option<(Activity, tokio::task::JoinHandle<()>)> {
         if !places.make_room(&client, now) {
             return None;
         }
@@ -111,7 +115,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_longest_idle_connection_gives_way_and_a_busy_one_does_not() {
-        let mut places = Places::new(PlaceLimits { total: 3, per_client: 2 });
+        let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
         let now = Instant::now();
         let (busy, mut busy_task) = connect(&mut places, 1, now).unwrap();
         busy.begin_request();
@@ -135,7 +139,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_client_with_many_connections_closes_its_own() {
-        let mut places = Places::new(PlaceLimits { total: 3, per_client: 2 });
+        let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
         let now = Instant::now();
         let (_other, mut other_task) = connect(&mut places, 1, now).unwrap();
         let (_, first) = connect(&mut places, 2, now).unwrap();

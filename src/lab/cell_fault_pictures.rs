@@ -3,8 +3,8 @@
 //! A bar is a 95 % interval. Red cells are those of a finding that the picture shows.
 
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
-use crate::cell_faults::finding;
-use crate::cell_faults::{Diagnosis, Finding, FindingKind};
+use crate::cell_faults::fault;
+use crate::cell_faults::{CellFault, CellFaultDetector, CellFaultKind};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Point, Shape};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
@@ -24,7 +24,7 @@ struct Shown {
     /// From which size on a cell is reported, in the state's unit.
     limits: &'static [f64],
     /// Findings that it shows.
-    kinds: &'static [FindingKind],
+    kinds: &'static [CellFaultKind],
 }
 
 /// In the order of a report; charge first, because it has no finding of its own.
@@ -44,8 +44,8 @@ const SHOWN: [Shown; STATES] = [
         title: "Loss of charge",
         label: "loss beside the pack's middle, % of the capacity a day",
         scale: 100.0,
-        limits: &[finding::LEAK_PER_DAY],
-        kinds: &[FindingKind::Leak],
+        limits: &[fault::LEAK_PER_DAY],
+        kinds: &[CellFaultKind::Leak],
     },
     Shown {
         state: CONTACT,
@@ -53,8 +53,8 @@ const SHOWN: [Shown; STATES] = [
         title: "Contact resistance",
         label: "beside the pack's middle, % of the series resistance",
         scale: 100.0,
-        limits: &[finding::CONTACT],
-        kinds: &[FindingKind::Contact],
+        limits: &[fault::CONTACT],
+        kinds: &[CellFaultKind::Contact],
     },
     Shown {
         state: CAPACITY,
@@ -62,8 +62,8 @@ const SHOWN: [Shown; STATES] = [
         title: "Capacity of the cells",
         label: "beside the pack's middle, %",
         scale: 100.0,
-        limits: &[finding::CAPACITY, -finding::CAPACITY],
-        kinds: &[FindingKind::WeakCell, FindingKind::ForeignCell, FindingKind::Module],
+        limits: &[fault::CAPACITY, -fault::CAPACITY],
+        kinds: &[CellFaultKind::WeakCell, CellFaultKind::ForeignCell, CellFaultKind::Module],
     },
     Shown {
         state: RESISTANCE,
@@ -71,8 +71,8 @@ const SHOWN: [Shown; STATES] = [
         title: "Resistance of the cells",
         label: "beside the pack's middle, %",
         scale: 100.0,
-        limits: &[finding::RESISTANCE],
-        kinds: &[FindingKind::HighResistance],
+        limits: &[fault::RESISTANCE],
+        kinds: &[CellFaultKind::HighResistance],
     },
     Shown {
         state: CHANNEL,
@@ -80,12 +80,12 @@ const SHOWN: [Shown; STATES] = [
         title: "Offset of the voltage channels",
         label: "beside the pack's middle, mV",
         scale: 1e3,
-        limits: &[finding::CHANNEL_V, -finding::CHANNEL_V],
+        limits: &[fault::CHANNEL_V, -fault::CHANNEL_V],
         kinds: &[
-            FindingKind::VoltageChannel,
-            FindingKind::VoltageFrozen,
-            FindingKind::DoubledChannels,
-            FindingKind::SwappedChannels,
+            CellFaultKind::VoltageChannel,
+            CellFaultKind::VoltageFrozen,
+            CellFaultKind::DoubledChannels,
+            CellFaultKind::SwappedChannels,
         ],
     },
 ];
@@ -102,13 +102,13 @@ pub const NAMES: [&str; STATES] = {
 };
 
 /// Every picture with the name of its file.
-pub fn all(diagnosis: &Diagnosis) -> Vec<(String, Picture)> {
+pub fn all(diagnosis: &CellFaultDetector) -> Vec<(String, Picture)> {
     let cells: Vec<[Option<ScalarGaussian>; STATES]> =
         (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
     SHOWN.iter().map(|shown| (shown.name.to_owned(), picture(shown, &cells, diagnosis.findings()))).collect()
 }
 
-fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: &[Finding]) -> Picture {
+fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: &[CellFault]) -> Picture {
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::bleed_timer::BalancingConfig;
 use super::channels::{Channel, compare};
 use super::difference::{CHANNEL, CONTACT, Difference, LEAK, Observation, RESISTANCE, SOC, STATES};
-use super::finding::{Finding, FindingKind};
+use super::fault::{CellFault, CellFaultKind};
 use super::gain::{Gain, Learned};
 use super::row::{CellSums, PackSums};
 use super::temperature::Following;
@@ -55,7 +55,7 @@ const SOC_JUMP: f64 = 0.02;
 const BLED_SOC: f64 = 0.9;
 const DAY_S: f64 = 86_400.0;
 /// Kinds up to the last one that a cell may have.
-const CELL_KINDS: usize = FindingKind::TemperatureSensor as usize;
+const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
 
 /// The cell in the middle of the pack, as the estimators know it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -126,7 +126,7 @@ impl Watched {
 /// The diagnosis of a pack.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Diagnosis {
+pub struct CellFaultDetector {
     cells: Vec<Watched>,
     pack: PackSums,
     /// Middle, SOC and charge (Ah) of the last row.
@@ -143,10 +143,10 @@ pub struct Diagnosis {
     lowest: Option<usize>,
     #[serde(default)]
     gain: Gain,
-    findings: Vec<Finding>,
+    findings: Vec<CellFault>,
 }
 
-impl Diagnosis {
+impl CellFaultDetector {
     /// As [`Self::new`], in a pack where only some cells are of one kind: only those may be [added](Self::add).
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
@@ -193,7 +193,7 @@ impl Diagnosis {
     }
 
     /// What is found, in the order of the cells.
-    pub fn findings(&self) -> &[Finding] {
+    pub fn findings(&self) -> &[CellFault] {
         &self.findings
     }
 
@@ -277,13 +277,13 @@ impl Diagnosis {
     pub fn note_sensor(
         &mut self,
         time: Timestamp,
-        kind: FindingKind,
+        kind: CellFaultKind,
         probability: f64,
         size: ScalarGaussian,
-    ) -> Option<Finding> {
-        let find = |findings: &[Finding]| findings.iter().copied().find(|found| found.kind == kind);
+    ) -> Option<CellFault> {
+        let find = |findings: &[CellFault]| findings.iter().copied().find(|found| found.kind == kind);
         let was_known = find(&self.findings).is_some();
-        self.put(Finding { kind, cells: None, since: time, reported: time, probability, size });
+        self.put(CellFault { kind, cells: None, since: time, reported: time, probability, size });
         find(&self.findings).filter(|_| !was_known)
     }
 
@@ -293,12 +293,12 @@ impl Diagnosis {
         time: Timestamp,
         temperature_c: f64,
         cells: impl Iterator<Item = Learned>,
-    ) -> Option<Finding> {
+    ) -> Option<CellFault> {
         if !self.gain.is_due(time) {
             return None;
         }
         let (probability, size) = self.gain.take(time, temperature_c, &cells.collect::<Vec<_>>());
-        self.note_sensor(time, FindingKind::CurrentGain, probability, size)
+        self.note_sensor(time, CellFaultKind::CurrentGain, probability, size)
     }
 
     /// Ends a row. `socs`: the cells' SOC as estimated, for the choice of the middle cell. `is_balanced`: fuller cells may be bled
@@ -310,7 +310,7 @@ impl Diagnosis {
         socs: impl Fn(usize) -> Option<f64>,
         is_balanced: bool,
         balancing: Option<BalancingConfig>,
-    ) -> Vec<Finding> {
+    ) -> Vec<CellFault> {
         let pack = std::mem::take(&mut self.pack);
         let (Some(begun), Some(time)) = (pack.begun, pack.last) else { return Vec::new() };
         self.pack.last = pack.last;
@@ -338,7 +338,7 @@ impl Diagnosis {
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
         self.ohm = model.r0_ohm(&model.grid_position(soc, row.temperature_c));
         self.choose_middle(socs);
-        let is_new = |found: &&Finding| !before.iter().any(|old| (old.kind, old.cells) == (found.kind, found.cells));
+        let is_new = |found: &&CellFault| !before.iter().any(|old| (old.kind, old.cells) == (found.kind, found.cells));
         self.findings.iter().filter(is_new).copied().collect()
     }
 
@@ -439,8 +439,8 @@ impl Diagnosis {
                 cell.temperature.compare(seconds, middle_k, here_k);
             }
         }
-        let kind = FindingKind::TemperatureSensor;
-        let reported: Vec<Finding> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
+        let kind = CellFaultKind::TemperatureSensor;
+        let reported: Vec<CellFault> = self.findings.iter().filter(|found| found.kind == kind).copied().collect();
         self.findings.retain(|found| found.kind != kind);
         let mut first = 0;
         let mut detached: Vec<(CellIndex, CellIndex)> = Vec::new();
@@ -455,7 +455,7 @@ impl Diagnosis {
             let since = before.map_or(time, |found| found.since);
             let reported = before.map_or(time, |found| found.reported);
             let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
-            self.insert(Finding { kind, cells, since, reported, probability: 1.0, size });
+            self.insert(CellFault { kind, cells, since, reported, probability: 1.0, size });
         }
     }
 

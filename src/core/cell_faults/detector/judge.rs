@@ -1,8 +1,8 @@
 //! What a row has shown of each cell, as findings: from when on one is reported, and when it is withdrawn.
 
-use super::Diagnosis;
+use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
-use crate::cell_faults::finding::{self, Finding, FindingKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
+use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -20,7 +20,7 @@ const DAY_S: f64 = 86_400.0;
 /// A judgement of one kind.
 #[derive(Debug, Clone, Copy)]
 struct Judged {
-    kind: FindingKind,
+    kind: CellFaultKind,
     size: ScalarGaussian,
     probability: f64,
     /// Whether the cell is near enough to the others for it.
@@ -49,7 +49,7 @@ impl Population {
     }
 }
 
-impl Diagnosis {
+impl CellFaultDetector {
     pub(super) fn population(&self, state: usize) -> Population {
         let compared = self.cells.iter().filter(|cell| cell.is_compared);
         Population::of(compared.map(|cell| cell.difference.state(state).mean))
@@ -69,7 +69,7 @@ impl Diagnosis {
             }
         }
         let populations = self.populations();
-        let mut foreign: Vec<Option<Finding>> = Vec::with_capacity(self.cells.len());
+        let mut foreign: Vec<Option<CellFault>> = Vec::with_capacity(self.cells.len());
         for index in 0..self.cells.len() {
             if !self.cells[index].is_compared {
                 foreign.push(None);
@@ -82,7 +82,7 @@ impl Diagnosis {
             for it in judged {
                 let probability = if fault.is_some_and(|fault| fault != it.kind) { 0.0 } else { it.probability };
                 let finding = self.take(time, index, &Judged { probability, ..it });
-                if it.kind == FindingKind::ForeignCell {
+                if it.kind == CellFaultKind::ForeignCell {
                     let certain = Some(finding).filter(|it| it.probability >= REPORTED);
                     foreign.push(self.module_of(index).copied().or(certain));
                 }
@@ -93,12 +93,12 @@ impl Diagnosis {
 
     /// Per cell and kind, its size against the middle of the pack, in the unit of the kind; `None` = it cannot be judged: the cell is
     /// too far from the others, its channel is faulty, or the value is not known well enough yet.
-    pub fn sizes<const N: usize>(&self, kinds: [FindingKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
+    pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
     }
 
-    fn size(&self, index: usize, kind: FindingKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
+    fn size(&self, index: usize, kind: CellFaultKind, populations: &[Population; STATES]) -> Option<ScalarGaussian> {
         let cell = CellIndex(index as u16);
         self.cells.get(index).filter(|cell| cell.is_compared)?;
         let judged = self.judged(index, populations).into_iter().find(|it| it.kind == kind)?;
@@ -142,7 +142,7 @@ impl Diagnosis {
     /// Whether a BMS may take charge out of the cell that no bit shows: where one balances, out of all but the lowest one. A leak that
     /// was found is still there when the others are bled.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
-        let is_found = |found: &Finding| found.kind == FindingKind::Leak && found.is_of(CellIndex(index as u16));
+        let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
         is_open && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
@@ -158,19 +158,19 @@ impl Diagnosis {
             let stands_out = sign * size.mean >= OUTLIER * population.std;
             (size, if stands_out { probability } else { 0.0 })
         };
-        let of = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+        let of = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judged {
             kind,
             size,
             probability,
             is_comparable: true,
         };
-        let sure = |kind: FindingKind, is_so: bool| {
+        let sure = |kind: CellFaultKind, is_so: bool| {
             let so = if is_so { 1.0 } else { 0.0 };
             of(kind, (ScalarGaussian { mean: so, variance: 0.0 }, so))
         };
-        let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, finding::CHANNEL_V, sign));
+        let channel = [1.0, -1.0].map(|sign| beyond(CHANNEL, fault::CHANNEL_V, sign));
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
-        let mut leak = beyond(LEAK, finding::LEAK_PER_DAY, 1.0);
+        let mut leak = beyond(LEAK, fault::LEAK_PER_DAY, 1.0);
         if self.may_be_bled(index) {
             // A leak makes it the lowest cell: until then there is none that matters.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
@@ -182,39 +182,39 @@ impl Diagnosis {
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let is_comparable = cell.difference.mean()[SOC].abs() < TOO_FAR;
-        let if_near = |kind: FindingKind, (size, probability): (ScalarGaussian, f64)| Judged {
+        let if_near = |kind: CellFaultKind, (size, probability): (ScalarGaussian, f64)| Judged {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
         [
-            sure(FindingKind::VoltageFrozen, cell.channel.is_frozen),
-            sure(FindingKind::DoubledChannels, cell.channel.doubled().is_some()),
-            if_near(FindingKind::VoltageChannel, unless_leaking(channel)),
-            of(FindingKind::Leak, leak),
-            if_near(FindingKind::Contact, beyond(CONTACT, finding::CONTACT, 1.0)),
-            if_near(FindingKind::HighResistance, beyond(RESISTANCE, finding::RESISTANCE, 1.0)),
-            of(FindingKind::WeakCell, beyond(difference::CAPACITY, finding::CAPACITY, -1.0)),
-            if_near(FindingKind::ForeignCell, unless_leaking(beyond(difference::CAPACITY, finding::CAPACITY, 1.0))),
+            sure(CellFaultKind::VoltageFrozen, cell.channel.is_frozen),
+            sure(CellFaultKind::DoubledChannels, cell.channel.doubled().is_some()),
+            if_near(CellFaultKind::VoltageChannel, unless_leaking(channel)),
+            of(CellFaultKind::Leak, leak),
+            if_near(CellFaultKind::Contact, beyond(CONTACT, fault::CONTACT, 1.0)),
+            if_near(CellFaultKind::HighResistance, beyond(RESISTANCE, fault::RESISTANCE, 1.0)),
+            of(CellFaultKind::WeakCell, beyond(difference::CAPACITY, fault::CAPACITY, -1.0)),
+            if_near(CellFaultKind::ForeignCell, unless_leaking(beyond(difference::CAPACITY, fault::CAPACITY, 1.0))),
         ]
     }
 
     /// Takes a judgement into the list, when it has lasted as long as its kind needs; the finding that it is, listed or not.
-    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> Finding {
+    fn take(&mut self, time: Timestamp, index: usize, judged: &Judged) -> CellFault {
         let Judged { kind, size, probability, .. } = *judged;
         let cell = &mut self.cells[index];
         let suspected = &mut cell.suspected[kind as usize - 1];
         if probability < WITHDRAWN {
             *suspected = None;
         } else if suspected.is_none() {
-            let is_after_jump = |jumped: &Timestamp| kind != FindingKind::Leak && time.since(*jumped) < DAY_S;
+            let is_after_jump = |jumped: &Timestamp| kind != CellFaultKind::Leak && time.since(*jumped) < DAY_S;
             *suspected = Some(cell.jumped.filter(is_after_jump).unwrap_or(time));
         }
         let since = suspected.unwrap_or(time);
-        let other = if kind == FindingKind::DoubledChannels { cell.channel.doubled() } else { None };
+        let other = if kind == CellFaultKind::DoubledChannels { cell.channel.doubled() } else { None };
         let own = CellIndex(index as u16);
         let cells = other.map_or((own, own), |other| (own.min(CellIndex(other)), own.max(CellIndex(other))));
-        let finding = Finding { kind, cells: Some(cells), since, reported: time, probability, size };
-        let is_in_module = kind == FindingKind::ForeignCell && self.module_of(index).is_some();
+        let finding = CellFault { kind, cells: Some(cells), since, reported: time, probability, size };
+        let is_in_module = kind == CellFaultKind::ForeignCell && self.module_of(index).is_some();
         // The upper one of two doubled channels is in the finding of the lower one.
         if cells.0 == own && !is_in_module {
             self.put(finding);
@@ -225,26 +225,26 @@ impl Diagnosis {
     /// Whether what is likelier than not since a time has been so for long enough to be reported. Where a BMS balances, nothing is
     /// known of a leak at first, so anything else that happens looks like one until the cell has been through a cycle. A cell with
     /// more capacity waits for its neighbours: together they are a module.
-    fn has_lasted(&self, kind: FindingKind, since: Timestamp, now: Timestamp) -> bool {
+    fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
-            FindingKind::Leak if self.is_balanced => DAY_S,
-            FindingKind::ForeignCell => SAME_MODULE_S,
+            CellFaultKind::Leak if self.is_balanced => DAY_S,
+            CellFaultKind::ForeignCell => SAME_MODULE_S,
             _ => 0.0,
         };
         now.since(since) >= settling_s
     }
 
     /// Puts a finding into the list, in place of an earlier one of its kind and first cell, or takes that out.
-    pub(super) fn put(&mut self, finding: Finding) {
-        let first = |found: &Finding| found.cells.map(|cells| cells.0);
-        let is_same = |found: &Finding| found.kind == finding.kind && first(found) == first(&finding);
+    pub(super) fn put(&mut self, finding: CellFault) {
+        let first = |found: &CellFault| found.cells.map(|cells| cells.0);
+        let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
         let has_lasted = self.has_lasted(finding.kind, finding.since, finding.reported);
         match self.findings.iter().position(is_same) {
             Some(at) => {
-                let Finding { since, reported, .. } = self.findings.remove(at);
+                let CellFault { since, reported, .. } = self.findings.remove(at);
                 if finding.probability >= finding.kind.withdrawn_below() {
                     let since = if finding.cells.is_some() { finding.since } else { since };
-                    self.insert(Finding { since, reported, ..finding });
+                    self.insert(CellFault { since, reported, ..finding });
                 }
             }
             None if has_lasted && finding.probability >= REPORTED => self.insert(finding),
@@ -253,21 +253,21 @@ impl Diagnosis {
     }
 
     /// Puts a new finding into the list, in the order of the cells.
-    pub(super) fn insert(&mut self, finding: Finding) {
+    pub(super) fn insert(&mut self, finding: CellFault) {
         let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
         self.findings.insert(at, finding);
     }
 
     /// The module that a cell was found to be of.
-    fn module_of(&self, index: usize) -> Option<&Finding> {
-        let is_of = |found: &&Finding| found.kind == FindingKind::Module && found.is_of(CellIndex(index as u16));
+    fn module_of(&self, index: usize) -> Option<&CellFault> {
+        let is_of = |found: &&CellFault| found.kind == CellFaultKind::Module && found.is_of(CellIndex(index as u16));
         self.findings.iter().find(is_of)
     }
 
     /// Joins cells side by side with more capacity than the others, since about the same time, to a replaced module. `foreign`: of
     /// each cell, its module, or that it certainly has more capacity.
-    fn find_modules(&mut self, time: Timestamp, foreign: &[Option<Finding>]) {
-        let is_same_event = |a: &Option<Finding>, b: &Option<Finding>| {
+    fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
+        let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
         };
         let mut first = 0;
@@ -281,9 +281,9 @@ impl Diagnosis {
     }
 
     /// Puts a module in place of the findings of its cells.
-    fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<Finding>]) {
+    fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<CellFault>]) {
         let found = || group.iter().flatten();
-        let (count, kind) = (group.len() as f64, FindingKind::Module);
+        let (count, kind) = (group.len() as f64, CellFaultKind::Module);
         let size = ScalarGaussian {
             mean: found().map(|it| it.size.mean).sum::<f64>() / count,
             variance: found().map(|it| it.size.variance).sum::<f64>() / (count * count),
@@ -291,12 +291,12 @@ impl Diagnosis {
         let since = found().map(|it| it.since).min().unwrap_or(time);
         let earlier = found().find(|it| it.kind == kind && it.cells == Some(cells));
         let reported = earlier.map_or(time, |it| it.reported);
-        let is_within = |it: &Finding| {
-            matches!(it.kind, FindingKind::ForeignCell | FindingKind::Module)
+        let is_within = |it: &CellFault| {
+            matches!(it.kind, CellFaultKind::ForeignCell | CellFaultKind::Module)
                 && it.cells.is_some_and(|(a, b)| cells.0 <= b && a <= cells.1)
         };
         self.findings.retain(|it| !is_within(it));
-        self.insert(Finding { kind, cells: Some(cells), since, reported, probability: 1.0, size });
+        self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
             // Where it ends is not known yet: cells that changed less at once may belong to it.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];

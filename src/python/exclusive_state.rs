@@ -1,4 +1,4 @@
-//! Turns of the calls of a monitor: one at a time, whatever threads they come from.
+//! A monitor's state for one call at a time, whatever threads they come from.
 //!
 //! A call that waits for its turn holds no lock of the interpreter, and a signal ends the wait. Two calls fail instead of waiting: one
 //! that a signal handler makes while its own thread is in another, and any after a panic, which left the state half changed.
@@ -14,19 +14,19 @@ use crate::error::data;
 use crate::monitor::State;
 
 /// A monitor's state, for one call at a time.
-pub(crate) struct Turns {
+pub(crate) struct ExclusiveState {
     state: Mutex<State>,
     /// Thread of the call whose turn it is.
     holder: Mutex<Option<ThreadId>>,
 }
 
 /// The turn of one call.
-pub(crate) struct Turn<'a> {
+pub(crate) struct StateGuard<'a> {
     state: MutexGuard<'a, State>,
-    turns: &'a Turns,
+    owner: &'a ExclusiveState,
 }
 
-impl Turns {
+impl ExclusiveState {
     pub(crate) fn new(state: State) -> Self {
         Self { state: Mutex::new(state), holder: Mutex::new(None) }
     }
@@ -35,12 +35,12 @@ impl Turns {
     ///
     /// # Errors
     /// An earlier call has failed inside the library, this thread is in another call, or a signal handler raises an exception.
-    pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<Turn<'_>> {
+    pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_>> {
         loop {
             match self.state.try_lock() {
                 Ok(state) => {
                     self.set_holder(Some(thread::current().id()));
-                    return Ok(Turn { state, turns: self });
+                    return Ok(StateGuard { state, owner: self });
                 }
                 Err(TryLockError::Poisoned(_)) => {
                     return Err(data("an earlier call failed inside packwatch: make a new Monitor"));
@@ -66,7 +66,7 @@ impl Turns {
     }
 }
 
-impl Deref for Turn<'_> {
+impl Deref for StateGuard<'_> {
     type Target = State;
 
     fn deref(&self) -> &State {
@@ -74,15 +74,15 @@ impl Deref for Turn<'_> {
     }
 }
 
-impl DerefMut for Turn<'_> {
+impl DerefMut for StateGuard<'_> {
     fn deref_mut(&mut self) -> &mut State {
         &mut self.state
     }
 }
 
-impl Drop for Turn<'_> {
+impl Drop for StateGuard<'_> {
     fn drop(&mut self) {
         // Before the state is free: the next holder sets its own.
-        self.turns.set_holder(None);
+        self.owner.set_holder(None);
     }
 }

@@ -19,12 +19,12 @@ struct Interrupted;
 
 /// What the work has done, and whether it must end.
 #[derive(Debug, Default)]
-pub(crate) struct Work {
+pub(crate) struct BackgroundTask {
     done: AtomicU64,
     must_end: AtomicBool,
 }
 
-impl Work {
+impl BackgroundTask {
     /// Adds to what has been done; does not return after Ctrl-C.
     pub(crate) fn advance(&self, amount: u64) {
         self.done.fetch_add(amount, Ordering::Relaxed);
@@ -56,10 +56,10 @@ impl Progress<'_> {
 pub(crate) fn run<T: Send>(
     py: Python<'_>,
     progress: Progress<'_>,
-    work: impl FnOnce(&Work) -> T + Send,
+    work: impl FnOnce(&BackgroundTask) -> T + Send,
 ) -> PyResult<T> {
     let bar = if progress.is_shown { Bar::new(py, progress)? } else { None };
-    let (state, bar) = (Work::default(), bar.as_ref());
+    let (state, bar) = (BackgroundTask::default(), bar.as_ref());
     let (result, interrupt) = py.detach(|| {
         std::thread::scope(|scope| {
             let (ended, end) = sync_channel::<()>(1);
@@ -86,7 +86,7 @@ pub(crate) fn run<T: Send>(
     }
 }
 
-fn look(py: Python<'_>, bar: Option<&Bar>, state: &Work) -> PyResult<()> {
+fn look(py: Python<'_>, bar: Option<&Bar>, state: &BackgroundTask) -> PyResult<()> {
     py.check_signals()?;
     bar.map_or(Ok(()), |bar| bar.show(py, state))
 }
@@ -109,13 +109,13 @@ impl Bar {
         Ok(Some(Self { bar, shown: AtomicU64::new(0) }))
     }
 
-    fn show(&self, py: Python<'_>, state: &Work) -> PyResult<()> {
+    fn show(&self, py: Python<'_>, state: &BackgroundTask) -> PyResult<()> {
         let done = state.done.load(Ordering::Relaxed);
         let more = done - self.shown.swap(done, Ordering::Relaxed).min(done);
         self.bar.call_method1(py, "update", (more,)).map(drop)
     }
 
-    fn close(&self, py: Python<'_>, state: &Work) -> PyResult<()> {
+    fn close(&self, py: Python<'_>, state: &BackgroundTask) -> PyResult<()> {
         self.show(py, state)?;
         self.bar.call_method0(py, "close").map(drop)
     }

@@ -11,7 +11,7 @@ use crate::quantity::{CellIndex, Timestamp};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
-pub enum FindingKind {
+pub enum CellFaultKind {
     /// The cell loses charge against the others; fraction of its capacity in a day.
     Leak = 1,
     /// The contact resistance of its connection is higher than that of the others; fraction of the cell's series resistance.
@@ -42,7 +42,7 @@ pub enum FindingKind {
     CurrentGain = 14,
 }
 
-impl FindingKind {
+impl CellFaultKind {
     /// Every kind, in the order of the wire.
     pub const ALL: [Self; 14] = [
         Self::Leak,
@@ -166,9 +166,9 @@ impl FindingKind {
 /// A finding.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Finding {
+pub struct CellFault {
     /// What.
-    pub kind: FindingKind,
+    pub kind: CellFaultKind,
     /// First and last cell of it; of two channels the lower and the upper one; `None` = the pack as a whole.
     pub cells: Option<(CellIndex, CellIndex)>,
     /// When it was first likelier than not.
@@ -181,7 +181,7 @@ pub struct Finding {
     pub size: ScalarGaussian,
 }
 
-impl Finding {
+impl CellFault {
     /// Whether it is about the cell.
     pub fn is_of(&self, cell: CellIndex) -> bool {
         let Some((first, last)) = self.cells else { return false };
@@ -191,7 +191,7 @@ impl Finding {
 
 /// In words, cells counted from 1: `cell 7: loses charge by itself, 18.24 ± 0.43 % of its capacity a day`. The deviation is one standard
 /// deviation.
-impl fmt::Display for Finding {
+impl fmt::Display for CellFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let number = |cell: CellIndex| cell.0 + 1;
         match self.cells.map(|(first, last)| (number(first), number(last))) {
@@ -202,10 +202,10 @@ impl fmt::Display for Finding {
         }
         write!(f, ": {}", self.kind.words())?;
         let (scale, digits, unit) = match self.kind {
-            FindingKind::Leak => (100.0, 2, "% of its capacity a day"),
-            FindingKind::Contact => (100.0, 0, "% of its series resistance"),
-            FindingKind::VoltageChannel => (1e3, 0, "mV"),
-            FindingKind::CurrentOffset => (100.0, 2, "% of the rated capacity per hour"),
+            CellFaultKind::Leak => (100.0, 2, "% of its capacity a day"),
+            CellFaultKind::Contact => (100.0, 0, "% of its series resistance"),
+            CellFaultKind::VoltageChannel => (1e3, 0, "mV"),
+            CellFaultKind::CurrentOffset => (100.0, 2, "% of the rated capacity per hour"),
             _ if self.size.variance > 0.0 => (100.0, 1, "%"),
             _ => return Ok(()),
         };

@@ -15,7 +15,7 @@ use crate::quantity::BusIndex;
 
 /// Listens on one interface; sends nothing and never waits.
 #[derive(Debug)]
-pub struct Tap {
+pub struct PassiveSocket {
     socket: RawSocket,
     mapper: StampMapper,
     /// Frames of one call; kept to reuse its memory.
@@ -25,7 +25,7 @@ pub struct Tap {
     before: Reading,
 }
 
-impl Tap {
+impl PassiveSocket {
     /// Opens the interface for everything: all identifiers, classic and FD. Second: whether it is up.
     ///
     /// # Errors
