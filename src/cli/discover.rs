@@ -21,13 +21,6 @@ use crate::replay::ReplayProgress;
 use crate::wiring::evidence::PackQuantity;
 use packwatch_host::failure::Failure;
 
-/// Candidates shown of a quantity.
-const SHOWN: usize = 3;
-/// Records between two looks at the clock.
-const REPORT_EVERY: u64 = 4096;
-/// Version of the JSON document.
-const VERSION: u32 = 1;
-
 /// Arguments of `discover`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
@@ -90,7 +83,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("{}: has no frames, must be a log of frames", args.log.display())));
     }
     match args.json {
-        true => unless_closed(print_json(&json!({ "version": VERSION, "discovery": discovery })))?,
+        true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
         false => print(&page(&discovery))?,
     }
     match (&args.write, &args.model) {
@@ -163,7 +156,7 @@ fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure
             discoverer.handle(*time, *bus, frame);
         }
         records += 1;
-        if records.is_multiple_of(REPORT_EVERY) {
+        if records.is_multiple_of(4096) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
             let times_real_time = discoverer.seconds() / bar.seconds();
             bar.show(ReplayProgress { bytes, frames: discoverer.frames(), times_real_time });
@@ -191,7 +184,7 @@ fn page(discovery: &Discovery) -> String {
     for quantity in PackQuantity::ALL {
         text += &format!("\n{}\n", quantity.name());
         let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
-        let rows: Vec<Vec<String>> = found.take(SHOWN).map(row).collect();
+        let rows: Vec<Vec<String>> = found.take(3).map(row).collect();
         text += &match rows.is_empty() {
             true => "  no candidate\n".to_owned(),
             false => table(&["  ", "signal", "interface", "values", "reason"], rows, 5),

@@ -19,11 +19,6 @@ use crate::replay::ReplayProgress;
 use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
 
-/// Longest time to listen, s: a day.
-const MAX_SECONDS: f64 = 86_400.0;
-/// Time to listen without `--for`, s.
-const DEFAULT_SECONDS: f64 = 60.0;
-
 /// Arguments of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
@@ -38,7 +33,7 @@ pub(crate) struct Args {
     #[arg(value_name = "LOG")]
     logs: Vec<PathBuf>,
     /// How long to listen, s [default: 60; logs: all of them]
-    #[arg(long = "for", value_name = "S", value_parser = above_0_to(MAX_SECONDS, "seconds, "))]
+    #[arg(long = "for", value_name = "S", value_parser = above_0_to(86_400.0, "seconds, "))]
     seconds: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]
@@ -128,7 +123,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
 }
 
 fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {
-    let wanted_s = args.seconds.unwrap_or(DEFAULT_SECONDS);
+    let wanted_s = args.seconds.unwrap_or(60.0);
     let bar = progress_bar((1000.0 * wanted_s) as u64, "listening {bar:32} {msg} (Ctrl-C ends early)");
     let result = wiring_check::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
         bar.set_position((1000.0 * progress.seconds) as u64);

@@ -24,13 +24,6 @@ use crate::wiring::{WiringObserver, WiringReport};
 
 pub use survey::{Survey, survey};
 
-/// How often the interfaces are read: a full bus brings 80 frames in that time, the kernel keeps thousands.
-const READ_PERIOD: Duration = Duration::from_millis(10);
-/// How often an interface that is not there is looked for.
-const LOOK_PERIOD: Duration = Duration::from_millis(500);
-/// Records between two looks at the clock.
-const REPORT_EVERY: u64 = 4096;
-
 /// Progress of a diagnosis.
 #[derive(Debug, Clone, Copy)]
 pub struct CheckProgress {
@@ -170,7 +163,7 @@ pub fn replay(
         if is_over || interrupt.is_set() {
             break;
         }
-        if records.is_multiple_of(REPORT_EVERY) {
+        if records.is_multiple_of(4096) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
             each(CheckProgress { bytes, frames: session.observer.frames(), seconds: session.observer.seconds() });
         }
@@ -217,7 +210,8 @@ pub fn listen(
         received.sort_by_key(Record::time);
         received.drain(..).for_each(|record| session.feed(&record));
         each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
-        std::thread::sleep(READ_PERIOD);
+        // A full bus brings 80 frames in that time, the kernel keeps thousands.
+        std::thread::sleep(Duration::from_millis(10));
     }
     session.observer.handle_listened(began.elapsed().as_secs_f64());
     Ok(session.finish())
@@ -228,7 +222,7 @@ impl BusListener {
         if self.tap.is_some() || Instant::now() < self.look_at {
             return Ok(());
         }
-        self.look_at = Instant::now() + LOOK_PERIOD;
+        self.look_at = Instant::now() + Duration::from_millis(500);
         match PassiveSocket::open(&self.name, clock) {
             Ok((tap, is_up)) => {
                 self.tap = Some(tap);

@@ -27,10 +27,6 @@ use judge::Population;
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
-/// Longest time between two samples of a row, s.
-const HOLE_S: f64 = 60.0;
-/// Current of rest, part of the capacity per hour.
-const REST_PER_H: f64 = 0.02;
 /// Fewest cells with a middle.
 pub(super) const LEAST_CELLS: usize = 3;
 /// Errors of a row: of the voltage, V; of the drop, fraction; of the SOC on the curve.
@@ -250,7 +246,7 @@ impl CellFaultDetector {
             return false;
         }
         let pack = &mut self.pack;
-        if pack.last.is_some_and(|last| time.since(last) > HOLE_S) {
+        if pack.last.is_some_and(|last| time.since(last) > 60.0) {
             *pack = PackSums::default();
             self.rest_s = 0.0;
             self.cells.iter_mut().for_each(Watched::interrupt);
@@ -268,7 +264,7 @@ impl CellFaultDetector {
         pack.soc += mean.soc;
         pack.temperature_c += mean.temperature_c;
         pack.charge_ah += mean.charge_ah - first_ah;
-        self.rest_s = if mean.current_a.abs() < REST_PER_H * capacity_ah { self.rest_s + seconds } else { 0.0 };
+        self.rest_s = if mean.current_a.abs() < 0.02 * capacity_ah { self.rest_s + seconds } else { 0.0 };
         (mean.charge_ah - first_ah).abs() >= ROW_SOC * capacity_ah
             || time.since(begun) >= ROW_S.max(REST_PART * self.rest_s)
     }

@@ -58,13 +58,6 @@ const UNSEEN_DAYS: f64 = 0.04;
 const HUBER: f64 = 3.0;
 const JUMP: f64 = 4.0;
 const STEPS_JUMP: f64 = 3.0;
-const JUMP_ROWS: u8 = 3;
-
-/// Least capacity, part of the mean cell's.
-const LEAST_CAPACITY: f64 = 0.1;
-/// Least variance of a state, and most of a mean or covariance: a thousand times the cell itself.
-const LEAST_VARIANCE: f64 = 1e-12;
-const MOST: f64 = 1e3;
 
 /// The filter of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -91,7 +84,7 @@ pub(super) enum Jump {
 fn count_odd(odd: &mut i8, deviations: f64, limit: f64) -> bool {
     let side = if deviations.abs() < limit { 0 } else { deviations.signum() as i8 };
     *odd = if side == 0 || odd.signum() * side < 0 { side } else { *odd + side };
-    let is_jump = odd.unsigned_abs() >= JUMP_ROWS;
+    let is_jump = odd.unsigned_abs() >= 3;
     if is_jump {
         *odd = 0;
     }
@@ -134,7 +127,7 @@ impl Difference {
     /// Time and charge pass: days, and the change of the mean cell's SOC.
     pub(super) fn pass(&mut self, days: f64, soc_change: f64) {
         // charge += (1 / (1 + capacity) - 1) * soc_change - leak * days
-        let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(LEAST_CAPACITY);
+        let part = 1.0 / (1.0 + self.mean[CAPACITY]).max(0.1);
         let (by_capacity, by_leak) = (-part * part * soc_change, -days);
         self.mean[SOC] += (part - 1.0) * soc_change + by_leak * self.mean[LEAK];
         let get = |cov: &[f64; PAIRS], i, j| cov[pair(i, j)];
@@ -277,10 +270,11 @@ impl Difference {
     fn keep_possible(&mut self) {
         for i in 0..STATES {
             let variance = &mut self.covariance[pair(i, i)];
-            *variance = variance.max(LEAST_VARIANCE);
+            *variance = variance.max(1e-12);
         }
         let numbers = self.mean.iter().chain(&self.covariance);
-        if !numbers.clone().all(|number| number.abs() <= MOST) {
+        // A thousand times the cell itself.
+        if !numbers.clone().all(|number| number.abs() <= 1e3) {
             *self = Self::new();
         }
     }

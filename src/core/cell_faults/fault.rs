@@ -236,8 +236,3 @@ pub(super) const WITHDRAWN: f64 = 0.5;
 
 /// Least distance from the middle of the pack in robust standard deviations of its cells: cells of one kind differ.
 pub(super) const OUTLIER: f64 = 3.5;
-
-/// Probability that a standard normal value is below.
-pub(super) fn normal_cdf(value: f64) -> f64 {
-    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
-}

@@ -7,8 +7,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::fault::{GAIN, REPORTED, normal_cdf};
-use crate::filter::ScalarGaussian;
+use super::fault::{GAIN, REPORTED};
+use crate::filter::{ScalarGaussian, median, normal_cdf};
 use crate::quantity::{InvalidState, Timestamp};
 
 /// Days that are compared: what takes longer is a season or age.
@@ -17,7 +17,6 @@ const DAY_S: f64 = 86_400.0;
 /// Time within which the resistances fall, s: what is known of them follows for hours, so that a look may fall in between. And the
 /// most difference of the temperatures then and now, K.
 const APART_S: f64 = 2.5 * DAY_S;
-const APART_K: f64 = 5.0;
 /// Error of a change within these days, fraction.
 const ERROR: f64 = 0.005;
 /// Deviation above which a capacity is not known yet, fraction: what it learns would be a change.
@@ -53,12 +52,6 @@ pub(super) struct Gain {
     days: Vec<Day>,
 }
 
-/// Middle of some values, 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
-}
-
 impl Gain {
     /// Whether a day has passed since the last one.
     pub(super) fn is_due(&self, now: Timestamp) -> bool {
@@ -70,11 +63,11 @@ impl Gain {
     pub(super) fn take(&mut self, time: Timestamp, temperature_c: f64, cells: &[Learned]) -> (f64, ScalarGaussian) {
         let none = (0.0, ScalarGaussian { mean: 0.0, variance: ERROR * ERROR });
         let part = |cell: &Learned| cell.capacity_ah.std() / cell.capacity_ah.mean;
-        let is_known = median(cells.iter().map(part).collect()) <= KNOWN;
+        let is_known = median(cells.iter().map(part)).is_some_and(|part| part <= KNOWN);
         let now = Day {
             time,
-            log_capacity: median(cells.iter().map(|cell| libm::log(cell.capacity_ah.mean)).collect()),
-            log_resistance: median(cells.iter().map(|cell| cell.log_resistance).collect()),
+            log_capacity: median(cells.iter().map(|cell| libm::log(cell.capacity_ah.mean))).unwrap_or(f64::NAN),
+            log_resistance: median(cells.iter().map(|cell| cell.log_resistance)).unwrap_or(f64::NAN),
             temperature_c,
         };
         let is_possible = [now.log_capacity, now.log_resistance, temperature_c].iter().all(|it| it.is_finite());
@@ -118,7 +111,7 @@ impl Gain {
 /// Rise of the gain between two days that `now` still shows, fraction: of the fall of the resistance and the rise of the capacity
 /// the smaller one. `None` = the days cannot be compared.
 fn rise(before: &Day, after: &Day, now: &Day) -> Option<f64> {
-    let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= APART_K;
+    let is_near = |day: &Day| (day.temperature_c - before.temperature_c).abs() <= 5.0;
     let is_next = after.time.since(before.time) <= APART_S;
     let fell = before.log_resistance - after.log_resistance.max(now.log_resistance);
     (is_next && is_near(after) && is_near(now)).then(|| fell.min(now.log_capacity - before.log_capacity))

@@ -30,8 +30,6 @@ use crate::quantity::{CellIndex, Timestamp};
 /// Standard deviations from which on a cell's SOC and capacity are not known: half of those before the first row, or less.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
-/// Temperature of the open-circuit curve, degrees C, and its parts for the mean voltage.
-const OCV_C: f64 = 25.0;
 const OCV_PARTS: u32 = 100;
 
 /// What the differences between the cells cost. Fractions are of the mean cell's capacity.
@@ -195,7 +193,7 @@ impl CellFaultDetector {
 /// Mean open-circuit voltage from empty to full of a cell that has aged to a capacity, V.
 pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     let soc = |part: u32| (f64::from(part) + 0.5) / f64::from(OCV_PARTS);
-    let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), OCV_C), capacity_ah);
+    let ocv_v = |part| model.aged_ocv_v(&model.grid_position(soc(part), 25.0), capacity_ah);
     (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
 }
 

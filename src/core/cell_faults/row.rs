@@ -4,12 +4,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
-/// Longest time between two samples whose difference shows the resistance, s.
-const STEP_S: f64 = 3.0;
-
-/// Least time between two samples that are taken, ns: more of them say the same again.
-const LEAST_APART_NS: i64 = 900_000_000;
-
 /// Sums of one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
@@ -40,7 +34,8 @@ impl CellSums {
         ohm: f64,
     ) {
         let apart_ns = |before: Timestamp| time.nanos().wrapping_sub(before.nanos());
-        if self.last.is_some_and(|(before, ..)| (0..LEAST_APART_NS).contains(&apart_ns(before))) {
+        // More of them say the same again.
+        if self.last.is_some_and(|(before, ..)| (0..900_000_000).contains(&apart_ns(before))) {
             return;
         }
         self.count += 1;
@@ -51,7 +46,7 @@ impl CellSums {
         self.voltage_v += voltage_v + ohm * current_a;
         if let Some((before, last_v, last_a)) = self.last.replace((time, voltage_v, current_a)) {
             let (step_v, step_a) = (voltage_v - last_v, current_a - last_a);
-            if (0.0..=STEP_S).contains(&time.since(before)) {
+            if (0.0..=3.0).contains(&time.since(before)) {
                 self.steps_a2 += step_a * step_a;
                 self.steps_va += step_a * step_v;
             }

@@ -15,13 +15,6 @@ use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
 
-/// Identifiers counted per interface; a vehicle's bus has some hundreds.
-const MAX_IDS: usize = 4096;
-/// Silence of every interface for this long means that the buses slept, or the record has a hole, s.
-const SLEEP_S: f64 = 30.0;
-/// Payloads of a protected message kept to try other checks on.
-const MAX_PAYLOADS: usize = 12;
-
 /// Frames of an identifier on an interface.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct IdStats {
@@ -163,7 +156,8 @@ impl WiringObserver {
         self.frames += 1;
         let Some(stats) = self.buses.get_mut(bus.index()) else { return };
         stats.frames += 1;
-        if stats.ids.len() < MAX_IDS || stats.ids.contains_key(&frame.id()) {
+        // A vehicle's bus has some hundreds.
+        if stats.ids.len() < 4096 || stats.ids.contains_key(&frame.id()) {
             let stats = stats.ids.entry(frame.id()).or_insert(IdStats { first: time, ..IdStats::default() });
             stats.count += 1;
             stats.fd += u64::from(matches!(frame.kind(), FrameKind::Fd { .. }));
@@ -196,7 +190,7 @@ impl WiringObserver {
         *stats.counts.entry(status.name()).or_default() += 1;
         stats.good += u64::from(status.is_usable());
         stats.bad += u64::from(!status.is_usable() && status != Status::Initial);
-        if stats.payloads.len() < MAX_PAYLOADS {
+        if stats.payloads.len() < 12 {
             stats.payloads.push(frame.data().to_vec());
         }
     }
@@ -288,7 +282,8 @@ impl WiringObserver {
     fn note_time(&mut self, time: Timestamp) {
         let last = *self.latest.get_or_insert(time);
         let passed_s = time.since(last);
-        if passed_s > SLEEP_S {
+        // The buses slept, or the record has a hole.
+        if passed_s > 30.0 {
             self.handle_gap();
         } else {
             self.awake_s += passed_s.max(0.0);

@@ -18,10 +18,6 @@ const MAX_ANSWER_BYTES: usize = 64 << 10;
 const WINDOW_S: f64 = 2.0;
 /// Messages (identifiers on an interface) followed; a car has a few hundred, a flood of random identifiers more.
 const MAX_MESSAGES: usize = 4096;
-/// Kinds of answers followed.
-const MAX_ANSWERS: usize = 1024;
-/// An answer belongs to a request at most this old, s (longest P2* of ISO 14229-2).
-const ANSWER_WITHIN_S: f64 = 5.0;
 /// First data byte of BMW's answers: extended addressing that needs no definition to be seen.
 const TESTER: u8 = 0xF1;
 
@@ -192,11 +188,12 @@ impl Capture {
         let service = first.wrapping_sub(0x40);
         let Some((number, length)) = identifier(service) else { return };
         let request = self.requests.get(&(bus, service, number));
-        let request = request.filter(|(at, _, _)| time_s - at <= ANSWER_WITHIN_S).map(|(_, id, first)| (*id, *first));
+        // Longest P2* of ISO 14229-2.
+        let request = request.filter(|(at, _, _)| time_s - at <= 5.0).map(|(_, id, first)| (*id, *first));
         let key = AnswerKey { bus, response: id, extension, service, identifier: number };
         // A single frame alone may be any message that begins with these bytes.
         let is_known = self.answers.contains_key(&key) || is_long || request.is_some();
-        if is_known && (self.answers.contains_key(&key) || self.answers.len() < MAX_ANSWERS) {
+        if is_known && (self.answers.contains_key(&key) || self.answers.len() < 1024) {
             self.answers.entry(key).or_default().push(time_s, request, &rest[length..]);
         }
     }

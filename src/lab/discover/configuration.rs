@@ -14,15 +14,6 @@ use crate::can::CanId;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::PackQuantity;
 
-/// Readings may be this many of their periods old.
-const PERIODS: f64 = 3.0;
-/// Shortest age written, s: the defaults of the configuration are as long.
-const MIN_AGE_S: f64 = 2.0;
-/// Distance of answers from requests at the identifiers that ISO 15765-4 fixes.
-const FIXED_DISTANCE: u16 = 8;
-/// Deviation of the pack voltage from the sum of the cells that is worth a remark.
-const SUM_TOLERANCE: f64 = 0.05;
-
 /// What the user decides.
 #[derive(Debug, Clone, Default)]
 pub struct PackSettings {
@@ -279,7 +270,7 @@ impl Writer<'_> {
         let Some(pack) = self.best(PackQuantity::PackVoltage) else { return };
         let sum: f64 = selection.voltage.members.iter().map(|index| self.signal(*index).series.extent.mean()).sum();
         let pack_v = self.signal(pack.members[0]).series.extent.mean();
-        if (pack_v / sum - 1.0).abs() > SUM_TOLERANCE {
+        if (pack_v / sum - 1.0).abs() > 0.05 {
             open.push(format!(
                 "{} is {pack_v:.1} V, the cells are {sum:.1} V together: are all cells there?",
                 pack.signal
@@ -373,7 +364,8 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            let age_s = (PERIODS * period_s).max(MIN_AGE_S).ceil();
+            // At least as long as the defaults of the configuration.
+            let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }
     }
@@ -381,7 +373,8 @@ impl Writer<'_> {
 
 fn guessed_request(response: CanId) -> CanId {
     match response {
-        CanId::Standard(id) => CanId::Standard(id.saturating_sub(FIXED_DISTANCE)),
+        // As ISO 15765-4 fixes it.
+        CanId::Standard(id) => CanId::Standard(id.saturating_sub(8)),
         // Normal fixed addressing: the two addresses change places.
         CanId::Extended(id) => {
             let [low, high, ..] = id.to_le_bytes();

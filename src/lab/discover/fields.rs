@@ -12,46 +12,25 @@
 use std::collections::BTreeSet;
 
 use super::capture::{Capture, MessageKey, Payloads};
-use super::signals::{LogSignal, SignalOrigin};
+use super::signals::{LogSignal, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::unit::Quantity;
-use crate::wiring::evidence::{Series, SignalLabel, Slope};
+use crate::wiring::evidence::{Series, Slope};
 
-/// Payloads to judge a message by.
-const MIN_PAYLOADS: usize = 20;
 /// Payloads judged of a message, or of each of its pages.
 const MAX_PAYLOADS: usize = 1500;
 /// Plausible voltages of a pack, V, and V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
-/// Largest range of a pack voltage within a log, of its largest value.
-const MAX_SWING: f64 = 0.35;
-/// Different values that an alive voltage takes at least.
-const MIN_DISTINCT: usize = 5;
 /// A per code of a current.
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Advantage of the first of them, the most customary one, in the logarithm of the resistance.
-const CUSTOMARY: f64 = 0.25;
-/// Resistance of a usual pack, ohms per V: 0.1 ohm at 400 V.
-const USUAL_OHM_PER_V: f64 = 2.5e-4;
-/// Voltages that are compared with every other field, and pairs that are kept.
-const MAX_VOLTAGES: usize = 16;
-const MAX_CURRENTS: usize = 12;
-/// Correlation of changes, and standard deviations from chance: thousands of fields are compared.
-const MIN_CORRELATION: f64 = 0.6;
-const MIN_STRENGTH: f64 = 7.0;
 /// Plausible voltages of a cell, V; cells of a pack are at most so far apart.
 const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
 /// Bits of a cell voltage and V per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
-/// Fewest cells of a page, and in all.
-const MIN_IN_PAGE: usize = 3;
-const MIN_CELLS: usize = 8;
-/// Most pages of a message.
-const MAX_PAGES: usize = 64;
 
 /// A field of a message: its identifier, and the value of the first byte where that is a page.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,7 +54,7 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
         .flatten()
         .collect();
     let usual = capture.messages.iter();
-    let usual = usual.filter(|(key, payloads)| payloads.len() >= MIN_PAYLOADS && !diagnostic.contains(&key.1));
+    let usual = usual.filter(|(key, payloads)| payloads.len() >= 20 && !diagnostic.contains(&key.1));
     let messages = usual.map(|(key, payloads)| Samples::new(*key, payloads)).filter(|samples| samples.bytes >= 2);
     let messages: Vec<Samples<'_>> = messages.collect();
     let mut found = cells(&messages);
@@ -83,7 +62,7 @@ pub(super) fn signals(capture: &Capture) -> Vec<LogSignal> {
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
     let mut voltages: Vec<LogSignal> = others.flat_map(voltages_of).collect();
     voltages.sort_by(|a, b| swing(&a.series).total_cmp(&swing(&b.series)).then_with(|| a.name.cmp(&b.name)));
-    voltages.truncate(MAX_VOLTAGES);
+    voltages.truncate(16);
     let compared: Vec<&LogSignal> = voltages.iter().chain(found.first()).collect();
     let currents = currents(messages.iter().filter(|samples| !of_cells.contains(&samples.key)), &compared);
     found.extend(currents);
@@ -163,31 +142,23 @@ fn signal(
     key: MessageKey,
     page: Option<u8>,
     name: String,
-    unit: &str,
+    quantity: Quantity,
     layout: SignalLayout,
     series: Series,
 ) -> LogSignal {
-    let quantity = if unit == "A" { Quantity::Current } else { Quantity::Voltage };
-    let (full_name, unit) = (format!("{}.{name}", message_name(key.1)), unit.to_owned());
+    let full_name = format!("{}.{name}", message_name(key.1));
     let signal = Signal {
         name,
         layout,
-        unit,
+        unit: if quantity == Quantity::Current { "A" } else { "V" }.to_owned(),
         receivers: Vec::new(),
         conditions: Vec::new(),
         is_multiplexor: false,
         values: Vec::new(),
         comment: None,
     };
-    LogSignal {
-        name: full_name,
-        bus: key.0,
-        origin: SignalOrigin::Field(Box::new(MessageField { id: key.1, page, signal })),
-        label: SignalLabel::unnamed(quantity),
-        series,
-        is_read_signed: false,
-        conversion: (1.0, 0.0),
-    }
+    let origin = SignalOrigin::Field(Box::new(MessageField { id: key.1, page, signal }));
+    LogSignal::unnamed(full_name, key.0, origin, quantity, series)
 }
 
 /// Place of a field in a name: first bit and byte order.
@@ -200,7 +171,8 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
     let mut found = Vec::new();
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        let is_alive = codes.bad() == 0 && codes.distinct() >= MIN_DISTINCT && swing(&codes) <= MAX_SWING;
+        // A pack voltage moves by less within a log.
+        let is_alive = codes.bad() == 0 && codes.distinct() >= 5 && swing(&codes) <= 0.35;
         if !is_alive || codes.is_counter() {
             continue;
         }
@@ -208,7 +180,14 @@ fn voltages_of(samples: &Samples<'_>) -> Vec<LogSignal> {
             if codes.extent.min * factor >= PACK_V.0 && codes.extent.max * factor <= PACK_V.1 {
                 let layout = SignalLayout { factor, ..layout };
                 let series = samples.values(&layout, None);
-                found.push(signal(samples.key, None, format!("Voltage_{}", place(&layout)), "V", layout, series));
+                found.push(signal(
+                    samples.key,
+                    None,
+                    format!("Voltage_{}", place(&layout)),
+                    Quantity::Voltage,
+                    layout,
+                    series,
+                ));
             }
         }
     }
@@ -228,22 +207,25 @@ fn currents<'a>(messages: impl Iterator<Item = &'a Samples<'a>>, voltages: &[&Lo
             let related = others
                 .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
             let best = related
-                .filter(|(slope, _)| slope.correlation().abs() >= MIN_CORRELATION && slope.strength() >= MIN_STRENGTH)
+                // Thousands of fields are compared.
+                .filter(|(slope, _)| slope.correlation().abs() >= 0.6 && slope.strength() >= 7.0)
                 .max_by(|a, b| a.0.correlation().abs().total_cmp(&b.0.correlation().abs()));
             let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
-                let unusual = (slope.ohm.abs() / factor / mean_v / USUAL_OHM_PER_V).ln().abs();
-                if *factor == CURRENT_SCALES[0] { unusual - CUSTOMARY } else { unusual }
+                // Of a usual pack: 0.1 ohm at 400 V.
+                let unusual = (slope.ohm.abs() / factor / mean_v / 2.5e-4).ln().abs();
+                // The first scale is the most customary one.
+                if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
             let layout = SignalLayout { factor: factor.unwrap_or(1.0), ..layout };
             let series = samples.values(&layout, None);
             let name = format!("Current_{}", place(&layout));
-            found.push((slope.correlation().abs(), signal(samples.key, None, name, "A", layout, series)));
+            found.push((slope.correlation().abs(), signal(samples.key, None, name, Quantity::Current, layout, series)));
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
-    found.into_iter().take(MAX_CURRENTS).map(|(_, signal)| signal).collect()
+    found.into_iter().take(12).map(|(_, signal)| signal).collect()
 }
 
 /// Whether a field overlaps with a layout of the same message, on whatever interface: gateways repeat messages.
@@ -268,7 +250,7 @@ fn cells(messages: &[Samples<'_>]) -> Vec<LogSignal> {
         for factor in scales {
             for byte_order in [ByteOrder::LittleEndian, ByteOrder::BigEndian] {
                 let found = cells_of_form(messages, bits, *factor, byte_order);
-                if found.len() >= MIN_CELLS && found.len() > best.len() {
+                if found.len() >= 8 && found.len() > best.len() {
                     best = found;
                 }
             }
@@ -290,11 +272,11 @@ fn cells_of_form(messages: &[Samples<'_>], bits: u16, factor: f64, byte_order: B
                 let layouts = places.map(|place| layout(place, bits, byte_order, ValueType::Unsigned, factor));
                 row(samples, *page, layouts)
             });
-            let longest = rows.rev().max_by_key(Vec::len).filter(|row| row.len() >= MIN_IN_PAGE);
+            let longest = rows.rev().max_by_key(Vec::len).filter(|row| row.len() >= 3);
             let Some(row) = longest.filter(|row| continues(&found, samples.key, row)) else { continue };
             for (layout, series) in row {
                 let name = format!("Cell{}", found.len() + 1);
-                found.push(signal(samples.key, *page, name, "V", layout, series));
+                found.push(signal(samples.key, *page, name, Quantity::Voltage, layout, series));
             }
         }
     }
@@ -312,27 +294,24 @@ fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)
 fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
-    let is_counter = (2..=MAX_PAGES).contains(&values.len()) && span == values.len() && payloads.len() >= 3 * span;
+    let is_counter = (2..=64).contains(&values.len()) && span == values.len() && payloads.len() >= 3 * span;
     if is_counter { values.into_iter().map(Some).collect() } else { vec![None] }
 }
 
-/// Neighbours from the first one on that are plausible and close together.
+/// The longest run of plausible neighbours that are close together.
 fn row(
     samples: &Samples<'_>,
     page: Option<u8>,
     layouts: impl Iterator<Item = SignalLayout>,
 ) -> Vec<(SignalLayout, Series)> {
-    let mut row: Vec<(SignalLayout, Series)> = Vec::new();
-    for layout in layouts {
+    let neighbours = layouts.map(|layout| {
         let series = samples.values(&layout, page);
         let is_cell = series.extent.min >= CELL_V.0 && series.extent.max <= CELL_V.1 && series.bad() == 0;
-        let is_near =
-            row.first().is_none_or(|first| (series.extent.mean() - first.1.extent.mean()).abs() <= MAX_SPREAD_V);
-        if !is_cell || !is_near {
-            break;
-        }
-        row.push((layout, series));
-    }
+        is_cell.then_some((layout, series))
+    });
+    let row = longest_run(neighbours, |(_, first), (_, next)| {
+        (next.extent.mean() - first.extent.mean()).abs() <= MAX_SPREAD_V
+    });
     // Bytes that never change are rather text or constants.
     let is_alive = row.iter().any(|(_, series)| !series.is_constant());
     if is_alive { row } else { Vec::new() }

@@ -12,9 +12,6 @@ use crate::can::unit::Quantity;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{PackQuantity, Score, Series, Slope};
 
-/// Share of readings that must be values.
-const MIN_VALID: f64 = 0.8;
-
 /// Evidence for one signal or group.
 #[derive(Debug, Clone)]
 pub(super) struct Evidence {
@@ -184,7 +181,7 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
 impl LogSignal {
     fn is_mostly_valid(&self) -> bool {
         let (good, bad) = (self.series.count() as f64, self.series.bad() as f64);
-        good >= MIN_VALID * (good + bad)
+        good >= 0.8 * (good + bad)
     }
 
     /// Whether nothing but its values says what it is.

@@ -8,12 +8,12 @@
 use std::collections::BTreeMap;
 
 use super::capture::{AnswerKey, Answers};
-use super::signals::{LogSignal, SignalOrigin};
+use super::signals::{LogSignal, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::unit::Quantity;
 use crate::import::{DiagnosticSignal, NumberRange};
 use crate::quantity::BusIndex;
-use crate::wiring::evidence::{Series, SignalLabel};
+use crate::wiring::evidence::Series;
 
 /// Name of a cell, before its number.
 pub(super) const CELL: &str = "Cell";
@@ -21,8 +21,6 @@ pub(super) const CELL: &str = "Cell";
 const MIN_CELLS: usize = 8;
 /// Plausible voltages of a cell in use, V.
 const CELL_V: (f64, f64) = (2.0, 4.5);
-/// Cells of one pack are at most so far apart, V.
-const MAX_SPREAD_V: f64 = 0.35;
 /// V per code, 16 bits and 8 bits.
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
 /// Plausible voltages of a pack, V.
@@ -32,14 +30,6 @@ const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
 /// Bits and A per code of a current.
 const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
-/// Largest plausible current, A.
-const MAX_CURRENT_A: f64 = 1500.0;
-/// Voltages of 16 bits from here on are the sign of a longer number, or no value.
-const SIGN_16: f64 = 65_280.0;
-/// Fewest sensors of a row of temperatures.
-const MIN_SENSORS: usize = 3;
-/// Sensors of one pack are at most so far apart, K.
-const MAX_SPREAD_C: f64 = 12.0;
 /// Answers to judge a field by.
 const MIN_ANSWERS: usize = 3;
 
@@ -128,16 +118,9 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
     if !form.name.starts_with(CELL) {
         form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
     }
-    (series.count() >= MIN_ANSWERS as u64).then(|| LogSignal {
-        name: format!("{}.{}", table_name(key), form.name),
-        bus: key.bus,
-        // Places say nothing about a meaning.
-        label: SignalLabel::unnamed(quantity),
-        origin: SignalOrigin::Raw(*key, Box::new(form)),
-        series,
-        is_read_signed: false,
-        conversion: (1.0, 0.0),
-    })
+    let name = format!("{}.{}", table_name(key), form.name);
+    let is_known = series.count() >= MIN_ANSWERS as u64;
+    is_known.then(|| LogSignal::unnamed(name, key.bus, SignalOrigin::Raw(*key, Box::new(form)), quantity, series))
 }
 
 /// Name of the tables of a controller's answers: `Answer7BB`.
@@ -150,9 +133,10 @@ fn is_plausible(signal: &LogSignal) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
-        within(PACK_V.0, PACK_V.1) && series.extent.max < SIGN_16 * field.factor
+        // From here on it is the sign of a longer number, or no value.
+        within(PACK_V.0, PACK_V.1) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
-        within(-MAX_CURRENT_A, MAX_CURRENT_A) && !series.is_constant()
+        within(-1500.0, 1500.0) && !series.is_constant()
     } else {
         // 0 and 0xFF all the time are no value.
         let is_absent = series.values.kept().iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
@@ -172,7 +156,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
                 row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
             // Equal constants are rather bytes of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
-            if row.len() >= MIN_SENSORS && weight > best_weight {
+            if row.len() >= 3 && weight > best_weight {
                 (best, best_weight) = (row, weight);
             }
         }
@@ -202,7 +186,8 @@ fn temperature_row(
         let next = signal(key, answers, form).filter(is_plausible);
         let is_near = |signal: &LogSignal| {
             row.first()
-                .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= MAX_SPREAD_C)
+                // Sensors of one pack are at most so far apart.
+                .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= 12.0)
         };
         match next.filter(is_near) {
             Some(signal) => row.push(signal),
@@ -242,25 +227,19 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows) 
 
 /// Length and first byte of the longest run of plausible neighbours that begin at `first`, `first + width`, ...
 fn row(answers: &Answers, bytes: usize, first: usize, width: usize, scale: f64) -> Option<(usize, usize)> {
-    let is_cell = |start: usize| {
-        answers.payloads.iter().all(|(_, data)| {
-            let code = data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte));
+    let code = |data: &[u8], start: usize| {
+        data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte))
+    };
+    let cell = |start: usize| {
+        let mut codes = answers.payloads.iter().map(|(_, data)| code(data, start));
+        let value = f64::from(codes.next()?) * scale;
+        let is_cell = answers.payloads.iter().map(|(_, data)| code(data, start)).all(|code| {
             (CELL_V.0..=CELL_V.1).contains(&(f64::from(code) * scale)) && code != u32::MAX >> (32 - 8 * width)
-        })
+        });
+        is_cell.then_some((start, value))
     };
-    let value = |start: usize| {
-        let data = answers.payloads.iter().next().map_or(&[][..], |(_, data)| data);
-        scale * f64::from(data[start..start + width].iter().fold(0_u32, |code, byte| code << 8 | u32::from(*byte)))
-    };
-    let mut best: Option<(usize, usize)> = None;
-    let mut run: Option<(usize, usize)> = None;
-    for start in (first..bytes).step_by(width).filter(|start| start + width <= bytes) {
-        run = match run {
-            _ if !is_cell(start) => None,
-            Some((count, begin)) if (value(start) - value(begin)).abs() <= MAX_SPREAD_V => Some((count + 1, begin)),
-            _ => Some((1, start)),
-        };
-        best = best.max(run);
-    }
-    best
+    let starts = (first..bytes).step_by(width).filter(|start| start + width <= bytes);
+    // Cells of one pack are at most so far apart.
+    let run = longest_run(starts.map(cell), |(_, first_v), (_, next_v)| (next_v - first_v).abs() <= 0.35);
+    Some((run.len(), run.first()?.0))
 }

@@ -44,6 +44,35 @@ pub(super) struct LogSignal {
     pub(super) conversion: (f64, f64),
 }
 
+impl LogSignal {
+    /// A field that no description names: places say nothing about a meaning.
+    pub(super) fn unnamed(
+        name: String,
+        bus: BusIndex,
+        origin: SignalOrigin,
+        quantity: Quantity,
+        series: Series,
+    ) -> Self {
+        let label = SignalLabel::unnamed(quantity);
+        Self { name, bus, origin, label, series, is_read_signed: false, conversion: (1.0, 0.0) }
+    }
+}
+
+/// The longest run of neighbours that go with the first of the run, of several the last; `None` ends a run.
+pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
+    let (mut best, mut run) = (Vec::new(), Vec::new());
+    for item in items.chain([None]) {
+        match item {
+            Some(item) if run.first().is_none_or(|first| goes_with(first, &item)) => run.push(item),
+            item => {
+                let ended = std::mem::replace(&mut run, item.into_iter().collect());
+                best = if ended.len() >= best.len() { ended } else { best };
+            }
+        }
+    }
+    best
+}
+
 /// Descriptions that the user gave.
 #[derive(Debug, Default)]
 pub(super) struct Descriptions {

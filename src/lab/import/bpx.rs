@@ -28,23 +28,14 @@ const FARADAY_C_PER_MOL: f64 = 96_485.332_12;
 /// Gas constant, J/(mol K) (CODATA 2018).
 const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 
-/// 0 degrees C in K.
-const ZERO_CELSIUS_K: f64 = 273.15;
-
 /// Temperatures of the tables, K from the file's reference temperature.
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
 /// Standard deviation of the voltage error at rest and the reference temperature, V: a cell differs from its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// Added to it for each kelvin from the reference temperature, V/K.
-const ERROR_PER_KELVIN_V: f64 = 0.0003;
-
 /// Share of the voltage drop at the nominal capacity in one hour that counts as error: the closed forms hold for small currents.
 const ERROR_OF_DROP: f64 = 0.3;
-
-/// Most of the voltage error, V.
-const MOST_ERROR_V: f64 = 0.5;
 
 /// What to convert.
 #[derive(Debug, Clone, Default)]
@@ -114,13 +105,13 @@ impl Model {
             return Err(vec![fault]);
         }
         let error_v = |from_reference: f64, of: &Resistances| {
-            let at_rest_v = ERROR_AT_REST_V + ERROR_PER_KELVIN_V * from_reference.abs();
-            at_rest_v.hypot(ERROR_OF_DROP * of.settled_ohm() * cell.nominal_ah).min(MOST_ERROR_V)
+            let at_rest_v = ERROR_AT_REST_V + 0.0003 * from_reference.abs();
+            at_rest_v.hypot(ERROR_OF_DROP * of.settled_ohm() * cell.nominal_ah).min(0.5)
         };
         let errors = TEMPERATURES_K.iter().zip(&resistances);
         let voltage_error_v =
             errors.map(|(from, row)| row.iter().map(|of| error_v(*from, of)).collect::<Vec<f64>>()).collect();
-        let temperature_c = kelvin.iter().map(|kelvin| (1e4 * (kelvin - ZERO_CELSIUS_K)).round() / 1e4).collect();
+        let temperature_c = kelvin.iter().map(|kelvin| (1e4 * (kelvin - 273.15)).round() / 1e4).collect();
         Ok(Self { temperature_c, curve: table, resistances, voltage_error_v })
     }
 

@@ -23,9 +23,6 @@ use crate::error::LabError;
 use address::Addresses;
 use document::{CommandDocument, SignalDocument, SignalSetDocument};
 
-/// Name of the signals' group when neither the ids nor the user give one.
-const DEFAULT_NAME: &str = "Car";
-
 /// What to convert.
 #[derive(Debug, Clone, Default)]
 pub struct ObdbSettings {
@@ -247,7 +244,7 @@ fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) {
     let first_word = |signal: &DiagnosticSignal| signal.name.split_once('_').map(|(word, _)| word.to_owned());
     let words = tables.iter().flat_map(|table| &table.signals).map(first_word);
     let word = words.reduce(|a, b| if a == b { a } else { None }).flatten().filter(|word| !word.is_empty());
-    let name = name.map(str::to_owned).or_else(|| word.clone()).unwrap_or_else(|| DEFAULT_NAME.to_owned());
+    let name = name.map(str::to_owned).or_else(|| word.clone()).unwrap_or_else(|| "Car".to_owned());
     for table in tables {
         table.name.clone_from(&name);
         for signal in &mut table.signals {

@@ -8,8 +8,6 @@ use crate::quantity::{InvalidState, Timestamp};
 
 /// Deviation of what the bits say was bled, part of it: the resistors of one BMS are alike, their current follows the voltage.
 const BLEED_PART: f64 = 0.2;
-/// Mean square of the part of an unseen time for which a cell was bled longer than the middle cells: uniform between -1 and 1.
-const UNSEEN_MEAN_SQUARE: f64 = 1.0 / 3.0;
 /// Most that a cell loses beside the others before it is like them, SOC: a BMS bleeds it down to the lowest.
 const MOST_BESIDE: f64 = 0.1;
 
@@ -103,7 +101,8 @@ impl CellFaultDetector {
                 false => middle_s,
             };
             let variance = BLEED_PART * BLEED_PART * cell.bleed.bled.add(soc)
-                + UNSEEN_MEAN_SQUARE * cell.bleed.unseen.add(soc_per_s * unseen_s);
+                // Mean square of a part that is uniform between -1 and 1.
+                + (1.0 / 3.0) * cell.bleed.unseen.add(soc_per_s * unseen_s);
             cell.difference.remove_charge(soc, variance);
         }
     }

@@ -2,8 +2,8 @@
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{self, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
-use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTED, WITHDRAWN, normal_cdf};
-use crate::filter::ScalarGaussian;
+use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTED, WITHDRAWN};
+use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// Time within which the cells of a module are found to have more capacity than the others.
@@ -11,8 +11,6 @@ const SAME_MODULE_S: f64 = 3.0 * DAY_S;
 /// Deviation up to which a size is known, in limits of its kind.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// Distance of two readings, in deviations, from which on one is below the other.
-const BEYOND_DOUBT: f64 = 2.0;
 /// Difference of SOC beyond which a cell is too far from the others for a comparison of resistance and channel.
 const TOO_FAR: f64 = 0.1;
 const DAY_S: f64 = 86_400.0;
@@ -136,7 +134,7 @@ impl CellFaultDetector {
         if self.lowest == Some(lowest) {
             return self.lowest;
         }
-        (next.mean - shown.mean > BEYOND_DOUBT * shown.std().hypot(next.std())).then_some(lowest)
+        (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
     /// Whether a BMS may take charge out of the cell that no bit shows: where one balances, out of all but the lowest one. A leak that

@@ -18,10 +18,6 @@ use crate::quantity::Timestamp;
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
 /// Blocks further apart than this do not belong together, s.
 const MAX_GAP_S: f64 = 40.0;
-/// Most steps kept: a slope from this number is good to a few per cent.
-const MAX_STEPS: usize = 192;
-/// Time at the start of a run that is not evaluated: the circuit's branches settle, s.
-const SETTLE_S: f64 = 20.0;
 
 /// A step of the current and of the voltages.
 #[derive(Debug, Clone)]
@@ -93,7 +89,8 @@ impl OpenRun {
         self.current_sum += mean.current_a;
         self.blocks += 1;
         let t = mean.time.since(self.from);
-        if t < SETTLE_S {
+        // The circuit's branches settle.
+        if t < 20.0 {
             return;
         }
         let (first_s, first_v) = *self.first.get_or_insert((t, mean.voltage_v));
@@ -208,7 +205,8 @@ impl VoltageResponse {
             before.cells_v.iter().zip(&after.cells_v).map(|(before, after)| (after - before) as f32).collect();
         let voltage_v = median(cells_v.iter().map(|v| f64::from(*v))).unwrap_or(f64::NAN);
         let step = CurrentStep { current_a: after.current_a - before.current_a, voltage_v, cells_v };
-        if self.steps.len() < MAX_STEPS {
+        // A slope from this number is good to a few per cent.
+        if self.steps.len() < 192 {
             self.steps.push(step);
             return;
         }

@@ -9,14 +9,6 @@ use crate::wiring::report::{Severity, Topic};
 
 /// Deviation of the sum of the cells that sensors explain.
 const SUM_TOLERANCE: f64 = 0.03;
-/// The same where some cells may be wrong or missing, for a decimal place.
-const UNCLEAR_TOLERANCE: f64 = 0.2;
-/// Ratios outside are another voltage: an auxiliary battery, a link behind open contactors.
-const SAME_VOLTAGE: std::ops::Range<f64> = 0.2..20.0;
-/// States of charge that differ by more are worth knowing.
-const SOC_DIFFERS: f64 = 0.03;
-/// States of charge that differ by more must be checked: a dash that hides a reserve at both ends differs by less.
-const SOC_DISAGREES: f64 = 0.1;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     let is_clear = !judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped, Topic::Silent, Topic::CellCount]);
@@ -40,7 +32,8 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         return;
     }
     let candidates = beside(judge, Channel::PackVoltage).into_iter();
-    let candidates = candidates.filter(|(_, pack_v)| SAME_VOLTAGE.contains(&(pack_v / sum_v)));
+    // Others are an auxiliary battery, a link behind open contactors.
+    let candidates = candidates.filter(|(_, pack_v)| (0.2..20.0).contains(&(pack_v / sum_v)));
     let off = |pack_v: f64| (pack_v / sum_v).ln().abs();
     let Some(((signal, _), pack_v)) = candidates.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) else { return };
     let (cells, sum, pack) = (judge.plan.pack.cells, number(sum_v), number(pack_v));
@@ -48,7 +41,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
         return judge.fine(format!("the {cells} cells add up to {sum} V; {} is {pack} V", signal.name));
     }
     let power = (pack_v / sum_v).log10().round();
-    let tolerance = if is_clear { SUM_TOLERANCE } else { UNCLEAR_TOLERANCE };
+    let tolerance = if is_clear { SUM_TOLERANCE } else { 0.2 };
     if power != 0.0 && ((pack_v / sum_v) / 10.0_f64.powf(power) - 1.0).abs() <= tolerance {
         let times = number(10.0_f64.powf(power));
         warning(judge, Topic::PackVoltage, format!("{} is off by {times}", signal.name))
@@ -79,11 +72,12 @@ fn states_of_charge(judge: &mut Judge<'_>) {
     for ((signal, _), soc) in beside(judge, Channel::ReportedSoc) {
         let difference = (soc - own_soc).abs();
         let [own_percent, percent] = [own_soc, soc].map(|soc| number((1000.0 * soc).round() / 10.0));
-        if difference <= SOC_DIFFERS {
+        if difference <= 0.03 {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
-        let severity = if difference > SOC_DISAGREES { Severity::Warning } else { Severity::Note };
+        // A dash that hides a reserve at both ends differs by less.
+        let severity = if difference > 0.1 { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))
             .seen(format!("the configured state of charge is {own_percent} %, the other one {percent} %"))
             .why("a dash may hide a reserve at both ends; otherwise one of them is not the state of charge")

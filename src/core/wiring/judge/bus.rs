@@ -10,14 +10,6 @@ use crate::wiring::observer::{BusStats, ProtectionStats};
 use crate::wiring::plan::MessagePlan;
 use crate::wiring::report::{Severity, Topic, WiringFinding};
 
-/// Error classes of linux/can/error.h.
-const CLASS_ACK: u32 = 0x20;
-const CLASS_BUS_OFF: u32 = 0x40;
-/// Share of error frames above which the wiring is suspect.
-const MANY_ERRORS: f64 = 0.01;
-/// Share of frames that may fail their check without a finding: some are lost at every start.
-const FAILING: f64 = 0.05;
-
 pub(super) fn check(judge: &mut Judge<'_>) {
     for index in 0..judge.plan.interfaces.len() {
         interface(judge, index);
@@ -102,13 +94,14 @@ fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
     let (name, classes) = (&bus.name, bus.error_classes);
     let share = bus.error_frames as f64 / (bus.frames + bus.error_frames) as f64;
     let hint = match classes {
-        _ if classes & CLASS_BUS_OFF != 0 => "the controller went bus-off",
-        _ if classes & CLASS_ACK != 0 => "no node acknowledged the sent frames",
+        // Error classes of linux/can/error.h.
+        _ if classes & 0x40 != 0 => "the controller went bus-off",
+        _ if classes & 0x20 != 0 => "no node acknowledged the sent frames",
         _ => "received bits were invalid",
     };
     let (severity, what, why) = if bus.frames == 0 {
         (Severity::Error, "only error frames: wrong bit rate?", ", and no valid frame was received")
-    } else if share > MANY_ERRORS {
+    } else if share > 0.01 {
         let why = "; frames are received, so the bit rate is right and the wiring is not";
         (Severity::Warning, "many error frames", why)
     } else {
@@ -204,7 +197,8 @@ fn protection(judge: &mut Judge<'_>) {
         let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
         let name = message.map_or("commands", |message| message.name.as_str());
         let all = stats.good + stats.bad;
-        if all == 0 || stats.bad as f64 <= FAILING * all as f64 {
+        // Some are lost at every start.
+        if all == 0 || stats.bad as f64 <= 0.05 * all as f64 {
             if stats.good > 0 {
                 judge.fine(format!("{name}: {} of {all} frames pass their end-to-end check", stats.good));
             }

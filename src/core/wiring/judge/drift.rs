@@ -6,8 +6,6 @@ use crate::wiring::evidence::response::SteadyRun;
 
 /// A drift is trusted from this many standard deviations.
 const SURE: f64 = 6.0;
-/// Smallest expected drift of all runs that is judged, V.
-const LEAST_V: f64 = 0.004;
 
 /// Voltage drift over all steady runs, per cell.
 #[derive(Debug, Clone, Copy)]
@@ -46,7 +44,7 @@ impl Drift {
     }
 
     pub(super) fn is_opposite(&self) -> bool {
-        (-6.0..-0.25).contains(&self.ratio) && self.sigma >= SURE && self.expected_v >= LEAST_V
+        (-6.0..-0.25).contains(&self.ratio) && self.sigma >= SURE && self.expected_v >= 0.004
     }
 
     pub(super) fn is_along(&self) -> bool {

@@ -11,12 +11,8 @@ use crate::wiring::report::{Severity, Topic, WiringFinding};
 
 /// Smallest step of the current that is judged, of the capacity.
 const SMALLEST_STEP: f64 = 0.02;
-/// A resistance this many times the model's is another unit, not another cell.
-const UNIT_RATIO: f64 = 6.0;
 /// A resistance this many times the model's is a finding.
 const ODD_RATIO: f64 = 2.5;
-/// The same where several strings are configured and fewer would explain it.
-const FEWER_STRINGS_RATIO: f64 = 2.0;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     if judge.observed.frames == 0 || judge.is_mixed_up {
@@ -116,9 +112,10 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     };
     let configured = judge.plan.pack.strings;
     let strings = likely_strings(configured, ohm, (fast, slow));
-    if ratio >= UNIT_RATIO {
+    // Another unit, not another cell.
+    if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
-    } else if ratio >= ODD_RATIO || ratio >= FEWER_STRINGS_RATIO && strings.is_some_and(|n| n < configured) {
+    } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
         let title = format!("resistance {} times {direction} than the cell model's", number(ratio));
         let finding = warning(judge, Topic::CellModel, title).seen(seen).why(why);
         if let Some(strings) = strings {

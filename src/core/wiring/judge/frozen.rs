@@ -9,12 +9,6 @@ use crate::wiring::report::Topic;
 
 /// Fewest readings to judge a signal by.
 const FEWEST_READINGS: u64 = 20;
-/// Fewest steps to judge a single cell by.
-const FEWEST_STEPS: usize = 4;
-/// Steps of a voltage above which equal cells say nothing, V: balanced cells differ by less.
-const COARSE_V: f64 = 0.005;
-/// Standard deviations from which two slopes differ.
-const SURE: f64 = 6.0;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     voltages(judge);
@@ -60,8 +54,6 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
 
 /// Cells with the voltage of another cell: by their bits, and by their values.
 pub(super) fn check_equal(judge: &mut Judge<'_>) {
-    /// Blocks in which cells must have moved: neighbours of coarse resolution agree for a while.
-    const FEWEST_BLOCKS: u32 = 25;
     let voltages = judge.signals(Kind::Voltage);
     let mut reported: Vec<Channel> = Vec::new();
     for (index, (signal, _)) in voltages.iter().enumerate() {
@@ -77,10 +69,11 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     }
     // Cells of coarse resolution agree without being one.
     let step_v = |(signal, _): &SignalSeries<'_>| (signal.layout.factor * signal.scale).abs() * judge.voltage_factor;
-    if voltages.iter().any(|voltage| step_v(voltage) > COARSE_V) {
+    if voltages.iter().any(|voltage| step_v(voltage) > 0.005) {
         return;
     }
-    let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(FEWEST_BLOCKS));
+    // Blocks in which cells must have moved: neighbours of coarse resolution agree for a while.
+    let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(25));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
         let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));
         let members: Vec<_> = voltages.iter().filter(is_member).collect();
@@ -105,8 +98,8 @@ pub(super) fn check_response(judge: &mut Judge<'_>) {
     let odd = (0..cells.min(judge.signals(Kind::Voltage).len())).filter_map(|cell| {
         let slope = judge.observed.slope_of(cell)?;
         let ratio = slope.ohm / common.ohm;
-        let is_sure = (slope.ohm - common.ohm).abs() > SURE * slope.std_ohm.max(common.std_ohm);
-        (is_sure && !(0.33..=3.0).contains(&ratio) && slope.points >= FEWEST_STEPS).then_some((cell + 1, ratio))
+        let is_sure = (slope.ohm - common.ohm).abs() > 6.0 * slope.std_ohm.max(common.std_ohm);
+        (is_sure && !(0.33..=3.0).contains(&ratio) && slope.points >= 4).then_some((cell + 1, ratio))
     });
     let odd: Vec<(usize, f64)> = odd.collect();
     if cells < 4 || odd.is_empty() || 4 * odd.len() > cells || judge.has(&[Topic::Cell, Topic::Frozen]) {

@@ -35,9 +35,6 @@ use super::plan::Kind;
 use super::report::{Topic, WiringFinding, WiringReport};
 use context::Judge;
 
-/// Seconds of frames below which periods and cells are not judged.
-const SHORT_S: f64 = 5.0;
-
 impl WiringObserver {
     /// Judges everything received.
     pub fn finish(mut self) -> WiringReport {
@@ -55,7 +52,7 @@ impl WiringObserver {
         beside::check(&mut judge);
         timing::check(&mut judge);
         let awake_s = self.awake_s;
-        if self.frames > 0 && awake_s < SHORT_S {
+        if self.frames > 0 && awake_s < 5.0 {
             let span = text::seconds(awake_s);
             judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));
         }

@@ -6,17 +6,6 @@ use crate::filter::median;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// A period this many times the DBC's is a finding.
-const SLOWER: f64 = 2.0;
-/// Periods the age limit must cover: a single lost frame is no fault.
-const MIN_PERIODS: f64 = 2.0;
-/// Proposed age limit in periods.
-const PROPOSED_PERIODS: f64 = 5.0;
-/// Share of missing frames that is a finding: single ones are lost on every bus.
-const LOST: f64 = 0.03;
-/// Share of gaps above the limit from which they are reported.
-const STALE_SHARE: f64 = 1e-3;
-
 pub(super) fn check(judge: &mut Judge<'_>) {
     for (kind, table, what) in [
         (Kind::Current, "limits.current", "pack current"),
@@ -37,7 +26,8 @@ fn lost(judge: &mut Judge<'_>) {
         let signals = judge.plan.signals.iter().zip(&judge.observed.series);
         let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
         let losses: Vec<(f64, f64)> = of_message.filter_map(|(_, series)| series.loss.share()).collect();
-        let Some(share) = median(losses.iter().map(|(share, _)| *share)).filter(|share| *share >= LOST) else {
+        // Single frames are lost on every bus.
+        let Some(share) = median(losses.iter().map(|(share, _)| *share)).filter(|share| *share >= 0.03) else {
             continue;
         };
         let cycle_s = losses.iter().map(|(_, cycle_s)| *cycle_s).fold(f64::INFINITY, f64::min);
@@ -65,14 +55,14 @@ fn slowest<'d>(all: &[SignalSeries<'d>]) -> Option<(SignalSeries<'d>, f64)> {
 fn stale(judge: &mut Judge<'_>, (table, what): (&str, &str), (signal, series): SignalSeries<'_>, period_s: f64) {
     let limit_s = judge.plan.max_age_s(signal.binding.channel);
     let share = series.stale_gaps as f64 / series.count().max(1) as f64;
-    let proposed_s = PROPOSED_PERIODS * period_s;
+    let proposed_s = 5.0 * period_s;
     let (severity, title, why, proposed_s) = if period_s > limit_s {
         let why = "a reading older than max_age_s is not used: estimates coast or stop";
         (Severity::Error, format!("{what} are stale before the next reading comes"), why, proposed_s)
-    } else if MIN_PERIODS * period_s > limit_s {
+    } else if 2.0 * period_s > limit_s {
         let why = "single frames are lost on every bus";
         (Severity::Warning, format!("{what}: one lost frame makes them stale"), why, proposed_s)
-    } else if series.stale_gaps > 0 && share > STALE_SHARE {
+    } else if series.stale_gaps > 0 && share > 1e-3 {
         let title = format!("{what} were stale {}", count(series.stale_gaps, "time"));
         let why = "the sender is uneven, or frames are lost on the way";
         (Severity::Warning, title, why, 1.5 * series.longest_gap_s)
@@ -101,7 +91,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let (span_s, awake_s) = (stats.last.since(stats.first), judge.observed.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
         let period_s = span_s / (stats.count.max(2) - 1) as f64;
-        if stats.count < 10 || period_s < SLOWER * cycle_s {
+        if stats.count < 10 || period_s < 2.0 * cycle_s {
             continue;
         }
         let (period, span, cycle) = (seconds(period_s), seconds(span_s), seconds(cycle_s));

@@ -17,8 +17,6 @@ const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
 /// Temperatures that a pack may have for a moment, on fire or in the cold, degrees C.
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// Temperatures above the plausible ones that a pack in danger may have, degrees C.
-const HOT_C: std::ops::Range<f64> = 60.0..90.0;
 /// Share of implausible readings that is more than a disturbance.
 const MANY: f64 = 0.01;
 
@@ -275,7 +273,8 @@ fn wrong_temperature(
             .change(&all[0].0.table, "signal", "a temperature");
         return;
     };
-    let (severity, hint) = match HOT_C.contains(&median_c) {
+    // A pack in danger may have these.
+    let (severity, hint) = match (60.0..90.0).contains(&median_c) {
         true => (Severity::Warning, "a pack this hot would be in danger"),
         false => (Severity::Error, "no pack has that"),
     };

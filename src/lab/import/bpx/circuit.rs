@@ -24,9 +24,6 @@ const SLOPE_STEP: f64 = 0.005;
 /// Least resistance, ohm, and least time constant, s: a flat potential gives none, a model must have one.
 const LEAST: f64 = 1e-7;
 
-/// Product `x (1 - x)` below which charge transfer is not extrapolated: at either end the exchange current vanishes.
-const LEAST_CONTENT: f64 = 1e-3;
-
 /// Resistances and time constants at one SOC and temperature.
 #[derive(Debug, Clone)]
 pub(super) struct Resistances {
@@ -98,7 +95,7 @@ fn surface_m2(electrode: &Electrode, area_m2: f64) -> f64 {
 }
 
 fn charge_transfer_ohm(electrode: &Electrode, area_m2: f64, content: f64, rate: f64, temperature_k: f64) -> f64 {
-    let exchange_a_per_m2 = FARADAY_C_PER_MOL * rate * (content * (1.0 - content)).max(LEAST_CONTENT).sqrt();
+    let exchange_a_per_m2 = FARADAY_C_PER_MOL * rate * (content * (1.0 - content)).max(1e-3).sqrt();
     GAS_J_PER_MOL_K * temperature_k / (FARADAY_C_PER_MOL * exchange_a_per_m2 * surface_m2(electrode, area_m2))
 }
 

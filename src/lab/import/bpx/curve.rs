@@ -9,23 +9,11 @@ use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};
 use crate::filter::bisect;
 
-/// SOC breakpoints come closer until a straight line between two is this close to the curve, V.
-const INTERPOLATION_V: f64 = 0.001;
-
-/// Most SOC breakpoints.
-const MAX_NODES: usize = 80;
-
-/// Closest SOC breakpoints.
-const CLOSEST_NODES: f64 = 1e-4;
-
 /// Least rise of the open-circuit voltage from one breakpoint to the next, V; one that falls is raised.
 const LEAST_RISE_V: f64 = 2e-5;
 
 /// Points between two breakpoints at which the interpolation is compared.
 const PROBES: usize = 15;
-
-/// Halvings of a search for a lithium content: to 1e-15.
-const HALVINGS: u32 = 50;
 
 /// Electrodes of a full and of an empty cell.
 #[derive(Debug, Clone, Copy)]
@@ -75,7 +63,8 @@ impl<'a> Curve<'a> {
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
-            let x = bisect((low, high), HALVINGS, |x| voltage_v(x) < cut_off_v).1;
+            // To 1e-15.
+            let x = bisect((low, high), 50, |x| voltage_v(x) < cut_off_v).1;
             let reached_v = voltage_v(x);
             let is_reached = (reached_v - cut_off_v).abs() < 1e-3;
             if !is_reached {
@@ -140,10 +129,10 @@ impl<'a> Curve<'a> {
     fn nodes(&self) -> Vec<f64> {
         let mut nodes: Vec<f64> = (0..=10).map(|k| f64::from(k) / 10.0).collect();
         let mut errors: Vec<f64> = nodes.windows(2).map(|ends| self.line_error_v(ends[0], ends[1])).collect();
-        while nodes.len() < MAX_NODES {
-            let can_be_halved = |k: &usize| nodes[k + 1] - nodes[*k] >= 2.0 * CLOSEST_NODES;
+        while nodes.len() < 80 {
+            let can_be_halved = |k: &usize| nodes[k + 1] - nodes[*k] >= 2.0 * 1e-4;
             let worst = (0..errors.len()).filter(can_be_halved).max_by(|a, b| errors[*a].total_cmp(&errors[*b]));
-            let Some(worst) = worst.filter(|worst| errors[*worst] > INTERPOLATION_V) else { break };
+            let Some(worst) = worst.filter(|worst| errors[*worst] > 0.001) else { break };
             let middle = 0.5 * (nodes[worst] + nodes[worst + 1]);
             errors[worst] = self.line_error_v(nodes[worst], middle);
             errors.insert(worst + 1, self.line_error_v(middle, nodes[worst + 1]));

@@ -7,9 +7,6 @@ use serde_json::{Map, Value};
 
 use super::function::{Function, found};
 
-/// Electrolyte concentration of a file that does not state it, mol/m3: 1 mol per litre, as in PyBaMM.
-const USUAL_CONCENTRATION: f64 = 1000.0;
-
 /// Reference temperature of a file that does not state it, K.
 const USUAL_TEMPERATURE_K: f64 = 298.15;
 
@@ -308,7 +305,8 @@ impl<'a> Section<'a> {
         let concentration = electrolyte
             .optional_number("Initial concentration [mol.m-3]", POSITIVE, faults)
             .or_else(|| initial.optional_number("Initial electrolyte concentration [mol.m-3]", POSITIVE, faults))
-            .unwrap_or(USUAL_CONCENTRATION);
+            // 1 mol per litre, as in PyBaMM.
+            .unwrap_or(1000.0);
         let [conductivity, diffusivity] = ["Conductivity [S.m-1]", "Diffusivity [m2.s-1]"]
             .map(|key| electrolyte.value_at(key, concentration, faults));
         Transport {

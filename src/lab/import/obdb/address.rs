@@ -11,14 +11,8 @@
 use super::document::AddressDocument;
 use crate::can::CanId;
 
-/// The tester's address on 29 bits if none is stated.
-const TESTER: u32 = 0xF1;
-/// Priority, first byte of the identifier, if none is stated.
-const PRIORITY: u32 = 0x18;
 /// `TT` of requests to one controller.
 const PHYSICAL: u32 = 0xDA;
-/// Distance of answers from requests at the identifiers that ISO 15765-4 fixes.
-const FIXED_DISTANCE: u32 = 8;
 
 /// Identifiers of one command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,7 +41,8 @@ fn standard(document: &AddressDocument) -> Result<Addresses, String> {
     let request = hexadecimal("hdr", &document.hdr)?;
     let response = match &document.rax {
         Some(rax) => hexadecimal("rax", rax)?,
-        None if (0x7E0..=0x7E7).contains(&request) => request + FIXED_DISTANCE,
+        // As ISO 15765-4 fixes it.
+        None if (0x7E0..=0x7E7).contains(&request) => request + 8,
         None => return Err(format!("hdr is {} without rax, must be 7E0 to 7E7 for that", document.hdr)),
     };
     let extension = match (byte("eax", document.eax.as_ref())?, byte("tst", document.tst.as_ref())?) {
@@ -65,8 +60,8 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
         return Err("eax with a hdr of 4 digits, must have 3".to_owned());
     }
     let middle = hexadecimal("hdr", &document.hdr)?;
-    let priority = byte("pri", document.pri.as_ref())?.map_or(PRIORITY, u32::from);
-    let tester = byte("tst", document.tst.as_ref())?.map_or(TESTER, u32::from);
+    let priority = byte("pri", document.pri.as_ref())?.map_or(0x18, u32::from);
+    let tester = byte("tst", document.tst.as_ref())?.map_or(0xF1, u32::from);
     let sender = match &document.rax {
         // Longer forms write more of the identifier; the last byte is the controller's address.
         Some(rax) => hexadecimal("rax", rax)? & 0xFF,

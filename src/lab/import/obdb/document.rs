@@ -130,28 +130,22 @@ impl std::fmt::Display for YearFilter {
     }
 }
 
-/// Fields of a file, a command, a signal and a format that are known and carry nothing for a decoder.
-const FILE_FIELDS: &[&str] = &["$schema", "signalGroups"];
-const COMMAND_FIELDS: &[&str] = &["tmo", "fcm1", "dbg", "dbgfilter", "dout"];
-const SIGNAL_FIELDS: &[&str] = &["name", "path", "description", "hidden", "suggestedMetric"];
-const FORMAT_FIELDS: &[&str] = &["omin", "omax", "oval"];
-
 impl SignalSetDocument {
     pub(super) fn unknown(&self) -> Vec<&str> {
-        unknown(&self.rest, FILE_FIELDS)
+        unknown(&self.rest, &["$schema", "signalGroups"])
     }
 }
 
 impl CommandDocument {
     pub(super) fn unknown(&self) -> Vec<&str> {
-        unknown(&self.rest, COMMAND_FIELDS)
+        unknown(&self.rest, &["tmo", "fcm1", "dbg", "dbgfilter", "dout"])
     }
 }
 
 impl SignalDocument {
     pub(super) fn unknown(&self) -> Vec<&str> {
-        let mut fields = unknown(&self.rest, SIGNAL_FIELDS);
-        fields.extend(unknown(&self.fmt.rest, FORMAT_FIELDS));
+        let mut fields = unknown(&self.rest, &["name", "path", "description", "hidden", "suggestedMetric"]);
+        fields.extend(unknown(&self.fmt.rest, &["omin", "omax", "oval"]));
         fields
     }
 }

@@ -13,8 +13,6 @@ use crate::import::{DiagnosticSignal, ExclusionReason};
 const MAX_LISTED_CODES: usize = 8;
 /// Bits of the longest ISO-TP message with a 12-bit length.
 const MAX_BITS: i64 = 4095 * 8;
-/// Tolerance of a limit, in codes: the file's decimals are rounded.
-const ROUNDING: f64 = 1e-6;
 
 /// Units of OBDb and ours. Numbers without a unit have an empty one.
 const UNITS: &[(&str, &str)] = &[
@@ -156,7 +154,8 @@ fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), Stri
     }
     signal.not_available = codes.unwrap_or_default();
     let (low, high) = signal.representable();
-    let room = ROUNDING * signal.factor.abs();
+    // The file's decimals are rounded.
+    let room = 1e-6 * signal.factor.abs();
     signal.range = (low < range.0 - room || high > range.1 + room).then_some(range);
     Ok(())
 }
