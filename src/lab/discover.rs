@@ -13,6 +13,7 @@ mod configuration;
 mod fields;
 pub(crate) mod groups;
 mod judge;
+mod log_signal;
 mod raw;
 mod signals;
 #[cfg(test)]
@@ -28,7 +29,8 @@ use crate::quantity::{BusIndex, Timestamp};
 use crate::wiring::evidence::PackQuantity;
 use capture::Capture;
 use configuration::Writer;
-use signals::{Descriptions, LogSignal};
+use log_signal::LogSignal;
+use signals::Descriptions;
 
 pub use configuration::{PackConfiguration, PackSettings};
 

@@ -7,8 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use super::capture::{AnswerKey, Capture};
-use super::fields::{self, MessageField};
-use super::signals::{Descriptions, LogSignal, SignalOrigin};
+use super::fields;
+use super::log_signal::{LogSignal, MessageField, SignalOrigin};
+use super::signals::Descriptions;
 use super::{Candidate, Discovery, PositiveDirection, raw};
 use crate::can::CanId;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};

@@ -12,7 +12,7 @@
 use std::collections::BTreeSet;
 
 use super::capture::{Capture, MessageKey, Payloads};
-use super::signals::{LogSignal, SignalOrigin, longest_run};
+use super::log_signal::{LogSignal, MessageField, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
@@ -31,14 +31,6 @@ const CELL_V: (f64, f64) = (2.5, 4.4);
 const MAX_SPREAD_V: f64 = 0.25;
 /// Bits of a cell voltage and V per code.
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
-
-/// A field of a message: its identifier, and the value of the first byte where that is a page.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct MessageField {
-    pub(super) id: CanId,
-    pub(super) page: Option<u8>,
-    pub(super) signal: Signal,
-}
 
 /// Name of a message without a DBC. Decimal: its digits are then one number.
 pub(super) fn message_name(id: CanId) -> String {

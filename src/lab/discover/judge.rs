@@ -5,8 +5,8 @@
 //! count 1 to 3 each, and behaviour that hardly anything else shows (voltage that falls with current, a sum of cells) 3 to 4.
 
 use super::groups::{SignalGroup, groups};
+use super::log_signal::{LogSignal, SignalOrigin};
 use super::raw;
-use super::signals::{LogSignal, SignalOrigin};
 use super::{Candidate, PositiveDirection};
 use crate::can::unit::Quantity;
 use crate::quantity::BusIndex;

@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 
 use super::capture::{AnswerKey, Answers};
-use super::signals::{LogSignal, SignalOrigin, longest_run};
+use super::log_signal::{LogSignal, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::unit::Quantity;
 use crate::import::{DiagnosticSignal, NumberRange};

@@ -2,76 +2,17 @@
 //! no definition describes.
 
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
-use super::fields::{self, MessageField};
-use super::raw;
+use super::log_signal::{LogSignal, SignalOrigin};
+use super::{fields, raw};
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::import::{DiagnosticSignal, DiagnosticTable};
-use crate::quantity::{BusIndex, Channel};
+use crate::quantity::Channel;
 use crate::wiring::evidence::{Series, SignalLabel};
 
 /// Fewest valid values of a signal; fewer are a coincidence.
 const MIN_VALUES: u64 = 2;
-
-/// Where a signal is described.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum SignalOrigin {
-    /// In a DBC file: its number.
-    Dbc(usize),
-    /// In a diagnostic answer that a definition describes: number of the table.
-    Defined(usize),
-    /// In an answer without a definition.
-    Raw(AnswerKey, Box<DiagnosticSignal>),
-    /// In a message without a DBC.
-    Field(Box<MessageField>),
-}
-
-/// A signal that is in the log.
-#[derive(Debug)]
-pub(super) struct LogSignal {
-    /// `Message.Signal`.
-    pub(super) name: String,
-    pub(super) bus: BusIndex,
-    pub(super) origin: SignalOrigin,
-    /// What its names and unit say.
-    pub(super) label: SignalLabel,
-    /// Values in V, A, degrees Celsius, per cent, or as they are.
-    pub(super) series: Series,
-    /// Its definition says unsigned, its values are of a signed number.
-    pub(super) is_read_signed: bool,
-    /// Factor and offset from the description's unit to V, A, degrees Celsius or per cent.
-    pub(super) conversion: (f64, f64),
-}
-
-impl LogSignal {
-    /// A field that no description names: places say nothing about a meaning.
-    pub(super) fn unnamed(
-        name: String,
-        bus: BusIndex,
-        origin: SignalOrigin,
-        quantity: Quantity,
-        series: Series,
-    ) -> Self {
-        let label = SignalLabel::unnamed(quantity);
-        Self { name, bus, origin, label, series, is_read_signed: false, conversion: (1.0, 0.0) }
-    }
-}
-
-/// The longest run of neighbours that go with the first of the run, of several the last; `None` ends a run.
-pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
-    let (mut best, mut run) = (Vec::new(), Vec::new());
-    for item in items.chain([None]) {
-        match item {
-            Some(item) if run.first().is_none_or(|first| goes_with(first, &item)) => run.push(item),
-            item => {
-                let ended = std::mem::replace(&mut run, item.into_iter().collect());
-                best = if ended.len() >= best.len() { ended } else { best };
-            }
-        }
-    }
-    best
-}
 
 /// Descriptions that the user gave.
 #[derive(Debug, Default)]
