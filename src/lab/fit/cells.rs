@@ -8,6 +8,7 @@
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
+use crate::filter::median;
 use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
@@ -28,8 +29,6 @@ const LEAST_CELLS: usize = 4;
 const SPREADS: f64 = 5.0;
 const OWN_DEVIATIONS: f64 = 3.0;
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
-/// A normal distribution's standard deviation relative to its median distance.
-const OF_MEDIAN: f64 = 1.4826;
 
 /// Distances of all cells from their mean over one stretch.
 #[derive(Debug, Clone, Default)]
@@ -253,24 +252,16 @@ struct Spread {
 }
 
 impl Spread {
-    fn of(values: impl Iterator<Item = f64>) -> Self {
-        let known: Vec<f64> = values.filter(|value| value.is_finite()).collect();
-        let centre = median(known.clone());
-        Self {
-            median: centre,
-            deviation: OF_MEDIAN * median(known.iter().map(|value| (value - centre).abs()).collect()),
-        }
+    fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
+        let centre = median(values.clone()).unwrap_or(f64::NAN);
+        let distance = median(values.map(|value| (value - centre).abs())).unwrap_or(f64::NAN);
+        // A normal distribution's standard deviation relative to its median distance.
+        Self { median: centre, deviation: 1.4826 * distance }
     }
 
     fn is_far(&self, value: f64, floor: f64) -> bool {
         (value - self.median).abs() > (SPREADS * self.deviation).max(floor)
     }
-}
-
-/// The middle value; NaN of none.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 //!
 //! In: the mean cell's stretches and fitted records, capacities (Ah). Out: notes.
 
+use crate::filter::median;
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
@@ -55,8 +56,8 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
             "no temperature in the logs, or one that never changes: the resistances follow it as those of usual cells";
         notes.push(what.to_owned());
     }
-    let interval_s =
-        median(parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0])).collect());
+    let intervals_s = parts.iter().flat_map(|part| part.time_s.windows(2).map(|pair| pair[1] - pair[0]));
+    let interval_s = median(intervals_s).unwrap_or(0.0);
     if interval_s > 3.0 {
         notes.push(format!(
             "readings every {interval_s:.0} s: the series resistance cannot be separated from the fastest branch"
@@ -84,10 +85,4 @@ fn step_v(parts: &[&MeasuredPart]) -> f64 {
     };
     let least_v = parts.iter().map(of_part).fold(f64::INFINITY, f64::min);
     if least_v.is_finite() { least_v } else { 0.0 }
-}
-
-/// The middle value; 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }

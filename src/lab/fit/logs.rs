@@ -21,6 +21,7 @@ use super::{
 };
 use crate::cell::{AgedOcv, CellModel};
 use crate::error::LabError;
+use crate::filter::median;
 use crate::ident::fit::{FitSettings, FittedTables, judge};
 use crate::ident::grid::{Grid, arrhenius};
 use crate::ident::parameters::ParameterTables;
@@ -363,12 +364,8 @@ fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
 
 /// A node per group of temperatures; stretches without a temperature have that of the surroundings.
 fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
-    let median = |stretch: &Stretch| {
-        let mut sorted = stretch.part.temperature_c.clone();
-        sorted.sort_by(f64::total_cmp);
-        sorted[sorted.len() / 2]
-    };
-    let mut medians: Vec<f64> = stretches.iter().map(median).collect();
+    let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
+    let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
     // Temperatures of stretches closer than this share a node, K.
     let groups = medians.chunk_by(|a, b| b - a < 5.0);

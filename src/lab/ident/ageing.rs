@@ -6,6 +6,7 @@
 //! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge have no known beginning and are left out.
 
 use super::{MeasuredPart, charge_ah};
+use crate::filter::median;
 
 /// SOC left at the cut-off under load when new.
 pub(crate) const SOC_LEFT: f64 = 0.045;
@@ -87,9 +88,7 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
 }
 
 fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
-    let mut sorted = cycle.current_a.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let loaded_a = LOADED_SHARE * sorted.get(sorted.len() / 2)?;
+    let loaded_a = LOADED_SHARE * median(cycle.current_a.iter().copied())?;
     let loaded: Vec<usize> = (0..cycle.time_s.len()).filter(|&k| cycle.current_a[k] > loaded_a).collect();
     let out_ah = charge_ah(&cycle.time_s, &cycle.current_a);
     let crossing = |level_v: f64| {

@@ -8,6 +8,7 @@ use super::pass::{NormalEquations, accumulate, residuals, visits};
 use super::prior::{Prior, PriorDeviations, per_node};
 use super::record::Record;
 use super::solve::{Space, minimise};
+use crate::filter::median;
 
 /// Number of groups of records. Groups are summed separately, then in order: the result does not depend on the number of
 /// cores.
@@ -223,8 +224,7 @@ fn resistance_of_steps(records: &[Record]) -> Option<f64> {
             }
         }
     }
-    found.sort_by(f64::total_cmp);
-    found.get(found.len() / 2).copied()
+    median(found.into_iter())
 }
 
 pub(super) fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {

@@ -7,6 +7,7 @@
 use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
+use crate::filter::median;
 
 /// Ranges of credible values: J/K, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
@@ -35,14 +36,12 @@ pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Resu
 
 fn medians(records: &[Record], tables: &ParameterTables) -> Option<Thermal> {
     let fitted = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
-    let (mut capacities, mut resistances): (Vec<f64>, Vec<f64>) =
+    let (capacities, resistances): (Vec<f64>, Vec<f64>) =
         fitted.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
-    Some(Thermal { heat_capacity_j_per_k: median(&mut capacities)?, resistance_k_per_w: median(&mut resistances)? })
-}
-
-fn median(values: &mut [f64]) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
+    Some(Thermal {
+        heat_capacity_j_per_k: median(capacities.into_iter())?,
+        resistance_k_per_w: median(resistances.into_iter())?,
+    })
 }
 
 /// T - T0 = heat / C + (-above) / (R C): normal equations of two unknowns.
