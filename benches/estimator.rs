@@ -3,7 +3,7 @@
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;
 use packwatch_host::cell::{CellEstimator, CellModel};
-use packwatch_host::monitor::{Input, Monitor, Outputs};
+use packwatch_host::monitor::{Monitor, Outputs, Record};
 use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 mod common;
@@ -47,9 +47,9 @@ fn round_of_96_cells(bencher: divan::Bencher) {
     bencher.counter(divan::counter::ItemsCount::new(96_u32)).bench_local(|| {
         time = time.plus_secs(0.1);
         for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut out);
+            monitor.handle(&Record::frame(time, *bus, frame), &mut out);
         }
-        monitor.handle(Input::Tick { time }, &mut out);
+        monitor.handle(&Record::tick(time), &mut out);
         divan::black_box(&out);
         out.clear();
     });

@@ -16,7 +16,8 @@ use packwatch_host::can::decode::{Binding, InputMap};
 use packwatch_host::can::encode::InputEncoder;
 use packwatch_host::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
 use packwatch_host::io::csv_log::CsvOptions;
-use packwatch_host::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch_host::io::log::{Batch, LogOptions, LogSource};
+use packwatch_host::monitor::RecordKind;
 use packwatch_host::quantity::{BusIndex, CellIndex, Channel};
 use tempfile::NamedTempFile;
 
@@ -126,7 +127,7 @@ fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let mut batch = Batch::new(Batch::MAX);
     while source.next_batch(&mut batch).expect("a log without faults") {
         for record in batch.records() {
-            let Record::Frame { bus, frame, .. } = record else { panic!("frames alone") };
+            let RecordKind::Frame { bus, frame } = &record.kind else { panic!("frames alone") };
             take(*bus, frame);
         }
     }

@@ -8,7 +8,8 @@ use packwatch_host::can::dbc::Database;
 use packwatch_host::can::decode::{Binding, InputMap};
 use packwatch_host::io::candump::{Line, parse_line};
 use packwatch_host::io::csv_log::CsvOptions;
-use packwatch_host::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch_host::io::log::{Batch, LogOptions, LogSource};
+use packwatch_host::monitor::{Record, RecordKind};
 use packwatch_host::quantity::{BusIndex, CellIndex, Channel, Reading, SensorIndex};
 
 fn main() {
@@ -113,7 +114,7 @@ fn parse_and_decode(bencher: Bencher) {
     let map = three_signals();
     batches(bencher, |records| {
         for record in records {
-            if let Record::Frame { bus, frame, .. } = record {
+            if let RecordKind::Frame { bus, frame } = &record.kind {
                 let mut sum = 0.0;
                 map.decode(*bus, frame, |reading| sum += value(reading));
                 divan::black_box(sum);

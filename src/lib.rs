@@ -14,7 +14,7 @@
 //! | | [`health`] | charge/discharge transitions, capacity, recharge period, usable capacity, remaining life |
 //! | | [`cell_faults`] | each cell against its pack: leaks, contacts, weak cells, channels |
 //! | | [`alarm`] | alarm rules over named values, debounce, hysteresis, latch |
-//! | | [`monitor`] | wires the stages above: `Input` in, `Outputs` out, snapshot and restore |
+//! | | [`monitor`] | wires the stages above: `Record` in, `Outputs` out, snapshot and restore |
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
 //! | | [`wiring`] | what signals show of themselves (`evidence`); judges wiring and configuration from the frames of a bus |
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
@@ -40,25 +40,25 @@
 //!
 //! | change | file |
 //! | --- | --- |
-//! | a new alarm rule | `core/alarm/rule.rs` (its table row); values that follow from inputs come from `core/monitor/watch.rs`, learned ones from `core/monitor/learning.rs`, those of a cell against its pack from `core/monitor/diagnosing.rs` |
+//! | a new alarm rule | `core/alarm/rule.rs` (its table row); values that follow from inputs come from `core/monitor/stages/watch.rs`, learned ones from `core/monitor/stage/learning.rs`, those of a cell against its pack from `core/monitor/stage/findings.rs` |
 //! | debounce, hysteresis, latch of an alarm | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
-//! | a new event | `core/monitor/event.rs` |
+//! | a new event | `core/monitor/message/event.rs` |
 //! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
-//! | which alarm is sent when, how often it is repeated | `core/monitor/alarm_queue.rs`; the promise to receivers: `/docs/src/ecu/contract.md` |
+//! | which alarm is sent when, how often it is repeated | `core/monitor/stage/sending/alarm_queue.rs`; the promise to receivers: `/docs/src/ecu/contract.md` |
 //! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/schema/keys/choices.rs` |
-//! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/command_gate.rs`; `host/io/can_key.rs` |
+//! | authentication: layout and freshness; which commands are executed; the key | `core/can/secoc.rs`, `core/can/secoc/window.rs`; `core/monitor/stage/intake/command_gate.rs`; `host/io/can_key.rs` |
 //! | a second sender of a message; frames with our own identifiers; a frozen current | `core/can/rate.rs`; `core/can/own_frames.rs`; `core/sample/frozen.rs` |
 //! | what a number can be at most, at every door | `core/quantity/bounds.rs` |
 //! | ISO-TP; what is read of a diagnostic answer; what is asked, and when not | `core/can/isotp.rs`; `core/can/uds.rs`; `core/can/poll.rs` |
-//! | when the buses sleep | `core/monitor/sleep.rs` |
+//! | when the buses sleep | `core/monitor/stage/sleep.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
-//! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/modelling.rs` (when); on another thread: `host/service/live.rs` |
-//! | what a fault of one cell looks like; from when on it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/fault.rs` |
+//! | how a model is learned on board | `core/cell/own_model/fit.rs` (fit), `core/monitor/stage/modelling.rs` (when); on another thread: `host/service/live.rs` |
+//! | what a fault of one cell looks like; from when on it is reported | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs`; `core/cell_faults/finding.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
-//! | what is kept of exchanged packs | `core/monitor/pack_memory.rs` |
-//! | what a stored state holds | `core/monitor/snapshot.rs`; only where the same clock continues: `core/monitor/continuation.rs` |
+//! | what is kept of exchanged packs | `core/monitor/stages/pack_memory.rs` |
+//! | what a stored state holds | the stage's state, `core/monitor/snapshot.rs`; how it is restored: `core/monitor/lifecycle/restore.rs` |
 //! | a configuration key | its table in `host/config/schema/keys/` (`pack`, `input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
 //! | how drop-ins are found and merged | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | what identifies the vehicle | `host/config/result/vehicle.rs` |
@@ -70,7 +70,7 @@
 //! | a history table or column | `host/store/rows.rs`; tables of packs, moments and segments: `host/store/database.rs` |
 //! | the files of the stored state; when a checkpoint is due | `host/store/state_files.rs`; `host/store/checkpoint.rs` |
 //! | how the history is verified, and how long it is kept | `host/store/segments.rs` |
-//! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/relearn.rs` |
+//! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/lifecycle/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
 //! | segments of a recording | `host/io/segments.rs` |

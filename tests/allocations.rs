@@ -10,9 +10,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use packwatch::config;
 use packwatch::io::candump::{Line, parse_line};
 use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{LogOptions, LogSource, Record};
+use packwatch::io::log::{LogOptions, LogSource};
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
@@ -89,7 +89,7 @@ fn next(source: &mut LogSource) -> Option<Record> {
 
 /// Has the log reached its steady part?
 fn is_warm(record: &Record, first: &Record) -> bool {
-    record.time().since(first.time()) >= WARM_S
+    record.time.since(first.time) >= WARM_S
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn a_frame_read_from_a_log_allocates_nothing() {
     without_allocating("reading a log", || {
         // The last frames are left: what is done at the end of a file is done once.
         while frames < MIN_FRAMES {
-            frames += u64::from(matches!(next(&mut source), Some(Record::Frame { .. })));
+            frames += u64::from(matches!(next(&mut source), Some(Record { kind: RecordKind::Frame { .. }, .. })));
         }
     });
 }
@@ -148,15 +148,15 @@ impl Core {
     }
 
     fn feed(&mut self, record: &Record) {
-        self.ticks.advance(record.time());
+        self.ticks.advance(record.time);
         while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-            self.handle(Input::Tick { time });
+            self.handle(&Record::tick(time));
         }
-        self.handle(record.input().expect("a frame"));
+        self.handle(record);
     }
 
-    fn handle(&mut self, input: Input<'_>) {
-        self.monitor.handle(input, &mut self.out);
+    fn handle(&mut self, record: &Record) {
+        self.monitor.handle(record, &mut self.out);
         self.sent += self.out.frames.len();
         self.events += self.out.events.len();
         self.out.clear();

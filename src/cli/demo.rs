@@ -17,7 +17,7 @@ use crate::can::encode::InputEncoder;
 use crate::config::{self, Config, ConfigFiles};
 use crate::io::candump::{self, StampDigits};
 use crate::io::ticks::Ticks;
-use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
+use crate::monitor::{EventKind, Monitor, Outputs, Record, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use consumer::Consumer;
@@ -159,9 +159,9 @@ impl Demo {
     fn feed(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.ticks.advance(time);
         while let Some(tick) = self.ticks.pop(self.monitor.next_due()) {
-            self.monitor.handle(Input::Tick { time: tick }, &mut self.out);
+            self.monitor.handle(&Record::tick(tick), &mut self.out);
         }
-        self.monitor.handle(Input::Frame { time, bus, frame }, &mut self.out);
+        self.monitor.handle(&Record::frame(time, bus, frame), &mut self.out);
         self.frames_in += 1;
         self.collect();
     }

@@ -13,10 +13,11 @@ use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config;
 use crate::io::csv_log::CsvOptions;
-use crate::io::log::{LogOptions, LogSource, Record};
+use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::discover::{Candidate, Discoverer, Discovery, PackSettings, PositiveDirection};
 use crate::lab::import::obdb::ObdbSettings;
+use crate::monitor::RecordKind;
 use crate::replay::ReplayProgress;
 use crate::wiring::evidence::PackQuantity;
 use packwatch_host::failure::Failure;
@@ -152,8 +153,8 @@ fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure
     let bar = Bar::new(std::slice::from_ref(&args.log));
     let mut records = 0_u64;
     while let Some(record) = source.next_record().map_err(failure)? {
-        if let Record::Frame { time, bus, frame } = &record {
-            discoverer.handle(*time, *bus, frame);
+        if let RecordKind::Frame { bus, frame } = &record.kind {
+            discoverer.handle(record.time, *bus, frame);
         }
         records += 1;
         if records.is_multiple_of(4096) {

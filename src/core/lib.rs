@@ -3,39 +3,41 @@
 //! authenticators, and passes the outcome in. The crate has no dependency that could do otherwise.
 //!
 //! # Data path
-//! [`monitor::Monitor`] takes every input. One file under `monitor/` is one stage; `stages.rs` alone knows their order.
+//! [`monitor::Monitor`] handles every record. Data flows one way: `monitor/message` (records in, events, estimates and frames out) knows no stage; one file under
+//! `monitor/stage` is one stage and knows none that comes after it; `monitor/stages.rs` alone knows their order; `monitor/lifecycle` restores,
+//! reconfigures and restarts them.
 //!
 //! | stage | in → out | file | algorithms |
 //! | --- | --- | --- | --- |
-//! | intake | frame → readings, command | `monitor/intake.rs` | [`can`]: flood limit, protection, decoding |
-//! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
-//! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
-//! | modelling | steps of the cells, rests → the cells' own model | `monitor/modelling.rs` | [`cell`]: notebook, own model |
-//! | diagnosing | cell samples, estimates → findings, values of the rules about a cell against its pack | `monitor/diagnosing.rs` | [`cell_faults`]: each cell against its pack |
-//! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
-//! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
-//! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/alarm_queue.rs`, `monitor/digest.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
+//! | intake | frame → readings, command | `monitor/stage/intake.rs` | [`can`]: flood limit, protection, decoding |
+//! | sampling | reading → cell sample | `monitor/stage/sampling.rs` | [`sample`]: limits, ages, charge |
+//! | estimation | cell samples → estimates | `monitor/stage/estimation/batch.rs`, `monitor/stage/estimation.rs` | [`cell`], [`filter`] |
+//! | modelling | steps of the cells, rests → the cells' own model | `monitor/stage/modelling.rs` | [`cell`]: notebook, own model |
+//! | findings | cell samples, estimates → findings, values of the rules about a cell against its pack | `monitor/stage/findings.rs` | [`cell_faults`]: each cell against its pack |
+//! | learning | pack current, estimates → health values | `monitor/stage/learning.rs`, `monitor/stage/learning/life.rs` | [`health`] |
+//! | alarming | values → changes of alarms | `monitor/stages/watch.rs`, `monitor/stage/alarming.rs` | [`alarm`] |
+//! | sending | alarms, values → frames | `monitor/stage/sending.rs`, `monitor/stage/sending/alarm_queue.rs`, `monitor/stage/sending/digest.rs`, `monitor/stage/sending/j1939.rs` | [`can`]: encoding, J1939 |
 //!
 //! # Where a change belongs
 //! | change | file |
 //! | --- | --- |
-//! | a new alarm rule | `alarm/rule.rs` (number, unit, direction), `monitor/watch.rs` (its value) |
+//! | a new alarm rule | `alarm/rule.rs` (number, unit, direction), `monitor/stages/watch.rs` (its value) |
 //! | a transition or command of an alarm | `alarm/machine.rs` (table), `alarm/engine.rs` |
-//! | a new event, or a field of one | `monitor/event.rs` |
-//! | a new field of the live view | `monitor/view.rs` |
+//! | a new event, or a field of one | `monitor/message/event.rs` |
+//! | a new field of the live view | `monitor/message/view.rs` (type), `monitor/view.rs` |
 //! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
-//! | what is begun with when only a history is left | `monitor/relearn.rs` |
-//! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
-//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/digest.rs`; of the reply `can/encode/reply.rs` |
-//! | which alarm is sent when, and how often | `monitor/alarm_queue.rs` |
+//! | what is begun with when only a history is left | `monitor/lifecycle/relearn.rs` |
+//! | a setting that may change while running | `monitor/config.rs`, `monitor/lifecycle/reconfigure.rs` |
+//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value); of the digest `can/encode/digest.rs`, `monitor/stage/sending/digest.rs`; of the reply `can/encode/reply.rs` |
+//! | which alarm is sent when, and how often | `monitor/stage/sending/alarm_queue.rs` |
 //! | another end-to-end profile | `can/e2e.rs` |
-//! | authentication of frames; which commands are executed | `can/secoc.rs`; `monitor/command_gate.rs` |
-//! | what is kept of exchanged packs | `monitor/pack_memory.rs` |
+//! | authentication of frames; which commands are executed | `can/secoc.rs`; `monitor/stage/intake/command_gate.rs` |
+//! | what is kept of exchanged packs | `monitor/stages/pack_memory.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs`; of the current by the voltages: `sample/frozen.rs` |
 //! | what counts as a second sender | `can/rate.rs`, `can/own_frames.rs` |
 //! | a physical bound | `quantity/bounds.rs` |
 //! | how a cell ages, a half-cell potential | `cell/aged_ocv.rs`, `cell/electrodes.rs` |
-//! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/modelling.rs` |
+//! | what is noted for a model; how it is fitted on board; when it is used | `cell/notebook.rs`; `cell/own_model/fit.rs`; `monitor/stage/modelling.rs` |
 //! | a chemistry on the label | `cell/chemistry.rs` |
 //! | a kind of finding | `cell_faults/fault.rs` (kind, limit), `cell_faults/detector.rs` (its judgement) |
 //! | what a cell has lost | `cell/loss_modes.rs` |

@@ -20,10 +20,10 @@ mod summary;
 use super::store::Recorder;
 use crate::can::Frame;
 use crate::io::event_log;
-use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
+use crate::io::log::{Batch, LogCounts, LogError, LogSource};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Downtime, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{Downtime, Monitor, Outputs, Record, RecordKind, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
@@ -92,7 +92,7 @@ impl ReplaySettings {
 }
 
 /// Called with each input and its outputs.
-pub type OutputWatch = Box<dyn FnMut(&Input<'_>, &Outputs)>;
+pub type OutputWatch = Box<dyn FnMut(&Record, &Outputs)>;
 
 /// Called with outputs before they are emptied.
 pub type OutputSink = Box<dyn FnMut(&Outputs)>;
@@ -194,16 +194,16 @@ pub fn play(
         (RecordSpan::new(settings.sleep_gap_s), Pace::new(settings.speed), TimeWindow::new(settings));
     let mut sent = 0;
     while let Some(record) = source.next_record()? {
-        match window.judge(record.time()) {
+        match window.judge(record.time) {
             WindowPosition::Before => continue,
             WindowPosition::After => break,
             WindowPosition::Inside => {}
         }
-        if span.advance(record.time()) || matches!(record, Record::UnknownGap { .. }) {
+        if span.advance(record.time) || record.is_unknown_gap() {
             pace.rebase();
         }
-        if let Record::Frame { time, bus, frame } = &record {
-            pace.wait(*time);
+        if let RecordKind::Frame { bus, frame } = &record.kind {
+            pace.wait(record.time);
             send(*bus, frame)?;
             sent += 1;
             report(progress(source, sent, &span));
@@ -264,13 +264,13 @@ impl Replay {
     /// Records in a row; `false` when the rest of the log is not wanted.
     fn take_batch(&mut self, batch: &Batch) -> Result<bool, ReplayError> {
         for record in batch.records() {
-            if let Record::Frame { time, bus, frame } = record
+            if matches!(record.kind, RecordKind::Frame { .. })
                 && self.is_simple
                 && !batch.carries_ticks()
-                && self.ticks.advance_within(*time, self.monitor.next_due())
+                && self.ticks.advance_within(record.time, self.monitor.next_due())
             {
-                self.span.advance(*time);
-                self.monitor.handle(Input::Frame { time: *time, bus: *bus, frame }, &mut self.out);
+                self.span.advance(record.time);
+                self.monitor.handle(record, &mut self.out);
                 if !self.out.is_empty() {
                     self.write_out()?;
                 }
@@ -283,7 +283,7 @@ impl Replay {
 
     /// One record; `false` when the rest of the log is not wanted.
     fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
-        let time = record.time();
+        let time = record.time;
         match self.window.judge(time) {
             WindowPosition::Before => {
                 self.summary.skipped_records += 1;
@@ -295,7 +295,7 @@ impl Replay {
         if self.span.first.is_none() {
             self.begin(record)?;
         }
-        let unknown_gap = matches!(record, Record::UnknownGap { .. });
+        let unknown_gap = record.is_unknown_gap();
         if self.span.advance(time) || unknown_gap {
             self.pace.rebase();
         }
@@ -305,11 +305,10 @@ impl Replay {
             self.ticks.advance(time);
         }
         self.make_ticks()?;
-        if let Record::Reload { time } = record {
-            self.note_reload(*time);
-        }
-        if let Some(input) = record.input() {
-            self.feed(input)?;
+        match record.kind {
+            RecordKind::Reload => self.note_reload(time),
+            RecordKind::Restore { .. } => {}
+            _ => self.feed(record)?,
         }
         Ok(true)
     }
@@ -326,12 +325,9 @@ impl Replay {
 
     /// The first record of all.
     fn begin(&mut self, record: &Record) -> Result<(), ReplayError> {
-        let first = self.window.first.unwrap_or(record.time());
+        let first = self.window.first.unwrap_or(record.time);
         self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
-        let recorded = match record {
-            Record::Restore { away, .. } => Some(*away),
-            _ => None,
-        };
+        let recorded = if let RecordKind::Restore { away } = record.kind { Some(away) } else { None };
         match (self.settings.restore.take(), recorded) {
             (Some(snapshot), recorded) => {
                 self.steps_before = None;
@@ -349,26 +345,26 @@ impl Replay {
     fn make_ticks(&mut self) -> Result<(), ReplayError> {
         while self.ticks.is_pending() {
             if let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-                self.feed(Input::Tick { time })?;
+                self.feed(&Record::tick(time))?;
             }
         }
         Ok(())
     }
 
-    fn feed(&mut self, input: Input<'_>) -> Result<(), ReplayError> {
-        if self.snapshot_at.is_some_and(|at| input.time() > at) {
+    fn feed(&mut self, record: &Record) -> Result<(), ReplayError> {
+        if self.snapshot_at.is_some_and(|at| record.time > at) {
             self.snapshot_at = None;
             self.snapshot = Some(self.monitor.snapshot());
         }
-        self.pace.wait(input.time());
-        self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
-        self.monitor.handle(input, &mut self.out);
+        self.pace.wait(record.time);
+        self.summary.ticks += u64::from(matches!(record.kind, RecordKind::Tick));
+        self.monitor.handle(record, &mut self.out);
         self.steps_before.get_or_insert_with(|| cell_steps(&self.monitor));
         if let Some(store) = &mut self.settings.store {
-            store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
+            store.record(&self.out.events, &self.monitor, record.time).map_err(ReplayError::Store)?;
         }
         if let Some(watch) = &mut self.sinks.watch {
-            watch(&input, &self.out);
+            watch(record, &self.out);
         }
         self.write_out()?;
         Ok(())

@@ -30,11 +30,10 @@ use crate::config::{Config, VehicleIdentity};
 use crate::io::can_key::CanKey;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
-use crate::io::record::Record;
 use crate::io::segments::SegmentLimits;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
 use crate::io::stop::Stop;
-use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
+use crate::monitor::{Downtime, Record, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
 use engine::Engine;
@@ -140,7 +139,7 @@ impl Service {
         engine.links = outputs;
         drop(sender);
         // The first input is the time of the start; frames it sends wait for the interfaces.
-        engine.handle(&Input::Tick { time: clock.now() });
+        engine.handle(&Record::tick(clock.now()));
         engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
         let mut service = ServiceLoop {

@@ -15,10 +15,10 @@ use nix::errno::Errno;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
-use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
+use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
 use crate::io::socket::PassiveSocket;
 use crate::io::stop::Stop;
-use crate::monitor::{BusEvent, Input, Monitor, Outputs};
+use crate::monitor::{BusEvent, Monitor, Outputs, Record, RecordKind};
 use crate::quantity::BusIndex;
 use crate::wiring::{WiringObserver, WiringReport};
 
@@ -80,17 +80,16 @@ impl Session {
     }
 
     fn feed(&mut self, record: &Record) {
-        let Some(input) = record.input() else { return };
-        let bus = match input {
-            Input::Frame { time, bus, frame } | Input::SecuredFrame { time, bus, frame, .. } => {
-                self.observer.handle_frame(time, bus, frame);
-                Some(bus)
+        let bus = match &record.kind {
+            RecordKind::Frame { bus, frame } | RecordKind::SecuredFrame { bus, frame, .. } => {
+                self.observer.handle_frame(record.time, *bus, frame);
+                Some(*bus)
             }
-            Input::Bus { bus, event, .. } => {
-                self.observer.handle_bus(bus, event);
-                Some(bus)
+            RecordKind::Bus { bus, event } => {
+                self.observer.handle_bus(*bus, *event);
+                Some(*bus)
             }
-            Input::UnknownGap { .. } => {
+            RecordKind::UnknownGap => {
                 self.observer.handle_gap();
                 None
             }
@@ -100,7 +99,7 @@ impl Session {
             return;
         }
         if let Some(monitor) = &mut self.monitor {
-            monitor.handle(input, &mut self.out);
+            monitor.handle(record, &mut self.out);
             self.forward_estimates();
         }
     }
@@ -158,8 +157,7 @@ pub fn replay(
         known = source.interfaces().len();
         session.feed(&record);
         records += 1;
-        let is_over = limit_s.is_some_and(|limit_s| session.observer.seconds() >= limit_s)
-            && !matches!(record, Record::UnknownGap { .. });
+        let is_over = limit_s.is_some_and(|limit_s| session.observer.seconds() >= limit_s) && !record.is_unknown_gap();
         if is_over || interrupt.is_set() {
             break;
         }
@@ -207,7 +205,7 @@ pub fn listen(
             listener.look(clock, &mut session)?;
             listener.read(&mut received, &mut session);
         }
-        received.sort_by_key(Record::time);
+        received.sort_by_key(|record| record.time);
         received.drain(..).for_each(|record| session.feed(&record));
         each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
         // A full bus brings 80 frames in that time, the kernel keeps thousands.

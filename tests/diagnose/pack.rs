@@ -9,7 +9,7 @@ use packwatch::cell_faults::fault::{CHANNEL_V, OFFSET_PER_H};
 use packwatch::cell_faults::{CellFault, CellFaultKind};
 use packwatch::config;
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Timestamp};
 use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Settings, Simulation, Spread, Wiring};
 
@@ -225,10 +225,10 @@ impl Case {
             frames.sort_by_key(|(_, frame)| frame.id().raw());
             ticks.advance(moment.time);
             while let Some(time) = ticks.pop(monitor.next_due()) {
-                monitor.handle(Input::Tick { time }, &mut out);
+                monitor.handle(&Record::tick(time), &mut out);
             }
             for (bus, frame) in &frames {
-                monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+                monitor.handle(&Record::frame(moment.time, *bus, frame), &mut out);
             }
             out.clear();
             if moment.current_a > least_a {

@@ -11,7 +11,7 @@ use packwatch::can::signal::SignalPlan;
 use packwatch::cell::circuit::{soc_after, terminal_v};
 use packwatch::config::{self, ConfigFiles};
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{EventKind, Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -86,10 +86,10 @@ fn day(config: MonitorConfig, rule: Rule, mut second: impl FnMut(&MonitorConfig,
         let time = Timestamp::from_secs(t);
         ticks.advance(time);
         while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
+            monitor.handle(&Record::tick(time), &mut out);
         }
         for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut out);
+            monitor.handle(&Record::frame(time, *bus, frame), &mut out);
         }
         day.take(rule, &reader, &out);
         out.clear();

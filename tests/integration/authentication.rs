@@ -6,7 +6,7 @@ mod ecu;
 use packwatch::can::secoc::{Authentication, Profile};
 use packwatch::can::{CanId, Frame};
 use packwatch::io::can_key::CanKey;
-use packwatch::monitor::{Downtime, EventKind, Input, Monitor, Outputs};
+use packwatch::monitor::{Downtime, EventKind, Monitor, Outputs, Record};
 use packwatch::quantity::{BusIndex, Timestamp};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -240,10 +240,10 @@ fn a_journal_gives_the_live_run_byte_for_byte_without_the_key() {
     for (ms, frame) in daemon.journal.take().unwrap() {
         let time = Timestamp::from_nanos(ms * 1_000_000);
         match &frame {
-            None => replay.handle(Input::Tick { time }, &mut out),
+            None => replay.handle(&Record::tick(time), &mut out),
             Some((frame, freshness)) => {
-                let input = Input::SecuredFrame { time, bus: BusIndex(0), frame, freshness: *freshness };
-                replay.handle(input, &mut out);
+                let input = Record::secured_frame(time, BusIndex(0), frame, *freshness);
+                replay.handle(&input, &mut out);
             }
         }
     }
@@ -276,7 +276,7 @@ fn a_frame_whose_authenticator_nobody_checked_is_not_executed() {
     daemon.sent.iter().for_each(|frame| ecu.hear(frame));
     let (frame, mut out) = (ecu.command(3, 2047).unwrap(), Outputs::default());
     let time = Timestamp::from_nanos(daemon.ms * 1_000_000);
-    daemon.monitor.handle(Input::Frame { time, bus: BusIndex(0), frame: &frame }, &mut out);
+    daemon.monitor.handle(&Record::frame(time, BusIndex(0), &frame), &mut out);
     assert_eq!((daemon.counts().forged, daemon.counts().authentic), (1, 0));
 }
 

@@ -2,7 +2,7 @@
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Downtime, Event, EventKind, Input, Validity};
+use packwatch::monitor::{Downtime, Event, EventKind, Record, Validity};
 use packwatch::quantity::BusIndex;
 
 use crate::support::config_texts;
@@ -71,7 +71,7 @@ fn bits_of_a_bms_that_balances_at_night_wake_no_bus() {
     for _ in 0..60 {
         rig.seconds(60);
         let (time, frame) = (rig.now(), Frame::classic(CanId::Standard(288), &[0b10]).unwrap());
-        rig.give(Input::Frame { time, bus: BusIndex(0), frame: &frame });
+        rig.give(Record::frame(time, BusIndex(0), &frame));
     }
     assert!(rig.monitor.asleep_since().is_some());
     let kinds: Vec<_> = rig.events.iter().map(|event| event.kind).collect();

@@ -9,7 +9,9 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::cell_faults::difference::LEAK;
 use packwatch::cell_faults::{BalancingConfig, CellFault, CellFaultKind};
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Command, Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{
+    Command, Downtime, Event, EventKind, Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS,
+};
 use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
@@ -172,10 +174,10 @@ impl FaultyPack {
             self.encoder.encode(self.sim.readings(), &mut frames);
             self.ticks.advance(moment.time);
             while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-                self.monitor.handle(Input::Tick { time }, &mut out);
+                self.monitor.handle(&Record::tick(time), &mut out);
             }
             for (bus, frame) in &frames {
-                self.monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+                self.monitor.handle(&Record::frame(moment.time, *bus, frame), &mut out);
             }
             self.events.append(&mut out.events);
             out.clear();
@@ -277,7 +279,7 @@ fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_ne
     assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Suppressed);
     assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Active);
     let mut out = Outputs::default();
-    pack.monitor.handle(Input::Command { time: pack.monitor.now(), command: Command::PackReplaced }, &mut out);
+    pack.monitor.handle(&Record::command(pack.monitor.now(), Command::PackReplaced), &mut out);
     assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Unknown);
     assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Suppressed, "until the first row of the new pack");
 }

@@ -14,7 +14,7 @@ use packwatch::can::dbc::Database;
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::Config;
-use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Monitor, Outputs, Snapshot};
+use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Monitor, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -165,8 +165,8 @@ impl<'a> Daemon<'a> {
         Timestamp::from_nanos(self.now_ms * 1_000_000)
     }
 
-    fn give(&mut self, input: Input<'_>) {
-        self.monitor.handle(input, &mut self.out);
+    fn give(&mut self, record: Record) {
+        self.monitor.handle(&record, &mut self.out);
         for sent in &self.out.frames {
             if let Some(listener) = &mut self.listener
                 && !self.random.random_bool(LOSS)
@@ -192,7 +192,7 @@ impl<'a> Daemon<'a> {
             }
             let time = self.now();
             if self.monitor.next_due().is_none_or(|due| due <= time) {
-                self.give(Input::Tick { time });
+                self.give(Record::tick(time));
             }
         }
     }
@@ -208,7 +208,7 @@ impl<'a> Daemon<'a> {
         self.encoder.encode(&values, &mut made);
         let time = self.now();
         for (bus, frame) in &made {
-            self.give(Input::Frame { time, bus: *bus, frame });
+            self.give(Record::frame(time, *bus, frame));
         }
     }
 
@@ -224,18 +224,18 @@ impl<'a> Daemon<'a> {
             5 | 6 => self.temperature_c = [None, Some(25.0), Some(55.0), Some(65.0)][self.random.random_range(0..4)],
             7 => {
                 let event = if self.random.random_bool(0.5) { BusEvent::Up } else { BusEvent::Down };
-                self.give(Input::Bus { time, bus: BUS, event });
+                self.give(Record::bus(time, BUS, event));
             }
             8 => {
                 let works = self.random.random_bool(0.5);
-                self.give(Input::Store { time, works });
+                self.give(Record::store(time, works));
             }
             _ => {
                 let rule = [None, Some(Rule::TemperatureHigh)][self.random.random_range(0..2)];
                 let which = Selector { rule, ..Selector::default() };
                 let is_clear = self.random.random_bool(0.5);
                 let command = if is_clear { Command::Clear(which) } else { Command::Acknowledge(which) };
-                self.give(Input::Command { time, command });
+                self.give(Record::command(time, command));
             }
         }
     }

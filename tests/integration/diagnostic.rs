@@ -8,7 +8,7 @@ use assert_cmd::Command;
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::isotp::segment;
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Input, Monitor, Outputs};
+use packwatch::monitor::{Monitor, Outputs, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// A Leaf: 96 cells of 16 bits in group 2 of service 0x21, current and pack values in group 1.
@@ -113,7 +113,7 @@ fn the_values_of_an_answer_are_of_its_first_frame() {
     let (mut monitor, mut out) = (Monitor::new(config), Outputs { want_estimates: true, ..Outputs::default() });
     let mut give = |ms: i64, frame: &Frame, out: &mut Outputs| {
         let time = Timestamp::from_nanos(ms * 1_000_000);
-        monitor.handle(Input::Frame { time, bus: BusIndex(0), frame }, out);
+        monitor.handle(&Record::frame(time, BusIndex(0), frame), out);
     };
     current(10.0).iter().for_each(|(_, frame)| give(0, frame, &mut out));
     let is_answer = |frame: &Frame| frame.id() == CanId::Standard(0x7BB);

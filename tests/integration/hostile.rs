@@ -9,7 +9,7 @@ use packwatch::alarm::{Change, Rule};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::{self, ConfigFiles};
-use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, Validity};
+use packwatch::monitor::{Downtime, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot, Validity};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex, Timestamp, bounds};
 
 use crate::support::config_texts;
@@ -141,7 +141,7 @@ fn with_second_sender(rig: &mut Rig, seconds: u32, more: u32, current_a: f64) {
         rig.tick_with_frames();
         for k in 0..more / 10 {
             let time = rig.now().plus_nanos(i64::from(k) * 100_000_000 / i64::from(more / 10) + 500_000);
-            rig.give(Input::Frame { time, bus: BUS, frame: &frame });
+            rig.give(Record::frame(time, BUS, &frame));
         }
     }
 }
@@ -175,7 +175,7 @@ fn frames_with_our_own_identifiers_are_reported_within_five_seconds_and_an_echo_
         rig.tick_with_frames();
         let time = rig.now();
         for frame in std::mem::take(&mut rig.frames) {
-            rig.give(Input::Frame { time, bus: BUS, frame: &frame });
+            rig.give(Record::frame(time, BUS, &frame));
         }
     }
     assert_eq!(rig.monitor.own_id_uses().count(), 0);
@@ -184,7 +184,7 @@ fn frames_with_our_own_identifiers_are_reported_within_five_seconds_and_an_echo_
     for _ in 0..50 {
         rig.tick_with_frames();
         let time = rig.now();
-        rig.give(Input::Frame { time, bus: BUS, frame: &status });
+        rig.give(Record::frame(time, BUS, &status));
     }
     let found: Vec<_> = rig.events.iter().filter(|event| matches!(event.kind, EventKind::OwnIdentifier(_))).collect();
     assert_eq!(found.len(), 1, "{found:?}");
@@ -234,9 +234,9 @@ fn drive(frozen_s: Option<f64>, seconds: f64) -> Drive {
         made.clear();
         encoder.encode(&values, &mut made);
         for (bus, frame) in &made {
-            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+            monitor.handle(&Record::frame(moment.time, *bus, frame), &mut out);
         }
-        monitor.handle(Input::Tick { time: moment.time }, &mut out);
+        monitor.handle(&Record::tick(moment.time), &mut out);
         events.extend(out.events.drain(..).map(|event| (event.time.secs(), event.kind)));
         out.clear();
     }

@@ -8,8 +8,8 @@ use packwatch::can::{CanId, Frame};
 use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
-use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource, Record};
-use packwatch::monitor::{BusEvent, Downtime, EventKind, Input};
+use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource};
+use packwatch::monitor::{BusEvent, Downtime, EventKind, Record, RecordKind};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
 
@@ -283,11 +283,11 @@ fn file(folder: &Path, name: &str, text: &[u8]) -> PathBuf {
 }
 
 fn gap(seconds: i64) -> Record {
-    Record::UnknownGap { time: Timestamp::from_nanos(seconds * 1_000_000_000) }
+    Record::unknown_gap(Timestamp::from_nanos(seconds * 1_000_000_000))
 }
 
 fn millis(records: &[Record]) -> Vec<i64> {
-    records.iter().map(|r| r.time().nanos() / 1_000_000).collect()
+    records.iter().map(|r| r.time.nanos() / 1_000_000).collect()
 }
 
 #[test]
@@ -350,12 +350,12 @@ fn a_journal_reads_back_as_written() {
         BusEvent::SendFailed { frames: u64::MAX },
     ];
     let mut inputs = vec![
-        Input::Frame { time: at(1_700_000_000_123_456_789), bus: BusIndex(1), frame: &frame },
-        Input::Tick { time: at(1_700_000_000_130_000_000) },
-        Input::UnknownGap { time: at(1_700_000_000_130_000_001) },
-        Input::Frame { time: at(1_700_000_000_120_000_000), bus: BusIndex(0), frame: &frame },
+        Record::frame(at(1_700_000_000_123_456_789), BusIndex(1), &frame),
+        Record::tick(at(1_700_000_000_130_000_000)),
+        Record::unknown_gap(at(1_700_000_000_130_000_001)),
+        Record::frame(at(1_700_000_000_120_000_000), BusIndex(0), &frame),
     ];
-    inputs.extend(events.map(|event| Input::Bus { time: at(1_700_000_001_000_000_000), bus: BusIndex(1), event }));
+    inputs.extend(events.map(|event| Record::bus(at(1_700_000_001_000_000_000), BusIndex(1), event)));
     let mut journal = JournalWriter::new(Vec::new(), vec!["can0".into(), "can1".into()]).expect("memory");
     let aways = [Downtime::Seconds(0.1), Downtime::AsStamped, Downtime::Unknown];
     let taken_up = at(1_700_000_000_000_000_000);
@@ -364,9 +364,8 @@ fn a_journal_reads_back_as_written() {
     let text = journal.into_inner();
     let folder = tempfile::tempdir().expect("a folder");
     let (records, counts) = read(&[file(folder.path(), "j", &text)], true, |_| {}).expect("read");
-    assert_eq!(records[..3], aways.map(|away| Record::Restore { time: taken_up, away }));
-    let back: Vec<_> = records.iter().filter_map(Record::input).collect();
-    assert_eq!(back, inputs);
+    assert_eq!(records[..3], aways.map(|away| Record::restore(taken_up, away)));
+    assert_eq!(records[3..], inputs);
     assert_eq!((counts.bad_lines, counts.ignored_lines, counts.time_backwards), (0, 1, 1));
 
     // Torn in the middle of its last line: that line is not taken for a shorter one.
@@ -383,11 +382,7 @@ const MOST_DROPPED: &str = "(1.000000) can0 123#11\n\
 fn numbers_of_lost_frames_add_up_to_the_largest_and_not_beyond() {
     let folder = tempfile::tempdir().expect("a folder");
     let candump = file(folder.path(), "a.log", MOST_DROPPED.as_bytes());
-    let lost = Record::Bus {
-        time: Timestamp::from_nanos(1_000_000_000),
-        bus: BusIndex(0),
-        event: BusEvent::Dropped { frames: u64::MAX },
-    };
+    let lost = Record::bus(Timestamp::from_nanos(1_000_000_000), BusIndex(0), BusEvent::Dropped { frames: u64::MAX });
     let one_by_one = read(std::slice::from_ref(&candump), true, |_| {}).expect("read");
     assert_eq!(one_by_one.0[1..], [lost, lost], "each line is a record with its number");
     assert_eq!((one_by_one.1.dropped_frames, one_by_one.1.bad_lines), (u64::MAX, 0));
@@ -411,7 +406,7 @@ fn the_largest_numbers_of_lost_frames_are_events_and_leave_the_monitor_s_statist
     rig.events.clear();
     for event in [notes[0], notes[0], notes[1], notes[1]] {
         let time = rig.now();
-        rig.give(Input::Bus { time, bus: BusIndex(0), event });
+        rig.give(Record::bus(time, BusIndex(0), event));
     }
     let noted = rig.events.iter().filter_map(|event| match event.kind {
         EventKind::Bus { what, .. } => Some(what),
@@ -446,8 +441,8 @@ fn csv_rows_become_frames_and_bad_fields_are_reported_with_their_column() {
         first.ends_with("a.csv:4: column current_a: found \"NaN\", must be a finite number or an empty field"),
         "{first}"
     );
-    let data = |record: &Record| match record {
-        Record::Frame { frame, .. } => frame.data().to_vec(),
+    let data = |record: &Record| match &record.kind {
+        RecordKind::Frame { frame, .. } => frame.data().to_vec(),
         other => panic!("{other:?}"),
     };
     assert_eq!((data(&records[0]), data(&records[1])), (vec![15, 40], vec![0xFF, 39]));

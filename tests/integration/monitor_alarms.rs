@@ -3,7 +3,7 @@
 use crate::support::rig::{NO_VALUE, Rig, WHOLE_PACK, Wire, command_frame, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{BusEvent, Command, EventKind, Input, Source};
+use packwatch::monitor::{BusEvent, Command, EventKind, Record, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 
 #[test]
@@ -91,17 +91,17 @@ fn interfaces_and_files_out_of_order_raise_their_alarms() {
     );
     rig.seconds(1);
     assert_eq!(rig.unknown_rules(), 1, "it is not known whether files can be written");
-    rig.give(Input::Store { time: rig.now(), works: true });
-    rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event: BusEvent::Up });
+    rig.give(Record::store(rig.now(), true));
+    rig.give(Record::bus(rig.now(), BusIndex(0), BusEvent::Up));
     rig.seconds(1);
     assert_eq!(rig.unknown_rules(), 0);
-    rig.give(Input::Store { time: rig.now(), works: false });
-    rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event: BusEvent::Down });
+    rig.give(Record::store(rig.now(), false));
+    rig.give(Record::bus(rig.now(), BusIndex(0), BusEvent::Down));
     rig.seconds(3);
     assert_eq!(rig.changes(Rule::StoreFailed), [Change::Raised]);
     assert_eq!(rig.changes(Rule::BusFault), [Change::Raised]);
-    rig.give(Input::Store { time: rig.now(), works: true });
-    rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event: BusEvent::Up });
+    rig.give(Record::store(rig.now(), true));
+    rig.give(Record::bus(rig.now(), BusIndex(0), BusEvent::Up));
     rig.seconds(1);
     assert_eq!(rig.changes(Rule::StoreFailed), [Change::Raised, Change::Cleared]);
     assert_eq!(rig.changes(Rule::BusFault), [Change::Raised, Change::Latched]);
@@ -150,13 +150,13 @@ fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
     // The same frame again, one with a wrong CRC, one with an unknown command: none is applied, one a second is reported.
     rig.seconds(2);
     let again = command_frame(1, 1, 0, 1);
-    rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &again });
+    rig.give(Record::frame(rig.now(), BusIndex(0), &again));
     let harmed = {
         let mut data: [u8; 8] = command_frame(2, 31, 2047, 2).data().try_into().unwrap();
         data[4] ^= 1;
         Frame::classic(CanId::Standard(1715), &data).unwrap()
     };
-    rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &harmed });
+    rig.give(Record::frame(rig.now(), BusIndex(0), &harmed));
     rig.command(9, 31, 2047);
     assert_eq!((reported(&rig), bad(&rig)), (1, 2));
     // Clearing what is beyond its threshold is refused, and erases nothing.
@@ -174,7 +174,7 @@ fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
 fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() {
     let mut rig = learned();
     let old_ah = rig.monitor.capacity(CellIndex(0)).mean.min(rig.monitor.capacity(CellIndex(1)).mean);
-    rig.give(Input::Command { time: rig.now(), command: Command::PackReplaced });
+    rig.give(Record::command(rig.now(), Command::PackReplaced));
     let reported = rig.events.iter().rev().find_map(|event| match event.kind {
         EventKind::PackReplaced { capacity_ah, .. } => capacity_ah,
         _ => None,
@@ -191,7 +191,7 @@ fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() 
 fn a_test_is_marked_carries_no_value_and_hides_no_real_alarm() {
     let mut rig = learned();
     rig.frames.clear();
-    rig.give(Input::Command { time: rig.now(), command: Command::Test { rule: Rule::CapacityLow, seconds: 2.0 } });
+    rig.give(Record::command(rig.now(), Command::Test { rule: Rule::CapacityLow, seconds: 2.0 }));
     rig.seconds(3);
     let (tests, real): (Vec<Wire>, Vec<Wire>) = rig.wire().into_iter().partition(|wire| wire.test);
     assert_eq!(tests.len(), 21, "ten a second, and the end");
@@ -200,6 +200,6 @@ fn a_test_is_marked_carries_no_value_and_hides_no_real_alarm() {
     assert!(real.len() >= 5 && real.iter().all(|wire| wire.state == 1 && wire.value != NO_VALUE));
     assert_eq!(rig.monitor.alarms().count(), 2, "a test raises nothing");
     let selector = Selector::default();
-    rig.give(Input::Command { time: rig.now(), command: Command::Acknowledge(selector) });
+    rig.give(Record::command(rig.now(), Command::Acknowledge(selector)));
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Acknowledged, Change::Acknowledged]);
 }

@@ -10,7 +10,9 @@ use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{BusEvent, Command, Downtime, Input, Monitor, MonitorConfig, Outputs, Snapshot, Transmit};
+use packwatch::monitor::{
+    BusEvent, Command, Downtime, Monitor, MonitorConfig, Outputs, Record, RecordKind, Snapshot, Transmit,
+};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
 use crate::support::config_texts;
@@ -115,24 +117,8 @@ rule = "channel_faulty"
 warning = 0.5
 "#;
 
-/// One input that owns its frame.
-#[derive(Debug, Clone)]
-enum Record {
-    Frame(Timestamp, Frame),
-    Other(Input<'static>),
-}
-
-impl Record {
-    fn is_command(&self) -> bool {
-        matches!(self, Self::Frame(_, frame) if frame.id() == CanId::Standard(1715))
-    }
-
-    fn input(&self) -> Input<'_> {
-        match self {
-            Self::Frame(time, frame) => Input::Frame { time: *time, bus: BusIndex(0), frame },
-            Self::Other(input) => *input,
-        }
-    }
+fn is_command(record: &Record) -> bool {
+    matches!(record.kind, RecordKind::Frame { frame, .. } if frame.id() == CanId::Standard(1715))
 }
 
 /// A pack with a model file; one that learns its model from a label; one with authenticated frames.
@@ -189,7 +175,7 @@ impl Vehicle {
         }
         for _ in 0..if dice.one_in(5) { 10 } else { 1 } {
             self.now_ns += if dice.one_in(3) { 10_000_000 } else { 100_000_000 };
-            records.push(Record::Other(Input::Tick { time: self.now() }));
+            records.push(Record::tick(self.now()));
         }
         self.rarities(dice, records);
     }
@@ -220,7 +206,7 @@ impl Vehicle {
                 continue;
             }
             for _ in 0..if dice.one_in(500) { 600 } else { 1 } {
-                records.push(Record::Frame(self.now(), frame));
+                records.push(Record::frame(self.now(), BusIndex(0), &frame));
             }
             self.now_ns += 300_000;
         }
@@ -243,38 +229,40 @@ impl Vehicle {
         match dice.below(400) {
             0 => self.now_ns += [700_000_000, 6_000_000_000, 3_600_000_000_000][dice.below(3)],
             1 => self.now_ns -= [200_000_000, 4_000_000_000][dice.below(2)],
-            2 => records.push(Record::Other(Input::UnknownGap { time })),
-            3 => {
-                records.push(Record::Other(Input::Command { time, command: Command::Acknowledge(Selector::default()) }))
-            }
-            4 => records.push(Record::Other(Input::Command { time, command: Command::Clear(Selector::default()) })),
+            2 => records.push(Record::unknown_gap(time)),
+            3 => records.push(Record::command(time, Command::Acknowledge(Selector::default()))),
+            4 => records.push(Record::command(time, Command::Clear(Selector::default()))),
             5 => {
                 let (rule, seconds) = (Rule::SocLow, dice.between(0.0, 5.0));
-                records.push(Record::Other(Input::Command { time, command: Command::Test { rule, seconds } }));
+                records.push(Record::command(time, Command::Test { rule, seconds }));
             }
-            6 => records.push(Record::Other(Input::Store { time, works: dice.one_in(2) })),
+            6 => records.push(Record::store(time, dice.one_in(2))),
             7 => {
                 let event = [BusEvent::Up, BusEvent::Down, BusEvent::SendFailed { frames: 2 }][dice.below(3)];
-                records.push(Record::Other(Input::Bus { time, bus, event }));
+                records.push(Record::bus(time, bus, event));
             }
             8..=15 => {
                 self.command_counter = (self.command_counter + 1) % 15;
                 let code = u64::try_from(dice.below(3)).expect("small");
                 let frame = command_frame(code, 31, 0x7FF, self.command_counter);
                 let damaged = tester(1715, &frame.data()[..7]);
-                records.push(Record::Frame(time, if dice.one_in(4) { damaged } else { frame }));
+                records.push(Record::frame(time, BusIndex(0), if dice.one_in(4) { &damaged } else { &frame }));
             }
             16 => self.identity = f64::from(u8::try_from(dice.below(3)).expect("small")),
             // An answer in one frame, one of two frames, of which the second may not come, and a refusal.
-            17..=30 => records.push(Record::Frame(time, tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0]))),
-            31..=34 => records.push(Record::Frame(time, tester(0x7BB, &[0x10, 9, 0x61, 1, 0x20, 0x20, 0, 0]))),
-            35..=38 => records.push(Record::Frame(time, tester(0x7BB, &[0x21, 0, 0, 0, 0, 0, 0, 0]))),
-            39 => records.push(Record::Frame(time, tester(0x7BB, &[3, 0x7F, 0x21, 0x78, 0, 0, 0, 0]))),
-            40 => records.push(Record::Frame(time, tester(0x7DF, &[2, 1, 0, 0, 0, 0, 0, 0]))),
+            17..=30 => {
+                records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0])))
+            }
+            31..=34 => {
+                records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[0x10, 9, 0x61, 1, 0x20, 0x20, 0, 0])))
+            }
+            35..=38 => records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[0x21, 0, 0, 0, 0, 0, 0, 0]))),
+            39 => records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[3, 0x7F, 0x21, 0x78, 0, 0, 0, 0]))),
+            40 => records.push(Record::frame(time, BusIndex(0), &tester(0x7DF, &[2, 1, 0, 0, 0, 0, 0, 0]))),
             41..=44 => {
                 let [low, middle, high] = [[0xCA, 0xFE, 0], [0xCB, 0xFE, 0], [0, 0xEE, 0]][dice.below(3)];
                 let request = Frame::classic(CanId::Extended(0x18EA_FF01), &[low, middle, high]).expect("short");
-                records.push(Record::Frame(time, request));
+                records.push(Record::frame(time, BusIndex(0), &request));
             }
             _ => {}
         }
@@ -301,7 +289,7 @@ fn records(seed: u64, steps: usize, config: &MonitorConfig) -> Vec<Record> {
 
 fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> String {
     out.clear();
-    monitor.handle(record.input(), out);
+    monitor.handle(record, out);
     if out.is_empty() {
         return String::new();
     }
@@ -335,12 +323,12 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let is_secured = !config.authentications().is_empty();
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
         // Whether a forged command is an old one depends on the freshness.
-        if is_secured && record.is_command() {
+        if is_secured && is_command(record) {
             continue;
         }
         // After a longer time without an input the restored one takes it that the program was off.
-        let is_break = record.input().time().since(before).abs() > 30.0;
-        before = record.input().time();
+        let is_break = record.time.since(before).abs() > 30.0;
+        before = record.time;
         if nth > 0 && !is_break && dice.one_in(one_in) {
             cut = restored(&cut, config);
             cuts += 1;

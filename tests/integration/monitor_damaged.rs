@@ -126,8 +126,8 @@ fn names_of(text: &str) -> Vec<&str> {
 #[test]
 fn the_stored_form_keeps_its_names_and_their_order() {
     let snapshot = learned().monitor.snapshot();
-    let expected = "version time cells waiting sampler detector learner learned_at offset_at recharge \
-                    recharge_period_s normalised_recharge pack updated_cells time_backwards alarms schedule intake buses identity statistics continuation";
+    let expected = "version time may_continue time_backwards intake sampling estimation cells modelling learning diagnosis \
+                    alarming sending statistics asleep_since packs";
     assert_eq!(names_of(&serde_json::to_string(&snapshot).unwrap()), expected.split_whitespace().collect::<Vec<_>>());
     let mut document = serde_json::to_value(snapshot).unwrap();
     assert!(serde_json::from_value::<Snapshot>(document.clone()).is_ok());

@@ -5,32 +5,13 @@
 
 use std::path::Path;
 
-use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
-use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
-use packwatch::quantity::{BusIndex, Timestamp};
+use packwatch::monitor::{
+    Downtime, EventKind, Monitor, MonitorConfig, Outputs, Record, RecordKind, Snapshot, TICK_PERIOD_MS,
+};
+use packwatch::quantity::Timestamp;
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
-
-/// One input that owns its frame.
-#[derive(Debug, Clone)]
-enum Record {
-    Frame(Timestamp, BusIndex, Frame),
-    Tick(Timestamp),
-}
-
-impl Record {
-    fn input(&self) -> Input<'_> {
-        match self {
-            Self::Frame(time, bus, frame) => Input::Frame { time: *time, bus: *bus, frame },
-            Self::Tick(time) => Input::Tick { time: *time },
-        }
-    }
-
-    fn time(&self) -> Timestamp {
-        self.input().time()
-    }
-}
 
 fn load(file: &str) -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(file);
@@ -75,10 +56,10 @@ fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Rec
         for (nth, (bus, frame)) in (0..).zip(&frames) {
             let time = moment.time.plus_nanos(nth * 230_000);
             while next_tick < time.nanos() {
-                records.push(Record::Tick(Timestamp::from_nanos(next_tick)));
+                records.push(Record::tick(Timestamp::from_nanos(next_tick)));
                 next_tick += period_ns;
             }
-            records.push(Record::Frame(time, *bus, *frame));
+            records.push(Record::frame(time, *bus, frame));
         }
     }
     records
@@ -87,7 +68,7 @@ fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Rec
 /// What came out of one input, as text.
 fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> [String; 3] {
     out.clear();
-    monitor.handle(record.input(), out);
+    monitor.handle(record, out);
     let text = |empty: bool, text: &dyn Fn() -> String| if empty { String::new() } else { text() };
     [
         text(out.estimates.is_empty(), &|| format!("{:?}", out.estimates)),
@@ -120,7 +101,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
         let (mut whole, mut out) = (Monitor::new(config.clone()), wanting_estimates());
         for record in &records[..split] {
             out.clear();
-            whole.handle(record.input(), &mut out);
+            whole.handle(record, &mut out);
         }
         let text = serde_json::to_string(&whole.snapshot()).expect("a snapshot is a document");
         let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
@@ -135,7 +116,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
                     reported[kind] = true;
                     found.push(format!(
                         "split {split} (t = {} s), {} differ {nth} inputs later at {} s\n  whole    {:.300}\n  restored {:.300}",
-                        records[split - 1].time().secs(), WHAT[kind], record.time().secs(), expected[kind], got[kind],
+                        records[split - 1].time.secs(), WHAT[kind], record.time.secs(), expected[kind], got[kind],
                     ));
                 }
             }
@@ -157,7 +138,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
 fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
     draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
         .map(|k| k + 1)
-        .filter(|&k| !same_stamp || records[k].time() == records[k - 1].time())
+        .filter(|&k| !same_stamp || records[k].time == records[k - 1].time)
         .take(count)
         .collect()
 }
@@ -190,7 +171,7 @@ fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
     let (mut monitor, mut out) = (Monitor::new(config.clone()), Outputs::default());
     let reported = records.iter().position(|record| {
         out.clear();
-        monitor.handle(record.input(), &mut out);
+        monitor.handle(record, &mut out);
         out.events.iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. }))
     });
     let split = reported.expect("a half-cycle");
@@ -235,7 +216,7 @@ fn reload_differences(
             if is_edited {
                 edit(&mut other);
             }
-            let done = reloaded.reconfigure(other, record.time(), &mut out_reloaded).expect("taken over");
+            let done = reloaded.reconfigure(other, record.time, &mut out_reloaded).expect("taken over");
             assert_eq!(done.alarms_ended, 0);
         }
         let expected = outputs(&mut whole, record, &mut out_whole);
@@ -243,7 +224,7 @@ fn reload_differences(
         for kind in 0..3 {
             if expected[kind] != got[kind] && !reported[kind] {
                 reported[kind] = true;
-                let (what, at_s) = (WHAT[kind], record.time().secs());
+                let (what, at_s) = (WHAT[kind], record.time.secs());
                 found.push(format!("{what} differ at {at_s} s\n  {:.300}\n  {:.300}", expected[kind], got[kind]));
             }
         }
@@ -282,15 +263,15 @@ fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
     let (mut given, mut skipped) = (0_u32, 0_u32);
     for (nth, record) in (0..).zip(records) {
         let expected = outputs(&mut all, record, &mut out_all);
-        let cares = few.next_due().is_none_or(|due| record.time() >= due);
-        if matches!(record, Record::Tick(_)) && !cares {
+        let cares = few.next_due().is_none_or(|due| record.time >= due);
+        if record.kind == RecordKind::Tick && !cares {
             skipped += 1;
             assert_eq!(expected, [const { String::new() }; 3], "input {nth}: a tick that was not due did something");
             continue;
         }
         given += 1;
         let got = outputs(&mut few, record, &mut out_few);
-        assert_eq!(expected, got, "input {nth} at {} s", record.time().secs());
+        assert_eq!(expected, got, "input {nth} at {} s", record.time.secs());
     }
     assert!(skipped > given, "the test must leave ticks out: {skipped} of {}", skipped + given);
 }
@@ -311,15 +292,16 @@ fn ticks_before_the_due_time_change_nothing_for_a_pack() {
 /// (The cut over time asleep lies between two ticks that are due: the last tick before it is one that may be left out.)
 fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<Record>) {
     let (config, records) = paper();
-    let records = records.into_iter().filter_map(|record| edit(record.time().secs(), record)).collect();
+    let records = records.into_iter().filter_map(|record| edit(record.time.secs(), record)).collect();
     (config, records)
 }
 
 #[test]
 fn ticks_before_the_due_time_change_nothing_while_a_sensor_is_silent() {
     let silent = |time_s: f64| (3000.0..3120.0).contains(&time_s);
-    let (config, records) =
-        edited(|time_s, record| (!(silent(time_s) && matches!(record, Record::Frame(..)))).then_some(record));
+    let (config, records) = edited(|time_s, record| {
+        (!(silent(time_s) && matches!(record.kind, RecordKind::Frame { .. }))).then_some(record)
+    });
     ticks_may_be_left_out(&config, &records);
 }
 
@@ -333,10 +315,7 @@ fn ticks_before_the_due_time_change_nothing_over_time_asleep() {
 fn ticks_before_the_due_time_change_nothing_when_the_clock_is_set_back() {
     let (config, records) = edited(|time_s, record| {
         let back_s = if time_s >= 12_000.0 { -20.0 } else { 0.0 };
-        Some(match record {
-            Record::Frame(time, bus, frame) => Record::Frame(time.plus_secs(back_s), bus, frame),
-            Record::Tick(time) => Record::Tick(time.plus_secs(back_s)),
-        })
+        Some(Record { time: record.time.plus_secs(back_s), ..record })
     });
     ticks_may_be_left_out(&config, &records);
 }

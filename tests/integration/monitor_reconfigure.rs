@@ -5,7 +5,7 @@ use packwatch::alarm::{AlarmState, Change, Rule, Severity};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
 use packwatch::health::{Axis, CapacityReading, Forecast, Usage};
-use packwatch::monitor::{Command, Downtime, EventKind, Input, Monitor, MonitorConfig};
+use packwatch::monitor::{Command, Downtime, EventKind, Monitor, MonitorConfig, Record};
 use packwatch::quantity::CellIndex;
 
 const HOT: &str = "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n";
@@ -29,7 +29,7 @@ impl Rig {
 fn hot() -> Rig {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 2);
-    rig.give(Input::Command { time: rig.now(), command: Command::Acknowledge(Default::default()) });
+    rig.give(Record::command(rig.now(), Command::Acknowledge(Default::default())));
     assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, true));
     rig.events.clear();
     rig.frames.clear();

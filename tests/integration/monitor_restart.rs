@@ -3,7 +3,7 @@
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Outputs, Source};
+use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Outputs, Record, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 
 impl Rig {
@@ -50,7 +50,7 @@ fn a_state_from_the_future_is_of_unknown_age() {
 /// What was learned, as it is stored: capacities with what drifts beside them, and the filters' resistances.
 fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
     let document = serde_json::to_value(rig.monitor.snapshot()).unwrap();
-    let learner = &document["learner"];
+    let learner = &document["learning"]["learner"];
     let mut parts = vec![learner["capacity"].clone(), learner["drift"].clone(), learner["learned"].clone()];
     for cell in document["cells"].as_array().unwrap() {
         let mean = cell["estimator"]["mean"].as_array().unwrap();
@@ -92,7 +92,7 @@ impl Rig {
     }
 
     fn ask(&mut self, command: Command) {
-        self.give(Input::Command { time: self.now(), command });
+        self.give(Record::command(self.now(), command));
     }
 
     fn refused(&self) -> Option<u32> {
@@ -212,7 +212,7 @@ fn a_missing_input_stays_missing_over_a_restart_until_it_is_back() {
 
 #[test]
 fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
-    let fault = |event| move |rig: &mut Rig| rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event });
+    let fault = |event| move |rig: &mut Rig| rig.give(Record::bus(rig.now(), BusIndex(0), event));
     for (event, away) in [
         (BusEvent::Down, Downtime::Seconds(2.0)),
         (BusEvent::Missing, Downtime::Seconds(3e4)),
@@ -326,7 +326,7 @@ fn a_flood_of_bad_commands_is_reported_once_a_second() {
         rig.tick();
         for _ in 0..10 {
             let nonsense = Frame::classic(CanId::Standard(1715), &[0xAA; 8]).unwrap();
-            rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &nonsense });
+            rig.give(Record::frame(rig.now(), BusIndex(0), &nonsense));
         }
     }
     let reported = rig.events.iter().filter(|event| matches!(event.kind, EventKind::BadCommand { .. })).count();
@@ -365,7 +365,7 @@ fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
         let (mut out, mut claimed, mut reported) = (Outputs::default(), None, None);
         for tick in 1..100 {
             let time = rig.now().plus_nanos(tick * 10_000_000);
-            rig.monitor.handle(Input::Tick { time }, &mut out);
+            rig.monitor.handle(&Record::tick(time), &mut out);
             for sent in out.frames.drain(..) {
                 match sent.frame.id() {
                     CanId::Extended(0x18EE_FFF9) => claimed = claimed.or(Some(time)),

@@ -11,7 +11,7 @@ use packwatch::cell::{CapacityState, Discretisation};
 use packwatch::config;
 use packwatch::health::CapacityMethod;
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, Event, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{CellIndex, Channel, Mode, SensorIndex, Timestamp};
 
 fn load(file: &str) -> MonitorConfig {
@@ -56,7 +56,7 @@ impl Bench {
         self.out.clear();
     }
     fn tick(&mut self) {
-        self.monitor.handle(Input::Tick { time: Timestamp::from_secs(self.t) }, &mut self.out);
+        self.monitor.handle(&Record::tick(Timestamp::from_secs(self.t)), &mut self.out);
         self.take();
     }
     fn truth(&mut self, i: f64, dt: f64) -> f64 {
@@ -75,7 +75,7 @@ impl Bench {
         ];
         self.encoder.encode(&values, &mut frames);
         for (bus, frame) in &frames {
-            self.monitor.handle(Input::Frame { time: Timestamp::from_secs(self.t), bus: *bus, frame }, &mut self.out);
+            self.monitor.handle(&Record::frame(Timestamp::from_secs(self.t), *bus, frame), &mut self.out);
         }
         self.take();
     }
@@ -240,7 +240,7 @@ fn after_an_unknown_gap_the_old_soc_is_not_valid() {
     b.run(2.6, 300);
     b.frames.clear();
     b.t += 1.0;
-    b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
+    b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     b.tick();
 
     assert_ne!(b.status().validity, 1, "{:?}", b.status());
@@ -329,7 +329,7 @@ fn half_cycle_before_an_unknown_gap_has_its_own_charge() {
     b.run(0.0, 60);
     b.run(2.0, 900);
     b.t += 3600.0;
-    b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
+    b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     b.take();
     for e in &b.events {
         if let EventKind::HalfCycle { charge_ah, duration_s, .. } = e.kind {
@@ -347,7 +347,7 @@ fn half_cycle_behind_an_unknown_gap_knows_how_little_it_knows_of_its_beginning()
     b.run(2.0, 900);
     // Not measured: the cell discharges to 30 %.
     b.t += 3600.0;
-    b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
+    b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     (b.soc, b.u1) = (0.3, 0.0);
     b.run(-2.0, 1200);
     b.run(0.0, 60);
@@ -484,7 +484,7 @@ fn a_gap_of_unknown_length_is_reported_once() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(2.0, 60);
     b.t += 3600.0;
-    b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
+    b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     b.take();
     let gaps: Vec<_> = b.events.iter().filter(|e| matches!(e.kind, EventKind::Gap { .. })).collect();
 
@@ -527,7 +527,7 @@ fn a_state_restored_on_an_earlier_clock_keeps_sending() {
     let mut out = Outputs::default();
     for tick in 0..300 {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
-        monitor.handle(Input::Tick { time }, &mut out);
+        monitor.handle(&Record::tick(time), &mut out);
     }
     // Three seconds: a status frame, five pages of health and three of the digest each, from wherever in the period the state
     // was taken.

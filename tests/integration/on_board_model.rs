@@ -10,7 +10,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::cell::own_model::task::FitFindings;
 use packwatch::cell::{Branch, CellModel, Chemistry, Table};
 use packwatch::config::{self, ConfigFiles};
-use packwatch::monitor::{Downtime, Event, EventKind, Input, ModelState, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, Event, EventKind, ModelState, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
@@ -131,13 +131,13 @@ impl Live {
 
     fn take(&mut self, (time, bus, frame): &(Timestamp, BusIndex, Frame)) {
         while let Some(due) = self.monitor.next_due().filter(|due| due <= time && time.since(*due) < 60.0) {
-            self.give(Input::Tick { time: due });
+            self.give(Record::tick(due));
         }
-        self.give(Input::Frame { time: *time, bus: *bus, frame });
+        self.give(Record::frame(*time, *bus, frame));
     }
 
-    fn give(&mut self, input: Input<'_>) {
-        self.monitor.handle(input, &mut self.out);
+    fn give(&mut self, record: Record) {
+        self.monitor.handle(&record, &mut self.out);
         self.said.extend(self.out.frames.iter().map(|frame| format!("{frame:?}")));
         self.said.extend(self.out.estimates.iter().map(|estimate| format!("{estimate:?}")));
         self.said.extend(self.out.events.iter().map(|event| format!("{event:?}")));
@@ -283,7 +283,7 @@ fn a_wrong_chemistry_on_the_label_is_found_within_one_cycle() {
         let config = configuration(wrong);
         let mut live = Live::new(&config);
         vehicle(&model, &truth, TRUE_AH, &DEEP, 1).iter().for_each(|frame| live.take(frame));
-        live.give(Input::UnknownGap { time: Timestamp::from_secs(4e9) });
+        live.give(Record::unknown_gap(Timestamp::from_secs(4e9)));
         let view = live.monitor.model();
         assert_eq!(view.state, ModelState::Unfit, "{wrong}");
         let better = view.chemistry.map(Chemistry::name).unwrap_or_default();
@@ -301,7 +301,7 @@ fn a_corrected_label_keeps_the_rows_and_forgets_the_model() {
     let rows = live.monitor.model().notebook.map_or(0, |notebook| notebook.rows().len());
     assert!(rows > 20, "{rows} rows");
     let mut corrected = Live::restored(&right, live.monitor.snapshot());
-    corrected.give(Input::UnknownGap { time: Timestamp::from_secs(4e9) });
+    corrected.give(Record::unknown_gap(Timestamp::from_secs(4e9)));
     let view = corrected.monitor.model();
     assert!(view.notebook.map_or(0, |notebook| notebook.rows().len()) >= rows);
     assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);

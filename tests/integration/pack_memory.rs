@@ -1,7 +1,7 @@
 //! Learned values belong to a pack number: they come back with it, whatever numbers were between, and over restarts.
 
 use packwatch::alarm::{Change, Rule};
-use packwatch::monitor::{CellView, Command, Downtime, EventKind, Input};
+use packwatch::monitor::{CellView, Command, Downtime, EventKind, Record};
 
 use crate::support::rig::Rig;
 
@@ -116,7 +116,12 @@ fn the_pack_that_was_connected_least_lately_is_forgotten_first() {
     // A and seven others are kept beside the eighth; with the ninth A would be the ninth kept.
     let snapshot = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     let numbers = |value: &serde_json::Value| {
-        value["packs"].as_array().unwrap().iter().map(|pack| pack["number"].as_f64().unwrap()).collect::<Vec<_>>()
+        value["packs"]["packs"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|pack| pack["number"].as_f64().unwrap())
+            .collect::<Vec<_>>()
     };
     assert_eq!(numbers(&snapshot), [A, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     let bytes = serde_json::to_string(&snapshot["packs"]).unwrap().len();
@@ -130,7 +135,7 @@ fn the_pack_that_was_connected_least_lately_is_forgotten_first() {
 fn a_command_forgets_a_pack_whatever_its_number() {
     let mut rig = with_pack_a();
     let of_a = learned(&rig);
-    rig.give(Input::Command { time: rig.now(), command: Command::PackReplaced });
+    rig.give(Record::command(rig.now(), Command::PackReplaced));
     let nothing = learned(&rig);
     assert_ne!(nothing, of_a);
     connect(&mut rig, B);

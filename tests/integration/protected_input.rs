@@ -6,7 +6,7 @@ use packwatch::can::e2e::{Profile, Protection, Status};
 use packwatch::can::flood::FloodChange;
 use packwatch::can::guard::GuardChange;
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Downtime, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, Estimate, Event, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, Timestamp};
 
 const BUS: BusIndex = BusIndex(0);
@@ -107,7 +107,7 @@ impl Bench {
     }
 
     fn give(&mut self, frame: Frame) {
-        self.monitor.handle(Input::Frame { time: self.now, bus: BUS, frame: &frame }, &mut self.out);
+        self.monitor.handle(&Record::frame(self.now, BUS, &frame), &mut self.out);
         self.take();
     }
 
@@ -115,7 +115,7 @@ impl Bench {
     fn wait(&mut self) {
         for _ in 0..10 {
             self.now = self.now.plus_nanos(10_000_000);
-            self.monitor.handle(Input::Tick { time: self.now }, &mut self.out);
+            self.monitor.handle(&Record::tick(self.now), &mut self.out);
         }
         self.take();
     }
@@ -330,7 +330,7 @@ fn a_flood_of_one_identifier_is_cut_counted_and_reported_while_the_others_contin
             bench.give(cell_2(3.9));
             sent += 1;
         }
-        bench.monitor.handle(Input::Tick { time: bench.now }, &mut bench.out);
+        bench.monitor.handle(&Record::tick(bench.now), &mut bench.out);
         let (current, cell) = (bench.next_current(1.0), bench.next_cell_1(3.9));
         bench.give(current);
         bench.give(cell);
@@ -379,13 +379,4 @@ fn a_restart_keeps_the_counts_and_waits_for_a_first_frame() {
     assert_eq!((of_cell(&bench), of_cell(&after)), ([1, 1], [1, 2]));
     assert_eq!(after.count(CELL_1, Status::Ok), bench.count(CELL_1, Status::Ok) + 1);
     assert_eq!(after.monitor.dropped().next(), bench.monitor.dropped().next());
-}
-
-#[test]
-fn a_snapshot_of_an_earlier_version_without_these_counts_is_restored() {
-    let bench = Bench::running();
-    let mut document = serde_json::to_value(bench.monitor.snapshot()).unwrap();
-    assert!(document.as_object_mut().unwrap().remove("intake").is_some());
-    let mut monitor = Monitor::new(configuration());
-    monitor.restore(serde_json::from_value(document).unwrap(), Downtime::Seconds(1.0)).unwrap();
 }

@@ -14,7 +14,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::config;
 use packwatch::health::RechargeAlarm;
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{EventKind, Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 use packwatch::sim::{Ageing, Pack, PackSettings, Settings, Spread};
 use rand::{Rng, SeedableRng};
@@ -149,10 +149,10 @@ impl Rig {
         self.encoder.encode(&readings, &mut frames);
         self.ticks.advance(time);
         while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-            self.monitor.handle(Input::Tick { time }, &mut self.out);
+            self.monitor.handle(&Record::tick(time), &mut self.out);
         }
         for (bus, frame) in &frames {
-            self.monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut self.out);
+            self.monitor.handle(&Record::frame(time, *bus, frame), &mut self.out);
         }
         self.listen();
         self.watch_own_charge(current_a, measured_a);

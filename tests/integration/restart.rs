@@ -11,7 +11,7 @@ use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
 use packwatch::filter::ScalarGaussian;
-use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Mode, SensorIndex, Timestamp};
 use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
@@ -70,16 +70,16 @@ impl Live {
 
     fn take(&mut self, time: Timestamp, frames: &[(BusIndex, Frame)]) {
         while let Some(due) = self.monitor.next_due().filter(|due| *due <= time) {
-            self.give(Input::Tick { time: due });
+            self.give(Record::tick(due));
         }
         for (bus, frame) in frames {
-            self.give(Input::Frame { time, bus: *bus, frame });
+            self.give(Record::frame(time, *bus, frame));
         }
     }
 
-    fn give(&mut self, input: Input<'_>) {
+    fn give(&mut self, record: Record) {
         self.out.clear();
-        self.monitor.handle(input, &mut self.out);
+        self.monitor.handle(&record, &mut self.out);
     }
 
     /// SOC and its deviation of a cell, and when.
@@ -223,7 +223,7 @@ fn start_waiting(
             continue;
         }
         let mut live = Live::restored(config, state.snapshot);
-        live.give(Input::Tick { time });
+        live.give(Record::tick(time));
         active.push(Case {
             // The time away ends a mode, and a half-cycle that was complete may be learned from right then.
             kept_learned: learned(&live.monitor) == state.learned

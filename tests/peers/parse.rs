@@ -11,7 +11,8 @@ use std::time::Instant;
 use packwatch::can::dbc::Database;
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch::io::log::{Batch, LogOptions, LogSource};
+use packwatch::monitor::RecordKind;
 use packwatch::quantity::{BusIndex, CellIndex, Channel};
 
 fn main() {
@@ -45,7 +46,7 @@ fn parse_and_decode(log: &Path, map: &InputMap, most: u64) -> (u64, f64) {
     let (mut frames, mut sum) = (0, 0.0);
     while frames < most && source.next_batch(&mut batch).unwrap() {
         for record in batch.records() {
-            let Record::Frame { bus, frame, .. } = record else { continue };
+            let RecordKind::Frame { bus, frame } = &record.kind else { continue };
             if frames < most {
                 map.decode(*bus, frame, |reading| sum += reading.value.unwrap_or(0.0));
                 frames += 1;

@@ -92,7 +92,7 @@ fn use_it(config: &Config) {
     let mut out = Outputs { want_estimates: true, ..Outputs::default() };
     for record in records(&mut Source::new(DRIVE)).iter().take(200) {
         out.clear();
-        monitor.handle(record.input(), &mut out);
+        monitor.handle(record, &mut out);
     }
     let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");

@@ -7,7 +7,7 @@ use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{
-    BusEvent, Command, Downtime, Estimate, EventKind, Input, MeasuredValues, Monitor, Outputs, Snapshot,
+    BusEvent, Command, Downtime, Estimate, EventKind, MeasuredValues, Monitor, Outputs, Record, Snapshot,
 };
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
@@ -34,22 +34,6 @@ const MS: i64 = 1_000_000;
 /// After a longer time without an input a restored monitor takes it that the program was off, s.
 const BREAK_S: f64 = 30.0;
 
-/// An input that owns its frame.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Record {
-    Frame(Timestamp, Frame),
-    Other(Input<'static>),
-}
-
-impl Record {
-    pub(super) fn input(&self) -> Input<'_> {
-        match self {
-            Self::Frame(time, frame) => Input::Frame { time: *time, bus: BUS, frame },
-            Self::Other(input) => *input,
-        }
-    }
-}
-
 /// Frames, gaps and commands in; a second run must give the same.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
@@ -71,7 +55,7 @@ pub fn cuts(data: &[u8]) {
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
         // By the monitor's clock: after a stamp of the far future it waits for a while before it goes back.
-        let is_break = record.input().time().since(whole.now()).abs() > BREAK_S;
+        let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;
             until_cut = steps[cuts % steps.len()];
@@ -115,7 +99,7 @@ fn outputs() -> Outputs {
 
 fn handle(monitor: &mut Monitor, record: &Record, out: &mut Outputs) {
     out.clear();
-    monitor.handle(record.input(), out);
+    monitor.handle(record, out);
 }
 
 /// Adds to the counts of this process, and prints them at times.
@@ -235,13 +219,13 @@ pub(super) fn records(source: &mut Source<'_>) -> Vec<Record> {
 }
 
 impl Vehicle {
-    fn push(&mut self, input: Input<'static>) {
-        self.records.push(Record::Other(input));
+    fn push(&mut self, record: Record) {
+        self.records.push(record);
     }
 
     fn frame(&mut self, id: CanId, data: &[u8]) {
         if let Some(frame) = Frame::classic(id, data) {
-            self.records.push(Record::Frame(Timestamp::from_nanos(self.now_ns), frame));
+            self.records.push(Record::frame(Timestamp::from_nanos(self.now_ns), BUS, &frame));
         }
     }
 
@@ -278,9 +262,9 @@ impl Vehicle {
                     i64::MAX / MS / 2,
                 ];
                 self.now_ns = self.now_ns.saturating_add(source.one_of(&steps) * MS);
-                self.push(Input::Tick { time: Timestamp::from_nanos(self.now_ns) });
+                self.push(Record::tick(Timestamp::from_nanos(self.now_ns)));
             }
-            13 => self.push(Input::UnknownGap { time }),
+            13 => self.push(Record::unknown_gap(time)),
             14 => {
                 let (rule, seconds) = (Rule::from_number(source.byte() % 20).unwrap_or(Rule::SocLow), source.number());
                 let cell = source.one_of(&[None, Some(CellIndex(0)), Some(CellIndex(1)), Some(CellIndex(900))]);
@@ -294,7 +278,7 @@ impl Vehicle {
                     Command::Test { rule, seconds: if seconds.is_finite() { seconds } else { 1.0 } },
                 ];
                 let command = source.one_of(&commands);
-                self.push(Input::Command { time, command });
+                self.push(Record::command(time, command));
             }
             15 => self.command(source),
             16 => {
@@ -309,9 +293,9 @@ impl Vehicle {
                     BusEvent::ErrorFrame { class },
                     BusEvent::SendFailed { frames: count },
                 ]);
-                self.push(Input::Bus { time, bus, event });
+                self.push(Record::bus(time, bus, event));
             }
-            17 => self.push(Input::Store { time, works: source.byte().is_multiple_of(2) }),
+            17 => self.push(Record::store(time, source.byte().is_multiple_of(2))),
             18 => self.identity = f64::from(source.byte() % 12),
             19 => self.contactor = f64::from(source.byte() % 16),
             20 => {
@@ -358,7 +342,7 @@ impl Vehicle {
             self.now_ns = self.now_ns.saturating_add(MS / 3);
         }
         self.now_ns = self.now_ns.saturating_add(period_ns);
-        self.push(Input::Tick { time: Timestamp::from_nanos(self.now_ns) });
+        self.push(Record::tick(Timestamp::from_nanos(self.now_ns)));
     }
 
     fn protected(&mut self, profile: Profile, data_id: u16, mut payload: [u8; 8]) {

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch::io::log::{Batch, LogOptions, LogSource};
+use packwatch::monitor::Record;
 
 use super::source::Source;
 

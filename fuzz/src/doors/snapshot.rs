@@ -19,7 +19,7 @@ fn stored() -> &'static str {
     STORED.get_or_init(|| {
         let mut monitor = Monitor::new(world::config().monitor.clone());
         let mut out = Outputs::default();
-        records(&mut Source::new(DRIVE)).iter().for_each(|record| monitor.handle(record.input(), &mut out));
+        records(&mut Source::new(DRIVE)).iter().for_each(|record| monitor.handle(record, &mut out));
         serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document")
     })
 }
@@ -71,7 +71,7 @@ pub fn snapshot(data: &[u8]) {
     let mut out = Outputs { want_estimates: true, ..Outputs::default() };
     for record in records(&mut Source::new(&DRIVE[..16])).iter().take(400) {
         out.clear();
-        monitor.handle(record.input(), &mut out);
+        monitor.handle(record, &mut out);
         check(record, &out);
     }
     let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");

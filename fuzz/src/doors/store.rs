@@ -44,8 +44,8 @@ fn write(path: &Path) {
     let (mut out, mut now) = (Outputs::default(), Timestamp::ZERO);
     for record in records(&mut Source::new(DRIVE)) {
         out.clear();
-        monitor.handle(record.input(), &mut out);
-        now = record.input().time();
+        monitor.handle(&record, &mut out);
+        now = record.time;
         store.learned(&out.events, &monitor, now);
     }
     store.finish(&monitor, now);

@@ -19,6 +19,7 @@
 //! keep an alarm from ever being raised.
 
 use serde::{Deserialize, Serialize};
+use strum::IntoStaticStr;
 
 use super::limit::LimitCheck;
 use super::{Observation, RuleConfig};
@@ -68,8 +69,9 @@ impl AlarmState {
 }
 
 /// A change of an alarm that is published.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum Change {
     /// Raised, or raised again while latched.
     Raised,

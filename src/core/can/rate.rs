@@ -68,7 +68,6 @@ pub struct MessageRate {
     /// Highest steady rate, 1/s.
     learned_per_s: Option<f64>,
     /// Part of its frames that come after a short interval.
-    #[serde(default)]
     usual_short: f64,
     /// Rate of the latest windows, and for how many it has been steady.
     candidate: f64,

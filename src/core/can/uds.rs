@@ -129,7 +129,6 @@ impl Answer {
 
 /// What came from a controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(default)]
 pub struct ControllerCounts {
     /// Whole answers that are read.
     pub read: u64,

@@ -62,7 +62,6 @@ pub struct ModelCheck {
     since_as: f64,
     /// Duration of the latest step, s.
     step_s: f64,
-    #[serde(default)]
     voltages: VoltageSums,
     /// Largest sum of the witnesses over [`LIMIT`] in this window.
     mismatch: f64,

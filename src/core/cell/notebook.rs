@@ -55,7 +55,6 @@ pub struct Row {
     /// Duration, s.
     pub seconds: f32,
     /// Time since the stretch began, s.
-    #[serde(default)]
     pub elapsed_s: f32,
     /// Charge taken out since the stretch began, Ah.
     pub charge_ah: f32,
@@ -105,7 +104,6 @@ struct Readings {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct RowSums {
     seconds: f64,
-    #[serde(default)]
     elapsed_s: f64,
     charge_ah: f64,
     voltage_v: f64,
@@ -122,13 +120,11 @@ struct RowSums {
 struct Stretch {
     charge_ah: f64,
     /// Time since it began, s.
-    #[serde(default)]
     elapsed_s: f64,
     filtered_a: [f64; FILTERS],
     /// Current, fastest filter and voltage of the reading before.
     last: [f64; 3],
     /// Time of rest so far, s.
-    #[serde(default)]
     rest_s: f64,
     row: RowSums,
 }

@@ -8,9 +8,7 @@ pub mod task;
 
 use serde::{Deserialize, Serialize};
 
-use super::chemistry::{
-    CurveOfCells, FACTOR_SOC, Label, LabelPrior, ResistanceFactors, TEMPERATURE_NODES, usual_cold_sag_v,
-};
+use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, LabelPrior, ResistanceFactors, TEMPERATURE_NODES};
 use super::config::EstimatorConfig;
 use super::model::{CellModel, ModelSpread};
 use super::notebook::Row;
@@ -41,7 +39,6 @@ pub struct OwnModel {
     /// Standard deviation of ln(voltage drop) at the temperatures of the tables.
     pub drop_std: [f64; TEMPERATURE_NODES],
     /// How far the curve is lower at 0 degrees C than at 25, V.
-    #[serde(default = "usual_cold_sag_v")]
     pub cold_sag_v: ScalarGaussian,
     /// Capacity, Ah.
     pub capacity: ScalarGaussian,

@@ -137,7 +137,6 @@ pub struct CellFaultDetector {
     is_balanced: bool,
     /// The cell that shows the least charge, where there is no doubt.
     lowest: Option<usize>,
-    #[serde(default)]
     gain: Gain,
     findings: Vec<CellFault>,
 }

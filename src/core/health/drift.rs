@@ -38,7 +38,6 @@ pub struct DriftFilter {
 struct StoredDrift {
     x: Vec<f64>,
     p: Vec<Vec<f64>>,
-    #[serde(default)]
     by_end: [[f64; N]; END_ERRORS],
 }
 

@@ -112,10 +112,8 @@ pub struct Learner {
     /// Capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
     /// Cells whose sample filter was restarted in this half-cycle.
-    #[serde(default)]
     in_doubt: Vec<usize>,
     /// Offset of the current sensor.
-    #[serde(default)]
     offset: CurrentOffset,
     /// Per cell: half-cycles leave the capacity as it is.
     #[serde(skip)]

@@ -40,10 +40,8 @@ pub struct RechargeTimer {
     last: Option<(Timestamp, f64)>,
     entered: Option<Timestamp>,
     /// Lowest and highest SOC of this charge.
-    #[serde(default)]
     range: Option<(f64, f64)>,
     /// Raw period of this charge, s.
-    #[serde(default)]
     raw_s: Option<f64>,
 }
 

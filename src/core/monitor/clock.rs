@@ -3,32 +3,32 @@
 //! In: the time of each input. Out: the time the stages work with, and a [`TimeJump`] where an input does not follow
 //! closely on the one before. A step back within [`MERGE_TOLERANCE_NS`] is counted and treated as "now".
 
-use super::MERGE_TOLERANCE_NS;
+use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
 /// Without any input, not even a tick, for this long, the computer was asleep, s: 500 ticks.
-pub(super) const ASLEEP_S: f64 = 5.0;
+pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
-pub(super) const HOUSEKEEPING_S: f64 = 0.1;
+pub(crate) const HOUSEKEEPING_S: f64 = 0.1;
 
 /// The clock of one monitor.
 #[derive(Debug, Default)]
-pub(super) struct Clock {
+pub(crate) struct Clock {
     /// Whether an input has come.
-    pub(super) has_started: bool,
+    pub(crate) has_started: bool,
     /// Time of the latest input that did something.
-    pub(super) now: Timestamp,
+    pub(crate) now: Timestamp,
     /// Inputs with a time before that of an earlier one.
-    pub(super) time_backwards: u64,
+    pub(crate) time_backwards: u64,
     /// When a tick next does something; `None` = not started.
-    pub(super) due: Option<Timestamp>,
+    pub(crate) due: Option<Timestamp>,
 }
 
 /// An input that does not follow closely on the one before.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum TimeJump {
+pub(crate) enum TimeJump {
     /// The clock was set back by this much, s: how much time passed is unknown.
     Backwards {
         /// Size of the step, s.
@@ -44,14 +44,14 @@ pub(super) enum TimeJump {
 impl Clock {
     /// Whether a tick at `time` comes too early to do anything.
     #[inline]
-    pub(super) fn is_before_due(&self, time: Timestamp) -> bool {
+    pub(crate) fn is_before_due(&self, time: Timestamp) -> bool {
         self.due.is_some_and(|due| time < due)
     }
 
     /// Moves to the time of an input. After a jump the time is still that before it: the caller ends what was under
     /// way, then [sets](Self::set) the new time.
     #[inline]
-    pub(super) fn advance(&mut self, time: Timestamp) -> Option<TimeJump> {
+    pub(crate) fn advance(&mut self, time: Timestamp) -> Option<TimeJump> {
         if (0..=ASLEEP_NS).contains(&time.nanos().saturating_sub(self.now.nanos())) {
             self.now = time;
             return None;

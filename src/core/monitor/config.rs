@@ -2,14 +2,13 @@
 //!
 //! Each stage keeps its part. The whole is assembled again only to compare it with another one.
 
-use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
-use crate::alarm::RuleConfig;
+use crate::alarm::{Rule, RuleConfig, Severity};
 use crate::can::CanId;
 use crate::can::decode::{Binding, InputMap};
-use crate::can::encode::LayoutMessage;
+use crate::can::encode::{CommandPlan, LayoutMessage, OutputPlan};
 use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
-use crate::can::j1939::Node;
+use crate::can::j1939::{Lamp, Node, NodeConfig, TroubleCode};
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
 use crate::can::uds::{self, Answer};
@@ -77,6 +76,79 @@ pub struct SupplyConfig {
     pub max_age_s: f64,
 }
 
+/// Commands that come from the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommandConfig {
+    /// Interface of the command frames.
+    pub bus: BusIndex,
+    /// Their layout. Authenticated frames are judged by the command gate; protection is checked by one of the guards.
+    pub plan: CommandPlan,
+}
+
+/// The daemon's sent frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutputConfig {
+    /// Layouts and identifiers.
+    pub plan: OutputPlan,
+    /// Interfaces they are sent on.
+    pub buses: Vec<BusIndex>,
+    /// Period of the status frame, s.
+    pub status_period_s: f64,
+    /// Period of the health frame (all its pages), s.
+    pub health_period_s: f64,
+    /// Period of the alarm frame, s: each raised alarm once in it, as far as the budget of frames allows.
+    pub alarm_period_s: f64,
+    /// Period of the digest (all its pages), s.
+    pub digest_period_s: f64,
+}
+
+/// J1939 as configured.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct J1939Config {
+    /// Interface the node is on.
+    pub bus: BusIndex,
+    /// Its name and addresses.
+    pub node: NodeConfig,
+    /// Trouble code of each threshold of each rule.
+    pub alarms: Vec<AlarmCode>,
+    /// Code that is active while a test runs.
+    pub test_code: TroubleCode,
+}
+
+/// Trouble code of the alarms of one threshold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AlarmCode {
+    /// The rule.
+    pub rule: Rule,
+    /// The threshold's severity.
+    pub severity: Severity,
+    /// Its code, with no occurrence counted.
+    pub code: TroubleCode,
+    /// The lamp it lights.
+    pub lamp: Lamp,
+}
+
+/// What a new configuration changed.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Reconfigured {
+    /// The tables of the file with other settings now, as they are written there.
+    pub changed: Vec<&'static str>,
+    /// Alarms, raised or past, that ended because no threshold watches them any more.
+    pub alarms_ended: usize,
+}
+
+/// A setting that cannot change while the program runs.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key}: {found}, running with {allowed}: needs a restart")]
+pub struct ReconfigureError {
+    /// The key, or the table it is in.
+    pub key: &'static str,
+    /// In the new configuration.
+    pub found: String,
+    /// As it runs.
+    pub allowed: String,
+}
+
 impl MonitorConfig {
     /// Whether every frame of an interface is received: requests are sent there, and only where the bus is awake.
     pub fn wants_all(&self, bus: BusIndex) -> bool {
@@ -110,7 +182,7 @@ impl MonitorConfig {
     }
 
     /// Identifiers of the frames of `[output]`, on each of its interfaces.
-    pub(super) fn own_ids(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
+    pub(crate) fn own_ids(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         let of = |output: &OutputConfig| {
             let ids = output.plan.ids();
             output.buses.clone().into_iter().flat_map(move |bus| ids.clone().into_iter().map(move |id| (bus, id)))
@@ -120,7 +192,7 @@ impl MonitorConfig {
 
     /// Unprotected input messages with the cycle time of their frames, s, where it is known: that of a multiplexed message may be
     /// that of each page.
-    pub(super) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
+    pub(crate) fn unprotected(&self) -> impl Iterator<Item = (BusIndex, CanId, Option<f64>)> + '_ {
         let is_protected = |bus, id| self.guards.iter().any(|guard| (guard.bus, guard.id) == (bus, id));
         let cycle_s = |bus, id| self.cycle_times_s.iter().find(|of| (of.0, of.1) == (bus, id)).map(|of| of.2);
         let has_pages = |bus, id| {
@@ -156,7 +228,7 @@ impl MonitorConfig {
     }
 
     /// Checks whether a monitor of this configuration can continue with `new`.
-    pub(super) fn check_fits(&self, new: &Self) -> Result<(), ReconfigureError> {
+    pub(crate) fn check_fits(&self, new: &Self) -> Result<(), ReconfigureError> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
         let counts = [
             ("[[interface]]", new.interfaces, self.interfaces),
@@ -204,7 +276,7 @@ impl MonitorConfig {
     }
 
     /// Whether `new` gives the same estimate for a sample.
-    pub(super) fn estimates_as(&self, new: &Self) -> bool {
+    pub(crate) fn estimates_as(&self, new: &Self) -> bool {
         self.model == new.model
             && self.modules == new.modules
             && self.estimator == new.estimator
@@ -213,7 +285,7 @@ impl MonitorConfig {
     }
 
     /// The tables with other settings in `new`.
-    pub(super) fn changed_tables(&self, new: &Self) -> Vec<&'static str> {
+    pub(crate) fn changed_tables(&self, new: &Self) -> Vec<&'static str> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
         let limits = |sample: &SampleConfig| {
             (sample.current, sample.voltage, sample.temperature, sample.reported_soc, sample.reported_soh)

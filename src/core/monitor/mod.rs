@@ -1,55 +1,32 @@
-//! The core's face: inputs in, outputs out. Never reads a clock, a file or a socket, and never logs.
+//! The core's face: records in, outputs out. Never reads a clock, a file or a socket, and never logs.
 //!
-//! Inputs come in the order in which they happened; the same inputs give the same outputs, byte for byte. Bad input is an
+//! Records come in the order in which they happened; the same records give the same outputs, byte for byte. A bad record is an
 //! event and a count, never a panic. The data path, one file per stage:
 //!
 //! ```text
-//! frame ─▶ intake ─▶ sampling ─▶ estimation ─▶ learning ─▶ alarming ─▶ sender
+//! frame ─▶ intake ─▶ sampling ─▶ estimation ─▶ learning ─▶ alarming ─▶ sending
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * `intake`, `command_gate`: flood limit, end-to-end check, commands and their authentication, interfaces; `sampling`, `pack_memory`: signals, pack identity;
-//! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
-//! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
-//! * `sender`, `alarm_queue`, `digest`, `j1939`: cyclic frames, alarm frames and their budget, trouble codes;
-//! * `stages` wires all of these; `clock`, `snapshot`, `relearn`, `reconfigure`, `statistics`, `view` go with the whole.
+//! * `message`: what goes in and out; knows no stage;
+//! * `stage`: the stages; each knows at most those before it;
+//! * `stages`: wires the stages behind the intake, and passes their values to the rules; remembers exchanged packs;
+//! * `snapshot`: what is stored; `lifecycle`: restores it, relearns from a history, reconfigures;
+//! * `clock`, `config`, `view`: go with the whole.
 
-mod alarm_queue;
-mod alarming;
-mod batch;
-mod buses;
 mod clock;
-mod command_gate;
 mod config;
-mod continuation;
-mod diagnosing;
-mod digest;
-mod estimation;
-mod event;
-mod input;
-mod intake;
-mod j1939;
-mod learning;
-mod life;
-mod modelling;
-mod outputs;
-mod pack_memory;
-mod publisher;
-mod reconfigure;
-mod relearn;
-mod sampling;
-mod sender;
-mod sleep;
+mod lifecycle;
+mod message;
 mod snapshot;
+mod stage;
 mod stages;
-mod statistics;
 mod view;
-mod watch;
 
 use clock::{ASLEEP_S, Clock, HOUSEKEEPING_S, TimeJump};
-use intake::{Intake, ReceivedFrame};
-use sleep::Silence;
 use snapshot::{Beginning, PendingRestore};
+use stage::intake::{Intake, ReceivedFrame};
+use stage::sleep::Silence;
 use stages::Stages;
 
 use crate::alarm::CommandOutcome;
@@ -61,31 +38,31 @@ use crate::can::uds::Heard;
 use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp, bounds};
 
-pub use command_gate::CommandCounts;
-pub use config::{MonitorConfig, SupplyConfig};
-pub use event::{Event, EventKind};
-pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
-pub use intake::{CommandConfig, ControllerCount};
-pub use j1939::{AlarmCode, J1939Config};
-pub use learning::Throughput;
-pub use modelling::{ModelChange, ModelState, ModelView};
-pub use outputs::{Estimate, MeasuredValues, Outputs, Secured, Transmit, Validity};
-pub use reconfigure::{ReconfigureError, Reconfigured};
-pub use relearn::LearnedCell;
-pub use sender::{MAX_TEST_S, OutputConfig};
+pub use config::{
+    AlarmCode, CommandConfig, J1939Config, MonitorConfig, OutputConfig, ReconfigureError, Reconfigured, SupplyConfig,
+};
+pub use message::{
+    BusEvent, CellView, Command, Downtime, DowntimeParseError, Estimate, Event, EventKind, LearnedCell,
+    MERGE_TOLERANCE_NS, MeasuredValues, ModelState, Outputs, PackView, Record, RecordKind, ReportedState, Secured,
+    Source, TICK_PERIOD_MS, Transmit, Validity,
+};
 pub use snapshot::{RestoreError, Snapshot};
-pub use statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
-pub use view::{CellView, PackView, ReportedState};
+pub use stage::intake::ControllerCount;
+pub use stage::intake::command_gate::CommandCounts;
+pub use stage::learning::Throughput;
+pub use stage::modelling::{ModelChange, ModelView};
+pub use stage::sending::MAX_TEST_S;
+pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 
 /// The pure core.
 #[derive(Debug)]
 pub struct Monitor {
-    config: MonitorConfig,
-    clock: Clock,
-    intake: Intake,
-    stages: Stages,
+    pub(crate) config: MonitorConfig,
+    pub(crate) clock: Clock,
+    pub(crate) intake: Intake,
+    pub(crate) stages: Stages,
     /// A stored state that waits for the first input.
-    pending: Option<PendingRestore>,
+    pub(crate) pending: Option<PendingRestore>,
 }
 
 /// The range of stamps.
@@ -99,64 +76,74 @@ impl Monitor {
         Self { config, clock: Clock::default(), intake, stages, pending: None }
     }
 
-    /// Takes one input; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
+    /// Handles one record; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
     /// driver may leave it out.
-    pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
+    pub fn handle(&mut self, record: &Record, out: &mut Outputs) {
+        if matches!(record.kind, RecordKind::Reload | RecordKind::Restore { .. }) {
+            return;
+        }
         let (first_event, first_frame) = (out.events.len(), out.frames.len());
-        self.dispatch(input, out);
+        self.dispatch(record, out);
         for sent in &out.frames[first_frame..] {
             self.intake.own.note_sent(sent.time, sent.bus, &sent.frame);
         }
-        if self.stages.sender.poller.is_some() {
+        if self.stages.sending.poller.is_some() {
             // Own requests do not come back from the bus: their answers were asked for all the same.
             for sent in &out.frames[first_frame..] {
                 self.intake.listener.handle(sent.time, sent.bus, &sent.frame);
             }
         }
-        self.stages.statistics.note(&input, &out.events[first_event..]);
+        self.stages.statistics.note(&record.kind, &out.events[first_event..]);
     }
 
-    fn dispatch(&mut self, input: Input<'_>, out: &mut Outputs) {
+    fn dispatch(&mut self, record: &Record, out: &mut Outputs) {
         // A stamp beyond this is wrong, and differences of stamps would leave the clock's range.
-        let time = input.time().clamp(EARLIEST, LATEST);
+        let time = record.time.clamp(EARLIEST, LATEST);
         if !self.clock.has_started {
             self.start(time, out);
         }
-        match input {
-            Input::Frame { bus, frame, .. } | Input::SecuredFrame { bus, frame, .. } => {
-                self.advance(time, out);
-                let freshness = match input {
-                    Input::SecuredFrame { freshness, .. } => freshness,
-                    _ => None,
-                };
-                self.handle_frame(ReceivedFrame { bus, frame, freshness }, out);
-                if self.stages.sender.take_rescheduled() {
-                    self.find_due();
-                }
-                if self.stages.sender.poller.is_some() {
-                    self.stages.poll_after_frame(self.clock.now, bus, frame, out);
-                    self.find_due();
-                }
-                if self.stages.sender.j1939.is_some() {
-                    self.stages.sender.handle_j1939_frame(self.clock.now, bus, frame, out);
-                    self.find_due();
-                }
+        match &record.kind {
+            RecordKind::Frame { bus, frame } => self.handle_frame_at(time, *bus, frame, None, out),
+            RecordKind::SecuredFrame { bus, frame, freshness } => {
+                self.handle_frame_at(time, *bus, frame, *freshness, out);
             }
-            Input::Tick { .. } if self.clock.is_before_due(time) => {}
-            Input::Tick { .. }
-            | Input::UnknownGap { .. }
-            | Input::Command { .. }
-            | Input::Store { .. }
-            | Input::Bus { .. } => {
+            RecordKind::Tick if self.clock.is_before_due(time) => {}
+            RecordKind::UnknownGap => {
                 self.stages.step_waiting(self.clock.now, true, out);
-                if matches!(input, Input::UnknownGap { .. }) {
-                    self.handle_unknown_gap(time, out);
-                } else {
-                    self.advance(time, out);
-                    self.handle_occasional(input, out);
-                }
+                self.handle_unknown_gap(time, out);
                 self.find_due();
             }
+            kind => {
+                self.stages.step_waiting(self.clock.now, true, out);
+                self.advance(time, out);
+                self.handle_occasional(kind, out);
+                self.find_due();
+            }
+        }
+    }
+
+    /// Moves the clock to a frame, and handles it.
+    #[inline]
+    fn handle_frame_at(
+        &mut self,
+        time: Timestamp,
+        bus: BusIndex,
+        frame: &Frame,
+        freshness: Option<u64>,
+        out: &mut Outputs,
+    ) {
+        self.advance(time, out);
+        self.handle_frame(ReceivedFrame { bus, frame, freshness }, out);
+        if self.stages.sending.take_rescheduled() {
+            self.find_due();
+        }
+        if self.stages.sending.poller.is_some() {
+            self.stages.poll_after_frame(self.clock.now, bus, frame, out);
+            self.find_due();
+        }
+        if self.stages.sending.j1939.is_some() {
+            self.stages.sending.handle_j1939_frame(self.clock.now, bus, frame, out);
+            self.find_due();
         }
     }
 
@@ -176,7 +163,7 @@ impl Monitor {
             let bad_commands = &mut stages.statistics.bad_commands;
             *bad_commands = bad_commands.saturating_add(u64::from(outcome.is_err()));
             let counter_expected = intake.next_command_counter(commands);
-            stages.sender.send_reply(now, bus, &ReplyFields { outcome, command, counter_expected }, out);
+            stages.sending.send_reply(now, bus, &ReplyFields { outcome, command, counter_expected }, out);
             return;
         }
         let intact = admission.readings();
@@ -209,13 +196,13 @@ impl Monitor {
             Heard::Begun { controller } => {
                 moments[controller] = Some(stages.sampling.sampler.moment(now));
                 let begun = |poller: &mut Poller, out: &mut _| poller.handle_begun(now, &controllers[controller], out);
-                stages.sender.poll_with(now, out, begun);
+                stages.sending.poll_with(now, out, begun);
             }
             Heard::Continued { controller } => {
-                stages.sender.poll_with(now, out, |poller, _| poller.handle_continued(now, &controllers[controller]));
+                stages.sending.poll_with(now, out, |poller, _| poller.handle_continued(now, &controllers[controller]));
             }
             Heard::Refused { controller, refusal } => {
-                stages.sender.poll_with(now, out, |poller, out| {
+                stages.sending.poll_with(now, out, |poller, out| {
                     poller.handle_refusal(now, &controllers[controller], refusal, out);
                 });
             }
@@ -228,20 +215,19 @@ impl Monitor {
                 for reading in answer.readings(data) {
                     stages.handle_answer_reading(now, bus, moment.as_ref(), reading, out);
                 }
-                stages.sender.poll_with(now, out, |poller, out| poller.handle_answer(now, &answer.question, out));
+                stages.sending.poll_with(now, out, |poller, out| poller.handle_answer(now, &answer.question, out));
             }
         }
         intake.report(now, out);
     }
 
-    /// Takes an input that is neither a frame nor a gap, at its time.
-    fn handle_occasional(&mut self, input: Input<'_>, out: &mut Outputs) {
+    /// Handles ticks, commands, store and interface reports.
+    fn handle_occasional(&mut self, kind: &RecordKind, out: &mut Outputs) {
         let Self { config, intake, stages, .. } = self;
         let now = self.clock.now;
-        match input {
-            Input::Frame { .. } | Input::SecuredFrame { .. } | Input::UnknownGap { .. } => {}
-            Input::Tick { .. } => {
-                if stages.sender.take_housekeeping_due(now, HOUSEKEEPING_S) {
+        match *kind {
+            RecordKind::Tick => {
+                if stages.sending.take_housekeeping_due(now, HOUSEKEEPING_S) {
                     intake.poll(now, out);
                     let silence = stages.silence(now);
                     if silence == Silence::Begins {
@@ -251,31 +237,37 @@ impl Monitor {
                     stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
-                if stages.sender.take_freshness_due(now) {
+                if stages.sending.take_freshness_due(now) {
                     let freshness = intake.gate_of_commands.announce(now);
-                    stages.sender.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
+                    stages.sending.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
                 }
                 stages.send_due(now, out);
             }
-            Input::Command { command, .. } => {
+            RecordKind::Command { command } => {
                 stages.handle_command(now, Source::Local, command, out);
             }
-            Input::Store { works, .. } => {
-                if stages.alarming.store.handle_report(now, works) {
+            RecordKind::Store { works } => {
+                if stages.alarming.state.store.handle_report(now, works) {
                     out.events.push(Event { time: now, kind: EventKind::Store { works } });
                 }
             }
-            Input::Bus { bus, event, .. } => {
+            RecordKind::Bus { bus, event } => {
                 intake.handle_bus_event(now, bus, event, out);
                 if event == BusEvent::Up && config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
-                    stages.sender.claim_address(now, out);
+                    stages.sending.claim_address(now, out);
                 }
             }
+            // Frames and gaps are handled before; the rest is for the driver.
+            RecordKind::Frame { .. }
+            | RecordKind::SecuredFrame { .. }
+            | RecordKind::UnknownGap
+            | RecordKind::Reload
+            | RecordKind::Restore { .. } => {}
         }
     }
 
     /// How the authenticator of a frame is checked; `None` = the frame is not of an authenticated message. The driver, who has
-    /// the key, passes such a frame as [`Input::SecuredFrame`] instead of [`Input::Frame`], which counts as forged.
+    /// the key, passes such a frame as [`RecordKind::SecuredFrame`] instead of [`RecordKind::Frame`], which counts as forged.
     #[inline]
     pub fn mac_check(&self, bus: BusIndex, frame: &Frame) -> Option<MacCheck> {
         let commands = self.config.commands.as_ref()?;
@@ -311,13 +303,13 @@ impl Monitor {
     }
 
     fn find_due(&mut self) {
-        self.clock.due = self.clock.has_started.then(|| self.stages.sender.next_due());
+        self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
     /// Begins at the time of the first input, with the stored state that waits, if there is one.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
-        self.stages.sender.restart(time);
+        self.stages.sending.restart(time);
         let beginning = self.apply_pending(time, out);
         if beginning == Beginning::Continued {
             // Whether another run continued from the same state cannot be known: its commands must not be accepted again.
@@ -339,17 +331,17 @@ impl Monitor {
         }
         self.intake.gate_of_commands.begin(time);
         if beginning == Beginning::New {
-            stages.sender.begin_freshness(time);
+            stages.sending.begin_freshness(time);
         } else {
             stages.restate_known(taken, was_brief, false, out);
         }
         if beginning == Beginning::RestoredAgeless {
-            // Claims the address, too.
+            // Also claims the J1939 address.
             self.handle_unknown_gap(time, out);
         }
         // After a longer time `advance` finds the gap and claims the address.
         if was_brief {
-            self.stages.sender.claim_address(time, out);
+            self.stages.sending.claim_address(time, out);
         }
         self.find_due();
     }
@@ -357,7 +349,7 @@ impl Monitor {
     /// Begins the freshness of commands and sent frames beyond that of any earlier run.
     fn begin_freshness(&mut self, now: Timestamp) {
         self.intake.gate_of_commands.begin(now);
-        self.stages.sender.begin_freshness(now);
+        self.stages.sending.begin_freshness(now);
     }
 
     /// Moves the clock to the time of an input.

@@ -3,17 +3,23 @@
 //! Each stage owns its configuration and state; this file alone knows their order. Every function takes the time of the
 //! input at hand.
 
-use super::alarming::Alarming;
-use super::diagnosing::Diagnosing;
-use super::estimation::Estimation;
-use super::learning::Learning;
-use super::modelling::Modelling;
-use super::pack_memory::PackMemory;
-use super::publisher::{Publisher, learned};
-use super::sampling::Sampling;
-use super::sender::Sender;
-use super::sleep::{BusSleep, Silence};
-use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
+pub(crate) mod pack_memory;
+pub(crate) mod watch;
+
+use pack_memory::PackMemory;
+
+use super::config::MonitorConfig;
+use super::message::{Command, Estimate, Event, EventKind, Outputs, Source, Validity};
+use super::stage::alarming::Alarming;
+use super::stage::estimation::Estimation;
+use super::stage::findings::Findings;
+use super::stage::learning::Learning;
+use super::stage::modelling::Modelling;
+use super::stage::publisher::{Publisher, learned};
+use super::stage::sampling::Sampling;
+use super::stage::sending::Sending;
+use super::stage::sleep::{BusSleep, QUIET_S, Silence};
+use super::stage::statistics::Statistics;
 use crate::alarm::{AlarmInput, CommandOutcome, Observation, Rule};
 use crate::can::Frame;
 use crate::can::encode::{HealthFields, StatusFields};
@@ -25,52 +31,52 @@ use crate::sample::{CellSample, Moment};
 
 /// All stages behind the intake.
 #[derive(Debug)]
-pub(super) struct Stages {
-    pub(super) sampling: Sampling,
-    pub(super) estimation: Estimation,
-    pub(super) modelling: Modelling,
-    pub(super) learning: Learning,
-    pub(super) diagnosing: Diagnosing,
-    pub(super) alarming: Alarming,
-    pub(super) sender: Sender,
-    pub(super) statistics: Statistics,
-    pub(super) sleep: BusSleep,
-    pub(super) packs: PackMemory,
+pub(crate) struct Stages {
+    pub(crate) sampling: Sampling,
+    pub(crate) estimation: Estimation,
+    pub(crate) modelling: Modelling,
+    pub(crate) learning: Learning,
+    pub(crate) findings: Findings,
+    pub(crate) alarming: Alarming,
+    pub(crate) sending: Sending,
+    pub(crate) statistics: Statistics,
+    pub(crate) sleep: BusSleep,
+    pub(crate) packs: PackMemory,
 }
 
 impl Stages {
-    pub(super) fn new(config: &MonitorConfig) -> Self {
+    pub(crate) fn new(config: &MonitorConfig) -> Self {
         let estimation = Estimation::new(config);
         Self {
             sampling: Sampling::new(config),
             modelling: Modelling::new(config),
             learning: Learning::new(config, &estimation.bank),
-            diagnosing: Diagnosing::new(config, estimation.bank.own_cells()),
+            findings: Findings::new(config, estimation.bank.own_cells()),
             estimation,
             alarming: Alarming::new(config),
-            sender: Sender::new(config),
+            sending: Sending::new(config),
             statistics: Statistics::default(),
             sleep: BusSleep::new(config),
             packs: PackMemory::default(),
         }
     }
 
-    pub(super) fn publisher<'a>(&'a mut self, now: Timestamp, out: &'a mut Outputs) -> Publisher<'a> {
+    pub(crate) fn publisher<'a>(&'a mut self, now: Timestamp, out: &'a mut Outputs) -> Publisher<'a> {
         self.learning_and_publisher(now, out).1
     }
 
-    pub(super) fn learning_and_publisher<'a>(
+    pub(crate) fn learning_and_publisher<'a>(
         &'a mut self,
         now: Timestamp,
         out: &'a mut Outputs,
     ) -> (&'a mut Learning, Publisher<'a>) {
-        let publisher = Publisher { now, alarming: &mut self.alarming, sender: &mut self.sender, out };
+        let publisher = Publisher { now, alarming: &mut self.alarming, sending: &mut self.sending, out };
         (&mut self.learning, publisher)
     }
 
     /// Takes a reading. Nearly all are ordinary cell voltages: they alone are inlined into the loop over a frame's signals.
     #[inline]
-    pub(super) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
+    pub(crate) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
             && let Some(sample) = self.sampling.take_ordinary_voltage(now, cell, voltage_v)
         {
@@ -84,8 +90,8 @@ impl Stages {
     fn handle_other_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
             Channel::PackIdentity => return self.handle_identity(now, bus, reading, out),
-            Channel::Balancing(cell) => return self.diagnosing.handle_balancing(now, cell, reading.value),
-            Channel::SupplyVoltage => return self.sender.handle_supply(now, reading.value),
+            Channel::Balancing(cell) => return self.findings.handle_balancing(now, cell, reading.value),
+            Channel::SupplyVoltage => return self.sending.handle_supply(now, reading.value),
             _ => {}
         }
         let sample = self.sampling.handle_reading(now, reading, out);
@@ -98,9 +104,9 @@ impl Stages {
     }
 
     /// Passes a frame of others to the poller, and what the car does now.
-    pub(super) fn poll_after_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+    pub(crate) fn poll_after_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let state = self.car_state();
-        self.sender.poll_with(now, out, |poller, out| {
+        self.sending.poll_with(now, out, |poller, out| {
             poller.set_state(now, state);
             poller.handle_frame(now, bus, frame, out);
         });
@@ -116,7 +122,7 @@ impl Stages {
     }
 
     /// Takes a reading of a diagnostic answer, whose values may be of an earlier moment.
-    pub(super) fn handle_answer_reading(
+    pub(crate) fn handle_answer_reading(
         &mut self,
         now: Timestamp,
         bus: BusIndex,
@@ -173,13 +179,13 @@ impl Stages {
         self.step_waiting(now, true, out);
         self.estimation.batch.begin();
         let all_fresh = self.sampling.sampler.voltages_fresh(now);
-        let Self { estimation, learning, alarming, sender, .. } = self;
-        learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sender, out });
+        let Self { estimation, learning, alarming, sending, .. } = self;
+        learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sending, out });
     }
 
     /// Steps the cells with a waiting sample, without waiting for the others: before anything that uses estimates.
     /// `is_current`: the samples are of now, so the rule about innovations takes them.
-    pub(super) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
+    pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
         }
@@ -196,7 +202,7 @@ impl Stages {
         if is_quiet && is_current {
             self.show_innovations(now, &samples);
         }
-        let has_row_ended = self.diagnosing.observe(now, &samples, &self.estimation, &self.learning, out);
+        let has_row_ended = self.findings.observe(now, &samples, &self.estimation, &self.learning, out);
         self.estimation.finish(samples, &mut self.learning.state.learner);
         if has_row_ended {
             self.publish_diagnosis(now, true, out);
@@ -216,12 +222,12 @@ impl Stages {
     }
 
     /// A cell's estimate after its latest step; `None` before the first.
-    pub(super) fn estimate(&self, index: usize) -> Option<Estimate> {
+    pub(crate) fn estimate(&self, index: usize) -> Option<Estimate> {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
     /// Takes the pack current into the mode detector; `None` = stale. A change of mode is learned from.
-    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
+    fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
         if observed.change.is_none() && !observed.candidate_begins {
@@ -239,8 +245,8 @@ impl Stages {
     }
 
     fn complete_mode(&mut self, now: Timestamp, change: ModeChange, out: &mut Outputs) {
-        let Self { estimation, modelling, learning, alarming, sender, .. } = self;
-        let mut publisher = Publisher { now, alarming, sender, out };
+        let Self { estimation, modelling, learning, alarming, sending, .. } = self;
+        let mut publisher = Publisher { now, alarming, sending, out };
         learning.complete_mode(change, &mut estimation.bank, modelling.teaches_capacity(), &mut publisher);
     }
 
@@ -280,7 +286,7 @@ impl Stages {
     }
 
     /// Executes a command.
-    pub(super) fn handle_command(
+    pub(crate) fn handle_command(
         &mut self,
         now: Timestamp,
         source: Source,
@@ -289,7 +295,7 @@ impl Stages {
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         if command == Command::PackReplaced {
-            // Whatever its number is: what was learned is not of the pack that is connected.
+            // Regardless of its number: learned values belong to the old pack.
             self.packs.drop_aside();
         }
         let CommandOutcome { changed, refused } = match command {
@@ -301,15 +307,15 @@ impl Stages {
                 CommandOutcome { changed, refused: 0 }
             }
             Command::Poll { standby } => {
-                let is_there = self.sender.poller.is_some();
-                self.sender.poll_with(now, out, |poller, out| {
+                let is_there = self.sending.poller.is_some();
+                self.sending.poll_with(now, out, |poller, out| {
                     poller.set_standby(standby);
                     poller.poll(now, out);
                 });
                 CommandOutcome { changed: u32::from(is_there), refused: u32::from(!is_there) }
             }
             Command::Test { rule, seconds } => {
-                let has_output = self.sender.start_test(now, rule, seconds, &self.alarming.engine, out);
+                let has_output = self.sending.start_test(now, rule, seconds, &self.alarming.engine, out);
                 CommandOutcome { changed: 0, refused: u32::from(!has_output) }
             }
         };
@@ -331,9 +337,9 @@ impl Stages {
         self.estimation.forget(&self.modelling);
         self.estimation.bank.set_current_offset_std(self.learning.config.capacity.current_offset_std_a);
         self.learning.forget(&self.estimation.bank);
-        self.diagnosing.forget();
+        self.findings.forget();
         self.forget_pack_state();
-        self.alarming.knows_all_valid = false;
+        self.alarming.state.knows_all_valid = false;
         self.alarming.faulty_channels.clear();
         for cell in self.estimation.cell_indices() {
             self.publisher(now, out).observe(Rule::ChannelFaulty, Some(cell), Observation::default());
@@ -349,13 +355,13 @@ impl Stages {
 
     /// Ends what was under way: no input came after `now`. The mode is unknown from there, no period is timed over it, and
     /// the pack's values wait for a new reading of every cell.
-    pub(super) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
+    pub(crate) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
         if self.modelling.is_due() {
             self.learn_model(now, out);
         }
         self.modelling.end_stretch();
-        self.sender.poll_with(now, out, |poller, _| poller.restart());
+        self.sending.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
         self.estimation.bank.change_all(|_, cell| cell.note_sleep());
@@ -363,15 +369,15 @@ impl Stages {
     }
 
     /// Continues at `time` after a time asleep.
-    pub(super) fn wake(&mut self, time: Timestamp, out: &mut Outputs) {
+    pub(crate) fn wake(&mut self, time: Timestamp, out: &mut Outputs) {
         self.sampling.sampler.wake(time);
-        self.sender.restart(time);
-        self.sender.claim_address(time, out);
+        self.sending.restart(time);
+        self.sending.claim_address(time, out);
     }
 
     /// Ends what cannot continue over a gap of unknown length that begins at `now`.
-    pub(super) fn begin_unknown_gap(&mut self, now: Timestamp, out: &mut Outputs) {
-        self.sender.end_test(now, &self.alarming.engine, out);
+    pub(crate) fn begin_unknown_gap(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sending.end_test(now, &self.alarming.engine, out);
         if let Some(change) = self.learning.state.detector.settle() {
             self.complete_mode(now, change, out);
         }
@@ -379,16 +385,16 @@ impl Stages {
     }
 
     /// Continues at `time` after a gap of unknown length.
-    pub(super) fn end_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
+    pub(crate) fn end_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.sampling.sampler.handle_gap(time);
-        self.sender.restart(time);
-        self.sender.claim_address(time, out);
+        self.sending.restart(time);
+        self.sending.claim_address(time, out);
         self.estimation.handle_unknown_gap();
-        self.diagnosing.diagnosis.forget_charge();
+        self.findings.diagnosis.forget_charge();
     }
 
     /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.
-    pub(super) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, silence: Silence, out: &mut Outputs) {
+    pub(crate) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, silence: Silence, out: &mut Outputs) {
         let is_judged = silence == Silence::None;
         if is_judged {
             self.sampling.poll(now, out);
@@ -406,7 +412,7 @@ impl Stages {
         // A current that is not the cells', or not alone on the bus, moves their estimates.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen;
-        self.diagnosing.watch_current(now, is_current_frozen, out);
+        self.findings.watch_current(now, is_current_frozen, out);
         if is_judged {
             self.watch(now, out);
         }
@@ -414,39 +420,40 @@ impl Stages {
     }
 
     /// Sends the frames that are due.
-    pub(super) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
-        self.sender.poll_j1939(now, out);
+    pub(crate) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sending.poll_j1939(now, out);
         let state = self.car_state();
-        self.sender.poll_with(now, out, |poller, out| {
+        self.sending.poll_with(now, out, |poller, out| {
             poller.set_state(now, state);
             poller.poll(now, out);
         });
-        let Some([is_status_due, is_health_due, is_alarm_due, is_digest_due]) = self.sender.take_frames_due(now) else {
+        let Some([is_status_due, is_health_due, is_alarm_due, is_digest_due]) = self.sending.take_frames_due(now)
+        else {
             return;
         };
         if is_status_due {
             let fields = self.status_fields();
-            self.sender.send_status(now, &fields, out);
+            self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
             let fields = HealthFields {
                 model_state: Some(self.modelling.view().state.code()),
                 ..self.learning.health_fields(&self.estimation.bank)
             };
-            self.sender.send_health(now, &fields, out);
+            self.sending.send_health(now, &fields, out);
         }
         if is_alarm_due {
-            self.sender.send_unknown_alarm(now, &self.alarming.engine, out);
+            self.sending.send_unknown_alarm(now, &self.alarming.engine, out);
         }
-        self.sender.send_due_alarms(now, &self.alarming.engine, out);
+        self.sending.send_due_alarms(now, &self.alarming.engine, out);
         if is_digest_due {
-            self.sender.send_digest(now, &self.alarming.engine, out);
+            self.sending.send_digest(now, &self.alarming.engine, out);
         }
-        self.sender.continue_test(now, &self.alarming.engine, out);
+        self.sending.continue_test(now, &self.alarming.engine, out);
     }
 
     /// Validity of the published estimates.
-    pub(super) fn validity(&self) -> Validity {
+    pub(crate) fn validity(&self) -> Validity {
         if self.learning.state.pack.is_none() {
             Validity::Unavailable
         } else if !self.estimation.all_trusted {
@@ -475,5 +482,44 @@ impl Stages {
                 (_, _) => 2,
             }),
         }
+    }
+
+    /// Judges the silence of all inputs.
+    pub(crate) fn silence(&self, now: Timestamp) -> Silence {
+        let Some(after_s) = self.sleep.after_s else { return Silence::None };
+        if self.sleep.since.is_some() {
+            return Silence::Lasts;
+        }
+        let sampler = &self.sampling.sampler;
+        let transition = &self.learning.config.transition;
+        let rest_a = transition.dead_band_a + transition.hysteresis_a;
+        // Without any reading so far nothing can have fallen asleep: the wiring may be wrong.
+        let Some(silent_s) = sampler.all_silent_s(now, QUIET_S) else { return Silence::None };
+        if sampler.latest_current_a(now).is_none_or(|current_a| current_a.abs() > rest_a) {
+            return Silence::None;
+        }
+        if silent_s > after_s { Silence::Begins } else { Silence::Quiet }
+    }
+
+    /// The buses fall asleep.
+    pub(crate) fn begin_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sleep.since = Some(now);
+        self.fall_asleep(now, out);
+        out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: true, seconds: None } });
+    }
+
+    /// A reading came: the buses are awake again.
+    #[cold]
+    pub(crate) fn end_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
+        let Some(since) = self.sleep.since.take() else { return };
+        let seconds = Some(now.since(since));
+        out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: false, seconds } });
+        self.sampling.sampler.wake(now);
+    }
+
+    /// Whether a reading is one of an input that wakes the buses: any but the supply voltage, which the computer may
+    /// measure itself, and the bits of a BMS that balances while the vehicle is parked.
+    pub(crate) fn wakes(channel: Channel) -> bool {
+        !matches!(channel, Channel::SupplyVoltage | Channel::Balancing(_))
     }
 }

@@ -24,7 +24,6 @@ pub struct CellSample {
     /// the current between its last reading and `time`.
     pub charge_as: f64,
     /// Time so far in which the current's reading was other than exactly zero, s.
-    #[serde(default)]
     pub offset_s: f64,
     /// Time so far without a usable current, s: the charge of that time is unknown.
     pub unmeasured_s: f64,

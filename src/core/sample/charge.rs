@@ -21,7 +21,6 @@ pub struct ChargeTotals {
     /// Charge taken out of the pack, As.
     pub charge_as: f64,
     /// Time in which the reading was other than exactly zero, s: the charge of that time has the sensor's offset.
-    #[serde(default)]
     pub offset_s: f64,
     /// Time without a usable current, s.
     pub unmeasured_s: f64,
@@ -40,7 +39,6 @@ pub(super) struct ChargeCounter {
     /// The reading at `counted_to`, A; `None` = unmeasured from there on.
     current_a: Option<f64>,
     /// The contactors are open up to here; `None` = closed, or not known.
-    #[serde(default)]
     open_until: Option<Timestamp>,
 }
 

@@ -8,7 +8,6 @@ use crate::quantity::Fault;
 
 /// Readings by outcome since the first start (part of the stored state).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(default)]
 pub struct ReadingCounts {
     /// Used.
     pub accepted: u64,

@@ -87,7 +87,7 @@ impl Reversals {
 
 /// State of the check; part of the stored state.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 pub(super) struct FrozenCheck {
     /// The unchanged reading, when it came last, and how often.
     current_a: Option<f64>,

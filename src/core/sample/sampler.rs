@@ -41,15 +41,11 @@ pub struct SamplerState {
     began: Option<Timestamp>,
     latest: Timestamp,
     unused_readings: u64,
-    #[serde(default)]
     counts: ReadingCounts,
-    #[serde(default)]
     frozen: FrozenCheck,
-    /// Parallel strings of the configuration; 0 in states of earlier programs, as the next.
-    #[serde(default)]
+    /// Parallel strings of the configuration.
     strings: u16,
     /// Cells in series.
-    #[serde(default)]
     series: u16,
 }
 
@@ -64,9 +60,9 @@ impl SamplerState {
         self.signals.iter().try_for_each(Signal::check)
     }
 
-    /// Parallel strings, and cells in series, of the configuration; `None` = the state is of an earlier program.
-    pub fn wiring(&self) -> Option<(u16, u16)> {
-        (self.strings > 0).then_some((self.strings, self.series))
+    /// Parallel strings, and cells in series, of the configuration.
+    pub fn wiring(&self) -> (u16, u16) {
+        (self.strings, self.series)
     }
 
     /// Charge up to `time`, As, for the pack: the latest reading holds for at most `max_age_s`.

@@ -19,10 +19,9 @@ use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
-use crate::io::record::Record;
 use crate::io::socket::PassiveSocket;
 use crate::io::stop::Stop;
-use crate::monitor::{BusEvent, Command, J1939Config};
+use crate::monitor::{BusEvent, Command, J1939Config, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Period of reading the sockets; stamps are the kernel's, so nothing depends on it.
@@ -172,9 +171,9 @@ impl MonitoredChannel {
             }
         }
         for record in &received {
-            match record {
-                Record::Frame { time, frame, .. } => self.take(rule, *time, frame),
-                Record::Bus { event: BusEvent::Dropped { frames }, .. } => self.report.dropped += frames,
+            match &record.kind {
+                RecordKind::Frame { frame, .. } => self.take(rule, record.time, frame),
+                RecordKind::Bus { event: BusEvent::Dropped { frames }, .. } => self.report.dropped += frames,
                 _ => {}
             }
         }

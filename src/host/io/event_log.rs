@@ -8,7 +8,6 @@ pub use text::command as command_words;
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
-use crate::can::encode::CommandRefusal;
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
 use crate::can::own_frames::OwnIdChange;
@@ -158,8 +157,12 @@ impl EventLog {
                 tracing::info!(source, command = text::command(&command), changed, refused, "command");
             }
             EventKind::BadCommand { bus, intact, reason } => {
-                let reason = reason.map(CommandRefusal::words);
-                tracing::warn!(interface = self.name(bus), intact, reason, "command frame not executed");
+                tracing::warn!(
+                    interface = self.name(bus),
+                    intact,
+                    reason = reason.words(),
+                    "command frame not executed"
+                );
             }
             EventKind::Test { rule, running } => {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });

@@ -24,9 +24,8 @@
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use super::record::Record;
 use crate::can::Frame;
-use crate::monitor::{BusEvent, Downtime, Input};
+use crate::monitor::{BusEvent, Downtime, Record, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// First line of every journal.
@@ -52,26 +51,26 @@ pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> R
     let rest_text = rest.strip_prefix(b" ").unwrap_or_default();
     let alone = |record: Record| rest.is_empty().then_some(record);
     let (record, expected) = match &line[..space] {
-        b"TICK" => (alone(Record::Tick { time }), "the line's end after the stamp"),
-        b"GAP" => (alone(Record::UnknownGap { time }), "the line's end after the stamp"),
-        b"RELOAD" => (alone(Record::Reload { time }), "the line's end after the stamp"),
-        b"RESTORE" => (parse_away(rest_text).map(|away| Record::Restore { time, away }), "seconds away, - or unknown"),
+        b"TICK" => (alone(Record::tick(time)), "the line's end after the stamp"),
+        b"GAP" => (alone(Record::unknown_gap(time)), "the line's end after the stamp"),
+        b"RELOAD" => (alone(Record::reload(time)), "the line's end after the stamp"),
+        b"RESTORE" => (parse_away(rest_text).map(|away| Record::restore(time, away)), "seconds away, - or unknown"),
         b"COMMAND" => {
             let command = serde_json::from_slice(rest_text).ok();
-            (command.map(|command| Record::Command { time, command }), "a command as JSON")
+            (command.map(|command| Record::command(time, command)), "a command as JSON")
         }
         b"STORE" => {
             let works = [(&b"works"[..], true), (b"fails", false)].into_iter().find(|(word, _)| *word == rest_text);
-            (works.map(|(_, works)| Record::Store { time, works }), "works or fails")
+            (works.map(|(_, works)| Record::store(time, works)), "works or fails")
         }
         b"SECURED" => match parse_secured(rest_text) {
             Some((interface, frame, freshness)) => {
-                return Ok(bus(interface).map(|bus| Record::SecuredFrame { time, bus, frame, freshness }));
+                return Ok(bus(interface).map(|bus| Record::secured_frame(time, bus, &frame, freshness)));
             }
             None => (None, "an interface, a frame, and its freshness or -"),
         },
         _ => match parse_bus(rest_text) {
-            Some((interface, event)) => return Ok(bus(interface).map(|bus| Record::Bus { time, bus, event })),
+            Some((interface, event)) => return Ok(bus(interface).map(|bus| Record::bus(time, bus, event))),
             None => (
                 None,
                 "an interface and up, down, missing, dropped N, error_frame CLASS (8 hex digits) or send_failed N",
@@ -144,34 +143,37 @@ impl<W: Write> JournalWriter<W> {
         write_mark(&mut self.out, "RELOAD", time, "")
     }
 
-    /// Appends one input, as the core receives it.
+    /// Appends one record, as the core receives it.
     ///
     /// # Errors
     /// Those of the file; an interface that is not configured is invalid input.
-    pub fn append(&mut self, input: &Input<'_>) -> io::Result<()> {
-        match *input {
-            Input::Frame { time, bus, frame } => {
+    pub fn append(&mut self, record: &Record) -> io::Result<()> {
+        let time = record.time;
+        match &record.kind {
+            RecordKind::Frame { bus, frame } => {
                 let interface = name(&self.interfaces, bus.index())?;
                 candump::write_line(&mut self.out, time, StampDigits::Nanos, interface, frame)
             }
-            Input::SecuredFrame { time, bus, frame, freshness } => {
+            RecordKind::SecuredFrame { bus, frame, freshness } => {
                 let interface = name(&self.interfaces, bus.index())?;
                 let frame = candump::frame_text(frame);
                 let freshness = freshness.map_or("-".to_owned(), |freshness| freshness.to_string());
                 write_mark(&mut self.out, "SECURED", time, format_args!(" {interface} {frame} {freshness}"))
             }
-            Input::Tick { time } => write_mark(&mut self.out, "TICK", time, ""),
-            Input::UnknownGap { time } => write_mark(&mut self.out, "GAP", time, ""),
-            Input::Command { time, command } => {
-                write_mark(&mut self.out, "COMMAND", time, format_args!(" {}", serde_json::to_string(&command)?))
+            RecordKind::Tick => write_mark(&mut self.out, "TICK", time, ""),
+            RecordKind::UnknownGap => write_mark(&mut self.out, "GAP", time, ""),
+            RecordKind::Command { command } => {
+                write_mark(&mut self.out, "COMMAND", time, format_args!(" {}", serde_json::to_string(command)?))
             }
-            Input::Store { time, works } => {
-                write_mark(&mut self.out, "STORE", time, if works { " works" } else { " fails" })
+            RecordKind::Store { works } => {
+                write_mark(&mut self.out, "STORE", time, if *works { " works" } else { " fails" })
             }
-            Input::Bus { time, bus, event } => {
+            RecordKind::Bus { bus, event } => {
                 let interface = name(&self.interfaces, bus.index())?;
-                write_mark(&mut self.out, "BUS", time, format_args!(" {interface} {}", bus_words(event)))
+                write_mark(&mut self.out, "BUS", time, format_args!(" {interface} {}", bus_words(*event)))
             }
+            RecordKind::Reload => write_mark(&mut self.out, "RELOAD", time, ""),
+            RecordKind::Restore { away } => write_mark(&mut self.out, "RESTORE", time, format_args!(" {away}")),
         }
     }
 

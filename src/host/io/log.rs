@@ -18,10 +18,11 @@ use super::lines::{self, Lines, RawLine};
 use super::segments;
 use crate::can::Frame;
 use crate::can::decode::Channel;
-use crate::monitor::BusEvent;
+use crate::monitor::{BusEvent, Record, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-pub use super::record::{Batch, Record};
+pub use super::record::Batch;
+use super::record::UNUSED;
 pub use super::table::TableError as LogError;
 
 /// Distance between the records so far and a part with an unknown gap before it.
@@ -185,7 +186,7 @@ impl LogSource {
                 return Ok(Some(record));
             }
             if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
-                && let mut slot = [Record::UNUSED]
+                && let mut slot = [UNUSED]
                 && self.state.fast_records(lines, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
@@ -203,8 +204,8 @@ impl LogSource {
             let more = match &mut open.form {
                 LogForm::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
                     Some(record) => {
-                        let (gap, time) = self.state.place(record.time());
-                        let record = record.at(time);
+                        let (gap, time) = self.state.place(record.time);
+                        let record = Record { time, ..record };
                         let Some(gap) = gap else { return Ok(Some(record)) };
                         self.queue.push_back(record);
                         return Ok(Some(gap));
@@ -217,7 +218,7 @@ impl LogSource {
                     let uncarried = (self.encode_row)(&log.values, &mut self.frames);
                     self.state.counts.uncarried_values += uncarried as u64;
                     self.state.counts.frames += self.frames.len() as u64;
-                    self.queue.extend(self.frames.drain(..).map(|(bus, frame)| Record::Frame { time, bus, frame }));
+                    self.queue.extend(self.frames.drain(..).map(|(bus, frame)| Record::frame(time, bus, &frame)));
                     true
                 }),
             };
@@ -287,7 +288,7 @@ impl ReadState {
         let (mut text, mut count, mut backwards) = (all, 0, 0);
         for slot in slots {
             let Some(line) = self.fast_line.parse(text) else { break };
-            *slot = Record::Frame { time: line.time, bus: line.bus, frame: line.frame() };
+            *slot = Record::frame(line.time, line.bus, &line.frame());
             text = &text[line.line_len..];
             count += 1;
             if line.time < latest {
@@ -350,7 +351,8 @@ impl ReadState {
                 Ok(line) => Ok(self.line_record(&line)),
                 Err(error) => Err(error),
             };
-            self.counts.frames += u64::from(matches!(record, Ok(Some(Record::SecuredFrame { .. }))));
+            self.counts.frames +=
+                u64::from(matches!(record, Ok(Some(Record { kind: RecordKind::SecuredFrame { .. }, .. }))));
             match record {
                 Ok(Some(record)) => return Ok(Some(record)),
                 Ok(None) => {}
@@ -364,19 +366,19 @@ impl ReadState {
             Line::Frame { time, interface, frame, .. } => {
                 let bus = self.bus(interface)?;
                 self.counts.frames += 1;
-                Some(Record::Frame { time, bus, frame })
+                Some(Record::frame(time, bus, &frame))
             }
             Line::ErrorFrame { time, interface, class } => {
                 self.counts.error_frames += 1;
                 let bus = self.bus(interface)?;
-                Some(Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } })
+                Some(Record::bus(time, bus, BusEvent::ErrorFrame { class }))
             }
             Line::Dropped { interface, frames } => {
                 self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
                 // The line has no stamp: it belongs to the frame before it, if there was one.
                 let time = self.latest?.plus_nanos(-self.shift_ns);
-                (!self.fresh).then_some(Record::Bus { time, bus, event: BusEvent::Dropped { frames } })
+                (!self.fresh).then_some(Record::bus(time, bus, BusEvent::Dropped { frames }))
             }
             Line::Xl { .. } => {
                 self.counts.xl_frames += 1;
@@ -448,6 +450,6 @@ impl ReadState {
         }
         self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
         self.counts.unknown_gaps += u64::from(gap);
-        (gap.then_some(Record::UnknownGap { time }), time)
+        (gap.then_some(Record::unknown_gap(time)), time)
     }
 }

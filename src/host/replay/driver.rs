@@ -7,7 +7,7 @@ use super::RowFrames;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use crate::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// A monitor, its ticks, and the encoder of rows.
@@ -43,7 +43,7 @@ impl MonitorDriver {
         let mut frames = std::mem::take(&mut self.frames);
         self.uncarried_values += self.row_frames.encode(values, &mut frames);
         for (bus, frame) in frames.drain(..) {
-            self.monitor.handle(Input::Frame { time, bus, frame: &frame }, &mut self.out);
+            self.monitor.handle(&Record::frame(time, bus, &frame), &mut self.out);
         }
         self.frames = frames;
     }
@@ -51,14 +51,14 @@ impl MonitorDriver {
     /// Takes one frame.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.advance(time);
-        self.monitor.handle(Input::Frame { time, bus, frame }, &mut self.out);
+        self.monitor.handle(&Record::frame(time, bus, frame), &mut self.out);
     }
 
     /// The record continues at `time` after a gap of unknown length.
     pub fn handle_unknown_gap(&mut self, time: Timestamp) {
         self.ticks.sleep();
         self.send_ticks();
-        self.monitor.handle(Input::UnknownGap { time }, &mut self.out);
+        self.monitor.handle(&Record::unknown_gap(time), &mut self.out);
     }
 
     /// Ends the record: its last samples become estimates.
@@ -77,7 +77,7 @@ impl MonitorDriver {
 
     fn send_ticks(&mut self) {
         while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-            self.monitor.handle(Input::Tick { time }, &mut self.out);
+            self.monitor.handle(&Record::tick(time), &mut self.out);
         }
     }
 }

@@ -6,7 +6,6 @@ use serde::Serialize;
 
 use super::{CellSummary, ProtectedSummary};
 use crate::alarm::Change;
-use crate::can::poll::PollChange;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::CellIndex;
@@ -37,8 +36,8 @@ pub struct ReplaySummary {
     pub dropped: Vec<MessageFlood>,
     /// Controllers that answer diagnostic requests.
     pub controllers: Vec<ControllerStatus>,
-    /// Events by kind.
-    pub events: BTreeMap<&'static str, u64>,
+    /// Events by name, those of alarms by change.
+    pub events: BTreeMap<String, u64>,
     /// The first 1,000 alarms raised.
     pub alarms_raised: Vec<Event>,
     /// The cells at the end.
@@ -73,92 +72,25 @@ pub(super) fn note_event(
     usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
     event: &Event,
 ) {
+    let name = event.kind.name();
     let name = match event.kind {
-        EventKind::Mode { .. } => "mode",
-        EventKind::HalfCycle { .. } => "half_cycle",
         EventKind::Capacity { cell, usable_capacity_ah, usable_capacity_std_ah, .. } => {
             usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
-            "capacity"
+            name.to_owned()
         }
-        EventKind::LossModes { .. } => "loss_modes",
-        EventKind::RemainingLife { .. } => "remaining_life",
-        EventKind::RechargePeriod { .. } => "recharge_period",
         EventKind::Alarm { change, .. } => {
             if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
                 summary.alarms_raised.push(*event);
             }
-            alarm_change_name(change)
+            format!("{name}_{}", <&str>::from(change))
         }
-        EventKind::SignalBad { .. } => "signal_bad",
         EventKind::SignalGood { bad_readings, .. } => {
             summary.bad_readings += bad_readings;
-            "signal_good"
+            name.to_owned()
         }
-        EventKind::Protection(change) => {
-            if change.usable {
-                "protection_usable"
-            } else {
-                "protection_failed"
-            }
-        }
-        EventKind::Flood(change) => {
-            if change.active {
-                "flood_begun"
-            } else {
-                "flood_over"
-            }
-        }
-        EventKind::SecondSender(change) => {
-            if change.active {
-                "second_sender"
-            } else {
-                "second_sender_gone"
-            }
-        }
-        EventKind::OwnIdentifier(change) => {
-            if change.active {
-                "own_identifier_used"
-            } else {
-                "own_identifier_free"
-            }
-        }
-        EventKind::MessageLoss(_) => "message_loss",
-        EventKind::BusAsleep { asleep: true, .. } => "bus_asleep",
-        EventKind::BusAsleep { asleep: false, .. } => "bus_awake",
-        EventKind::Poll(PollChange::Silent { .. }) => "poll_silent",
-        EventKind::Poll(PollChange::Asking) => "poll_asking",
-        EventKind::Poll(PollChange::Refused { .. }) => "poll_refused",
-        EventKind::Bus { .. } => "bus",
-        EventKind::J1939 { .. } => "j1939",
-        EventKind::Gap { .. } => "gap",
-        EventKind::TimeBackwards { .. } => "time_backwards",
-        EventKind::FilterReset { .. } => "filter_reset",
-        EventKind::Model { .. } => "model",
-        EventKind::Finding(_) => "finding",
-        EventKind::Trust { .. } => "trust",
-        EventKind::Command { .. } => "command",
-        EventKind::BadCommand { .. } => "bad_command",
-        EventKind::Test { .. } => "test",
-        EventKind::PackReplaced { .. } => "pack_replaced",
-        EventKind::PackIdentity { .. } => "pack_identity",
-        EventKind::PackReturned { .. } => "pack_returned",
-        EventKind::Reconfigured { .. } => "reconfigured",
-        EventKind::AlarmDropped { .. } => "alarm_dropped",
-        EventKind::Store { .. } => "store",
+        _ => name.to_owned(),
     };
     *summary.events.entry(name).or_default() += 1;
-}
-
-fn alarm_change_name(change: Change) -> &'static str {
-    match change {
-        Change::Raised => "alarm_raised",
-        Change::Suppressed => "alarm_suppressed",
-        Change::Resumed => "alarm_resumed",
-        Change::Latched => "alarm_latched",
-        Change::Cleared => "alarm_cleared",
-        Change::Acknowledged => "alarm_acknowledged",
-        Change::Forgotten => "alarm_forgotten",
-    }
 }
 
 /// VmHWM of /proc/self/status.

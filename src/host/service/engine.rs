@@ -17,7 +17,9 @@ use crate::io::journal::{self, JournalWriter};
 use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Downtime, Input, LearnedCell, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
+use crate::monitor::{
+    Downtime, LearnedCell, Monitor, MonitorConfig, Outputs, Reconfigured, Record, RecordKind, Transmit,
+};
 use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
@@ -122,25 +124,25 @@ impl Engine {
         })
     }
 
-    /// Takes one input; checks the authenticator of a frame first, where it has one. Returns the ticket of the commit of what
+    /// Handles one record; checks the authenticator of a frame first, where it has one. Returns the ticket of the commit of what
     /// it changed; `None` = nothing that is stored, or nothing is stored.
-    pub(super) fn handle(&mut self, input: &Input<'_>) -> Option<u64> {
-        if let Input::Frame { time, bus, frame } = *input
-            && let Some(check) = self.monitor.mac_check(bus, frame)
+    pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
+        if let RecordKind::Frame { bus, frame } = &record.kind
+            && let Some(check) = self.monitor.mac_check(*bus, frame)
         {
             let verified = self.key.as_ref().and_then(|key| check.verify(frame.data(), |bytes| key.mac(bytes)));
-            return self.take(&Input::SecuredFrame { time, bus, frame, freshness: verified });
+            return self.take(&Record::secured_frame(record.time, *bus, frame, verified));
         }
-        self.take(input)
+        self.take(record)
     }
 
-    /// Journals one input, passes it to the core and dispatches its outputs.
-    fn take(&mut self, input: &Input<'_>) -> Option<u64> {
-        self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(input));
+    /// Journals one record, passes it to the core and dispatches its outputs.
+    fn take(&mut self, record: &Record) -> Option<u64> {
+        self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(record));
         self.outputs.clear();
-        self.monitor.handle(*input, &mut self.outputs);
-        self.is_fresh |= matches!(input, Input::Frame { .. } | Input::SecuredFrame { .. });
-        self.dispatch_outputs(input.time())
+        self.monitor.handle(record, &mut self.outputs);
+        self.is_fresh |= matches!(record.kind, RecordKind::Frame { .. } | RecordKind::SecuredFrame { .. });
+        self.dispatch_outputs(record.time)
     }
 
     /// Gives the core another configuration, and journals that.
@@ -247,7 +249,7 @@ impl Engine {
         let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
-            self.handle(&Input::Store { time, works });
+            self.handle(&Record::store(time, works));
         }
     }
 

@@ -17,11 +17,10 @@ use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::control::protocol::{Answer, CommandOutcome, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
-use crate::io::record::Record;
 use crate::io::snapshot_file;
 use crate::io::stop::Stop;
 use crate::logging;
-use crate::monitor::{Command, Input, TICK_PERIOD_MS};
+use crate::monitor::{Command, Record, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
@@ -134,7 +133,7 @@ impl ServiceLoop {
         self.drain().await;
         let time = self.clock.now();
         self.engine.poll_store(time);
-        self.engine.handle(&Input::Tick { time });
+        self.engine.handle(&Record::tick(time));
         time
     }
 
@@ -162,7 +161,7 @@ impl ServiceLoop {
     async fn apply_command(&mut self, command: Command) -> (Result<CommandOutcome, Answer>, Option<u64>) {
         self.drain().await;
         let time = self.clock.now();
-        let ticket = self.engine.handle(&Input::Command { time, command });
+        let ticket = self.engine.handle(&Record::command(time, command));
         let Engine { monitor, outputs, .. } = &self.engine;
         (answer::outcome(monitor.alarms(), &command, &outputs.events, time), ticket)
     }
@@ -186,11 +185,9 @@ impl ServiceLoop {
 
     /// Handles a batch in the order of time; items of one interface keep their order.
     fn handle_batch(&mut self) {
-        self.batch.sort_by_key(Record::time);
+        self.batch.sort_by_key(|record| record.time);
         for received in &self.batch {
-            if let Some(input) = received.input() {
-                self.engine.handle(&input);
-            }
+            self.engine.handle(received);
         }
         // Outputs leave after the last item: then all frames have their estimates.
         self.status_publisher.note_frames(&self.batch, self.clock.now());

@@ -3,8 +3,7 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::io::record::Record;
-use crate::monitor::TICK_PERIOD_MS;
+use crate::monitor::{Record, RecordKind, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::status::PERIOD;
 use crate::status::StatusServer;
@@ -37,8 +36,8 @@ impl StatusPublisher {
 
     /// Counts the frames of a batch, which have their estimates at `now`.
     pub(super) fn note_frames(&mut self, batch: &[Record], now: Timestamp) {
-        let frames = batch.iter().filter(|received| matches!(received, Record::Frame { .. }));
-        frames.for_each(|received| self.latency.record(now.since(received.time())));
+        let frames = batch.iter().filter(|received| matches!(received.kind, RecordKind::Frame { .. }));
+        frames.for_each(|received| self.latency.record(now.since(received.time)));
     }
 
     /// Counts a reload; `Ok` = the configuration was applied.

@@ -15,7 +15,7 @@ use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
-use crate::monitor::{Input, Outputs};
+use crate::monitor::{Outputs, Record};
 use crate::quantity::CellIndex;
 use crate::replay::{self, LogTime, ReplaySettings, Sinks};
 
@@ -70,7 +70,7 @@ fn restored(snapshot: Snapshot) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     let time = snapshot.time;
     monitor.restore(snapshot, Downtime::AsStamped).unwrap();
-    monitor.handle(Input::Tick { time }, &mut Outputs::default());
+    monitor.handle(&Record::tick(time), &mut Outputs::default());
     monitor
 }
 
@@ -295,7 +295,7 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
 /// A monitor whose state was taken at that time.
 fn at(seconds: f64) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
-    monitor.handle(Input::Tick { time: Timestamp::from_secs(seconds) }, &mut Outputs::default());
+    monitor.handle(&Record::tick(Timestamp::from_secs(seconds)), &mut Outputs::default());
     monitor
 }
 

@@ -31,7 +31,7 @@ use crate::ident::record::{self, Limits, Record};
 use crate::ident::unanchored::{self, Known, UnanchoredFit, UnanchoredRecord};
 use crate::ident::{MeasuredPart, charge_ah, electrodes, error_table, thermal};
 use crate::io::log::{LogOptions, LogSource};
-use crate::monitor::{Estimate, Input, Monitor, MonitorConfig};
+use crate::monitor::{Estimate, Monitor, MonitorConfig};
 use crate::quantity::CellIndex;
 use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
@@ -296,9 +296,9 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     // The cells of a module of another kind have another curve.
     let is_own: Vec<bool> =
         (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
-    let watch: OutputWatch = Box::new(move |input, out| {
+    let watch: OutputWatch = Box::new(move |record, out| {
         let mut mean = watched.borrow_mut();
-        if matches!(input, Input::UnknownGap { .. }) {
+        if record.is_unknown_gap() {
             mean.end_stretch();
         }
         out.estimates.iter().filter(|it| is_own[it.cell.index()]).for_each(|estimate| mean.take(estimate));

@@ -8,9 +8,9 @@ use std::sync::atomic::Ordering;
 
 use crate::config::Config;
 use crate::error::LabError;
-use crate::io::log::{LogCounts, LogSource, Record};
+use crate::io::log::{LogCounts, LogSource};
 use crate::io::ticks::Ticks;
-use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
+use crate::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 
 /// An opened log, and a note for the user on how it is read.
@@ -59,23 +59,23 @@ pub fn drive(
     let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
     let (mut driven, mut records, mut reported) = (DriveSummary::default(), 0_u64, 0);
     driven.notes.extend(note);
-    let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
+    let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, record: Option<&Record>| {
         while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
+            monitor.handle(&Record::tick(time), &mut out);
             each(monitor, &mut out)?;
         }
-        let Some(input) = input else { return Ok::<(), LabError>(()) };
-        monitor.handle(input, &mut out);
+        let Some(record) = record else { return Ok::<(), LabError>(()) };
+        monitor.handle(record, &mut out);
         each(monitor, &mut out)
     };
     while let Some(record) = source.next_record()? {
         driven.note(&record);
-        if matches!(record, Record::UnknownGap { .. }) || source.carries_ticks() {
+        if record.is_unknown_gap() || source.carries_ticks() {
             ticks.sleep();
         } else {
-            ticks.advance(record.time());
+            ticks.advance(record.time);
         }
-        tick(&mut ticks, &mut monitor, record.input())?;
+        tick(&mut ticks, &mut monitor, Some(&record))?;
         records += 1;
         // Records between two reports of progress.
         if records.is_multiple_of(4096) {
@@ -104,12 +104,12 @@ impl DriveSummary {
     }
 
     fn note(&mut self, record: &Record) {
-        let time = record.time();
+        let time = record.time;
         let (first, last) = self.span.unwrap_or((time, time));
         self.span = Some((first.min(time), last.max(time)));
-        let noted = match record {
-            Record::Restore { .. } => "the recorded run began from a stored state, this one did not",
-            Record::Reload { .. } => "the recorded run took another configuration over, this one did not",
+        let noted = match record.kind {
+            RecordKind::Restore { .. } => "the recorded run began from a stored state, this one did not",
+            RecordKind::Reload => "the recorded run took another configuration over, this one did not",
             _ => return,
         };
         if !self.notes.iter().any(|note| note == noted) {

@@ -9,7 +9,7 @@ use super::record::{CellRecord, Learned, Record};
 
 use crate::cell::CellModel;
 use crate::config::Config;
-use crate::monitor::{Downtime, Input, ModelState, Monitor, Outputs, Snapshot};
+use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 
 /// Stamps before 2001-01-01, s since 1970, are no dates. A clock that was not set begins in 1970, 1980 or 2000; a log that counts from its
@@ -111,16 +111,14 @@ fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
             "a pack with modules of other cells ({name}) has no passport: its values are of one kind of cell"
         ));
     }
-    let (strings, series) = state.wiring().unzip();
+    let (strings, series) = state.wiring();
     let counts = [
-        ("estimated cells", u16::try_from(state.cells()).ok(), sample.cells),
-        ("parallel strings", strings, sample.strings),
-        ("cells in series", series, sample.series()),
+        ("estimated cells", state.cells(), usize::from(sample.cells)),
+        ("parallel strings", usize::from(strings), usize::from(sample.strings)),
+        ("cells in series", usize::from(series), usize::from(sample.series())),
     ];
-    for (name, found, configured) in counts {
-        if let Some(found) = found.filter(|found| *found != configured) {
-            return Err(format!("the record is of {found} {name}, the configuration has {configured}"));
-        }
+    if let Some((name, found, configured)) = counts.into_iter().find(|(_, found, configured)| found != configured) {
+        return Err(format!("the record is of {found} {name}, the configuration has {configured}"));
     }
     let configured_ah = config.monitor.model.rated_capacity_ah;
     let other = |found: &f64| (found - configured_ah).abs() > RATED_TOLERANCE * configured_ah;
@@ -162,7 +160,7 @@ impl<'a> Battery<'a> {
         let mut monitor = Monitor::new(config.monitor.clone());
         let fits = monitor.restore((**snapshot).clone(), Downtime::AsStamped);
         fits.map_err(|error| format!("the state does not fit the configuration: {error}"))?;
-        monitor.handle(Input::Tick { time }, &mut Outputs::default());
+        monitor.handle(&crate::monitor::Record::tick(time), &mut Outputs::default());
         let sample = &config.monitor.sample;
         let offset_ns = at_ns.saturating_sub(time.nanos());
         let (series, strings) = (f64::from(sample.series()), f64::from(sample.strings));

@@ -123,7 +123,7 @@ impl Record {
             return;
         }
         let is_whole = counted >= half_cycles.saturating_add(deleted);
-        match self.snapshot().and_then(Snapshot::throughputs).filter(|_| is_whole) {
+        match self.snapshot().map(Snapshot::throughputs).filter(|_| is_whole) {
             Some(sums) => sums.into_iter().enumerate().for_each(|(index, sum)| self.cell(index).moved = sum),
             None => self.note_gap(format!(
                 "{deleted} half-cycles were deleted from the store (store.max_rows, store.keep_years)"

@@ -10,7 +10,7 @@ use packwatch::alarm::{Change, Severity};
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CellModel;
 use packwatch::config::{self, ConfigFiles};
-use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs};
+use packwatch::monitor::{EventKind, Monitor, MonitorConfig, Outputs, Record};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
 
@@ -367,13 +367,13 @@ impl Rig {
         let mut frames = Vec::new();
         self.encoder.encode(&readings, &mut frames);
         let time = self.time;
-        self.monitor.handle(Input::Tick { time }, &mut self.out);
+        self.monitor.handle(&Record::tick(time), &mut self.out);
         for (bus, frame) in &frames {
-            self.monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut self.out);
+            self.monitor.handle(&Record::frame(time, *bus, frame), &mut self.out);
         }
         for tick in 1..TICKS {
             let time = time.plus_secs(dt_s * f64::from(tick) / f64::from(TICKS));
-            self.monitor.handle(Input::Tick { time }, &mut self.out);
+            self.monitor.handle(&Record::tick(time), &mut self.out);
         }
         self.listen();
         self.pack.step(current_a, dt_s);

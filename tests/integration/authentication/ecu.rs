@@ -6,7 +6,7 @@ use packwatch::can::secoc::{Authentication, Mac, Profile};
 use packwatch::can::{CanId, Frame};
 use packwatch::io::can_key::CanKey;
 use packwatch::monitor::{
-    Command, CommandCounts, Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot,
+    Command, CommandCounts, Downtime, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot,
 };
 use packwatch::quantity::{BusIndex, Timestamp};
 
@@ -141,7 +141,7 @@ impl Daemon {
             if let Some(journal) = &mut self.journal {
                 journal.push((self.ms, None));
             }
-            self.monitor.handle(Input::Tick { time: self.now() }, &mut self.out);
+            self.monitor.handle(&Record::tick(self.now()), &mut self.out);
             self.drain();
         }
     }
@@ -159,7 +159,7 @@ impl Daemon {
         if let Some(journal) = &mut self.journal {
             journal.push((self.ms, Some((*frame, freshness))));
         }
-        self.monitor.handle(Input::SecuredFrame { time: self.now(), bus: BUS, frame, freshness }, &mut self.out);
+        self.monitor.handle(&Record::secured_frame(self.now(), BUS, frame, freshness), &mut self.out);
         self.drain();
         self.executed > before
     }

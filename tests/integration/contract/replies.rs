@@ -4,7 +4,7 @@ use packwatch::alarm::Rule;
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::CommandRefusal;
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Downtime, EventKind, Input, Monitor};
+use packwatch::monitor::{Downtime, EventKind, Monitor, Record};
 use packwatch::quantity::BusIndex;
 
 use crate::support::config_texts;
@@ -30,12 +30,12 @@ impl Rig {
 
     fn send_raw(&mut self, frame: &Frame) {
         let time = self.now();
-        self.give(Input::Frame { time, bus: BusIndex(0), frame });
+        self.give(Record::frame(time, BusIndex(0), frame));
     }
 
     fn last_refusal(&self) -> Option<(bool, Option<CommandRefusal>)> {
         self.events.iter().rev().find_map(|event| match event.kind {
-            EventKind::BadCommand { intact, reason, .. } => Some((intact, reason)),
+            EventKind::BadCommand { intact, reason, .. } => Some((intact, Some(reason))),
             _ => None,
         })
     }
@@ -192,7 +192,7 @@ fn the_digest_shows_raised_and_unknown_rules_and_exact_thresholds() {
     rig.seconds(3);
     let rule = |rig: &Rig, number: u32| rig.digest(1, 20 + 3 * (number - 1), 3);
     assert_eq!((rule(&rig, 9), rule(&rig, 13), rule(&rig, 1)), (0, 4, 5), "judged, unknown, not watched");
-    rig.give(Input::Store { time: rig.now(), works: true });
+    rig.give(Record::store(rig.now(), true));
     rig.heat(60.0, 3);
     assert_eq!((rule(&rig, 9), rule(&rig, 13)), (2, 0));
     assert_eq!((rig.digest(0, 20, 12), rig.digest(0, 32, 3)), (1, 2), "one warning");
@@ -331,25 +331,4 @@ fn counters_after_an_unknown_time_continue_where_the_stored_state_ends_and_witho
         rig.seconds(6);
         assert_eq!(firsts(&rig), [0; 4], "{profile:?}");
     }
-}
-
-#[test]
-fn a_state_of_an_earlier_program_is_restored_and_its_alarms_are_sent() {
-    let mut rig = Rig::new(HOT);
-    rig.heat(60.0, 3);
-    let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
-    let schedule = stored["schedule"].as_object_mut().unwrap();
-    for key in ["digest", "threshold_turn", "reply", "alarms"] {
-        assert!(schedule.remove(key).is_some(), "{key}");
-    }
-    let counters = schedule["counters"].as_object_mut().unwrap();
-    assert!(counters.remove("digest").is_some() && counters.remove("reply").is_some());
-    rig.monitor = Monitor::new(rig.config.clone());
-    rig.monitor.restore(serde_json::from_value(stored).unwrap(), Downtime::Seconds(1.0)).unwrap();
-    rig.deci += 10;
-    rig.frames.clear();
-    rig.seconds(4);
-    assert_eq!(rig.last_wire(Rule::TemperatureHigh).state, 1);
-    assert!(rig.wire().len() >= 6, "twice a second: {}", rig.wire().len());
-    assert_eq!(rig.digest(0, 20, 12), 1);
 }

@@ -194,12 +194,12 @@ fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
         made.clear();
         encoder.encode(&values, &mut made);
         for (bus, frame) in &made {
-            monitor.handle(Input::Frame { time: now, bus: *bus, frame }, &mut out);
+            monitor.handle(&Record::frame(now, *bus, frame), &mut out);
         }
-        monitor.handle(Input::Tick { time: now }, &mut out);
+        monitor.handle(&Record::tick(now), &mut out);
         now = now.plus_secs([0.1, 1.0, 4.0, 30.0, 3600.0][dice.below(5)]);
         if dice.one_in(60) {
-            monitor.handle(Input::UnknownGap { time: now }, &mut out);
+            monitor.handle(&Record::unknown_gap(now), &mut out);
         }
         out.clear();
     }
@@ -207,7 +207,7 @@ fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
     let snapshot: Snapshot = serde_json::from_str(&text).map_err(|error| format!("{error}: {text:.2000}"))?;
     let mut after = Monitor::new(config.clone());
     after.restore(snapshot, Downtime::Seconds(60.0)).map_err(|error| error.to_string())?;
-    after.handle(Input::Tick { time: now }, &mut out);
+    after.handle(&Record::tick(now), &mut out);
     Ok(())
 }
 

@@ -10,7 +10,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::Config;
 use packwatch::monitor::{
-    Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
+    Downtime, Event, EventKind, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Record, Snapshot,
 };
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
@@ -132,8 +132,8 @@ impl Rig {
         Timestamp::from_nanos(self.deci * 100_000_000)
     }
 
-    pub(crate) fn give(&mut self, input: Input<'_>) {
-        self.monitor.handle(input, &mut self.out);
+    pub(crate) fn give(&mut self, record: Record) {
+        self.monitor.handle(&record, &mut self.out);
         self.collect();
     }
 
@@ -141,7 +141,7 @@ impl Rig {
     pub(crate) fn tick(&mut self) {
         self.deci += 1;
         let time = self.now();
-        self.give(Input::Tick { time });
+        self.give(Record::tick(time));
     }
 
     fn collect(&mut self) {
@@ -179,9 +179,9 @@ impl Rig {
             self.encoder.encode(&values, &mut made);
             let time = self.now();
             for (bus, frame) in &made {
-                self.give(Input::Frame { time, bus: *bus, frame });
+                self.give(Record::frame(time, *bus, frame));
             }
-            self.give(Input::Tick { time });
+            self.give(Record::tick(time));
         }
     }
 
@@ -261,7 +261,7 @@ impl Rig {
         self.commands_sent += 1;
         let frame = command_frame(code, rule, cell, counter);
         let time = self.now();
-        self.give(Input::Frame { time, bus: BusIndex(0), frame: &frame });
+        self.give(Record::frame(time, BusIndex(0), &frame));
     }
 }
 

@@ -3,7 +3,7 @@
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Event, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
@@ -25,10 +25,10 @@ pub(crate) fn live(
         encoder.encode(sim.readings(), &mut frames);
         ticks.advance(moment.time);
         while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
+            monitor.handle(&Record::tick(time), &mut out);
         }
         for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+            monitor.handle(&Record::frame(moment.time, *bus, frame), &mut out);
         }
         each(moment.time, &sim, &monitor, &out.events);
         out.clear();

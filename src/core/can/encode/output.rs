@@ -174,9 +174,7 @@ pub struct SendCounters {
     status: u8,
     health: u8,
     alarm: u8,
-    #[serde(default)]
     digest: u8,
-    #[serde(default)]
     reply: u8,
 }
 

@@ -53,44 +53,34 @@ pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
     /// Capacity of the open-circuit curve, Ah; `None` in a state stored before it was kept: then that of the cell.
-    #[serde(default)]
     pub(super) curve: Option<ScalarGaussian>,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
     /// |current| low-passed over `load_memory_s`, A: the load that still drives slow diffusion.
-    #[serde(default)]
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
     /// Time that the next voltage reading stands for, s: since the last one used.
     pub(super) information_s: f64,
     /// How long the cell has rested, s.
-    #[serde(default)]
     pub(super) rest_s: f64,
     /// Information about the current sensor's offset in the voltages since it was last corrected, in units of its standard
     /// deviation: sum of d^2 / R with d its effect on an innovation of variance R without it.
-    #[serde(default)]
     pub(super) offset_information: f64,
     /// What these voltages say: sum of d x innovation / R.
-    #[serde(default)]
     pub(super) offset_score: f64,
-    #[serde(default)]
     pub(super) slow_branch: SlowBranch,
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
-    #[serde(default, rename = "away_std")]
+    #[serde(rename = "away_std")]
     pub(super) downtime_std: f64,
     /// Part of the coming unmeasured time that has been noted as downtime, s.
-    #[serde(default)]
     pub(super) noted_s: f64,
     /// Probability that the cell was used during the downtime.
-    #[serde(default)]
     pub(super) used_prior: f64,
     /// No voltage has been used since the last sleep or unknown gap.
-    #[serde(default)]
     pub(super) is_unseen: bool,
     /// After a gap of unknown length the SOC says nothing: the filter restarts from the next voltage.
-    #[serde(default)]
     pub(super) is_soc_unknown: bool,
     /// Consecutive readings beyond the gate.
     pub(super) rejected: u32,

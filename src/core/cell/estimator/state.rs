@@ -23,7 +23,6 @@ pub struct CellState {
     /// Its covariance in that order, row by row.
     covariance: Vec<f64>,
     /// Errors of that state by the constant errors, state by state.
-    #[serde(default)]
     by_constant: Vec<f64>,
     memory: Memory,
 }

@@ -21,8 +21,7 @@ use super::raw::{CALL_BATCH, RawRead, RawSocket, every_frame, filters, index_of}
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
-use crate::io::record::Record;
-use crate::monitor::BusEvent;
+use crate::monitor::{BusEvent, Record};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is looked at again.
@@ -302,8 +301,8 @@ impl Link {
         let bus = self.config.bus;
         let record = match received.what {
             Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
-            Wire::Frame(frame) => Record::Frame { time, bus, frame },
-            Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
+            Wire::Frame(frame) => Record::frame(time, bus, &frame),
+            Wire::Error(class) => Record::bus(time, bus, BusEvent::ErrorFrame { class }),
             Wire::Malformed => {
                 self.lost += 1;
                 self.health.count(|counts| counts.malformed += 1);
@@ -438,7 +437,7 @@ impl Link {
     /// Sends an event. Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
-        let _ = self.inbox.send(Record::Bus { time, bus: self.config.bus, event }).await;
+        let _ = self.inbox.send(Record::bus(time, self.config.bus, event)).await;
     }
 
     /// Logs a problem once, until it is another one.

@@ -9,8 +9,7 @@ use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawRead, RawSocket, f
 use super::wire::Wire;
 use crate::can::CanId;
 use crate::io::clock::{MappedClock, Reading, StampMapper};
-use crate::io::record::Record;
-use crate::monitor::BusEvent;
+use crate::monitor::{BusEvent, Record};
 use crate::quantity::BusIndex;
 
 /// Listens on one interface; sends nothing and never waits.
@@ -72,9 +71,9 @@ impl PassiveSocket {
         for received in &self.received {
             let time = self.mapper.arrival(received.stamps, self.before);
             into.push(match received.what {
-                Wire::Frame(frame) => Record::Frame { time, bus, frame },
-                Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
-                Wire::Malformed => Record::Bus { time, bus, event: BusEvent::Dropped { frames: 1 } },
+                Wire::Frame(frame) => Record::frame(time, bus, &frame),
+                Wire::Error(class) => Record::bus(time, bus, BusEvent::ErrorFrame { class }),
+                Wire::Malformed => Record::bus(time, bus, BusEvent::Dropped { frames: 1 }),
             });
         }
         Ok(true)
@@ -84,7 +83,7 @@ impl PassiveSocket {
         let total = self.socket.dropped_total();
         let frames = u64::from(total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total)));
         if frames > 0 {
-            into.push(Record::Bus { time: self.mapper.event(self.before), bus, event: BusEvent::Dropped { frames } });
+            into.push(Record::bus(self.mapper.event(self.before), bus, BusEvent::Dropped { frames }));
         }
     }
 }

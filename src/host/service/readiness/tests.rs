@@ -3,7 +3,7 @@
 use super::*;
 use crate::can::{CanId, Frame};
 use crate::config;
-use crate::monitor::{Input, MonitorConfig, Outputs};
+use crate::monitor::{MonitorConfig, Outputs, Record};
 use crate::quantity::{BusIndex, Timestamp};
 use std::path::Path;
 
@@ -31,20 +31,20 @@ impl Scene {
     }
 
     /// Feeds one input, `after_s` later.
-    fn feed(&mut self, after_s: f64, input: impl Fn(Timestamp) -> Input<'static>) -> ManagerUpdate {
+    fn feed(&mut self, after_s: f64, record: impl Fn(Timestamp) -> Record) -> ManagerUpdate {
         self.at_s += after_s;
         let mut out = Outputs::default();
-        self.monitor.handle(input(Timestamp::from_secs(1e9 + self.at_s)), &mut out);
+        self.monitor.handle(&record(Timestamp::from_secs(1e9 + self.at_s)), &mut out);
         out.events.iter().for_each(|event| self.readiness.note(event));
         self.readiness.poll(&self.monitor, self.began + Duration::from_secs_f64(self.at_s))
     }
 
     fn tick(&mut self, after_s: f64) -> ManagerUpdate {
-        self.feed(after_s, |time| Input::Tick { time })
+        self.feed(after_s, Record::tick)
     }
 
     fn bus(&mut self, after_s: f64, bus: u8, event: BusEvent) -> ManagerUpdate {
-        self.feed(after_s, |time| Input::Bus { time, bus: BusIndex(bus), event })
+        self.feed(after_s, |time| Record::bus(time, BusIndex(bus), event))
     }
 
     /// The line reported after `seconds` of ticks, if any.
@@ -69,9 +69,9 @@ fn ready_comes_with_the_first_usable_reading_and_not_before() {
     assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
     // A frame without a configured signal does not count.
     let foreign = leaked(0x7FE, &[1]);
-    assert!(!scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame: foreign }).ready);
+    assert!(!scene.feed(0.1, |time| Record::frame(time, BusIndex(0), foreign)).ready);
     let frame = good_frame();
-    let update = scene.feed(0.2, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    let update = scene.feed(0.2, |time| Record::frame(time, BusIndex(0), frame));
     let status = Some("running: 2 interfaces, first frame after 0.4 s".to_owned());
     assert_eq!(update, ManagerUpdate { ready: true, status });
     assert!(!scene.tick(5.0).ready, "readiness is reported once");
@@ -89,7 +89,7 @@ fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_inter
     assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
     // The first frame after that is reported, too.
     let frame = good_frame();
-    scene.feed(1.5, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.feed(1.5, |time| Record::frame(time, BusIndex(0), frame));
     assert_eq!(
         scene.readiness.reported,
         "running: 2 interfaces, first frame after 11.5 s, restored state 12 s old; can1 is missing"
@@ -100,7 +100,7 @@ fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_inter
 fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
-    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
     let mut reports = 0;
     for n in 0..40 {
         let event = if n % 2 == 0 { BusEvent::Down } else { BusEvent::Missing };
@@ -115,12 +115,12 @@ fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
 fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
     let mut scene = Scene::with(None, |config| config.asleep_after_s = None);
     let frame = good_frame();
-    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
     // Longer than a temperature may be old.
     let line = scene.wait(130).expect("signals were lost");
     assert!(line.starts_with("running without input; 3 of 3 signals lost (pack current, "), "{line}");
     for _ in 0..20 {
-        scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
+        scene.feed(0.1, |time| Record::frame(time, BusIndex(0), frame));
     }
     assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
 }
@@ -129,10 +129,10 @@ fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
 fn a_parked_vehicle_sleeps_and_has_lost_nothing() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
-    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
     assert_eq!(scene.wait(130).as_deref(), Some("running: the buses sleep"));
     for _ in 0..20 {
-        scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
+        scene.feed(0.1, |time| Record::frame(time, BusIndex(0), frame));
     }
     assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
 }
@@ -141,7 +141,7 @@ fn a_parked_vehicle_sleeps_and_has_lost_nothing() {
 fn a_rejected_reload_stays_in_the_line_until_one_is_applied() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
-    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
     scene.readiness.note_reload(Some("pack.toml:3: pack.cells = 0,\nmust be 1 to 1024".to_owned()));
     let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("reported at once");
     assert!(line.ends_with("; reload refused: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");

@@ -71,7 +71,7 @@ fn means_and_covariances_survive_a_power_cut() {
         let mut monitor = Monitor::new(config().monitor);
         monitor.restore(*back.snapshot, downtime).unwrap();
         let time = late.snapshot.time.plus_secs(age_s);
-        monitor.handle(Input::Tick { time }, &mut Outputs::default());
+        monitor.handle(&Record::tick(time), &mut Outputs::default());
         assert_eq!(monitor.statistics().filter_resets, late_resets(&before));
     }
 }

@@ -1,0 +1,96 @@
+//! Another configuration for a running monitor.
+//!
+//! In: a checked configuration. Out: what changed, and the events and frames that follow from it; or why it needs a
+//! restart, with nothing changed. Limits, thresholds, modes, noises and outputs change. Filters, learned values, alarms
+//! with a rule and severity that are still configured, counters and schedules stay, so estimates are the same as without
+//! it as far as the settings behind them are.
+//!
+//! A measured value keeps its definition: another recharge window or usable load begins with "not known", except where
+//! the old value can be restated exactly. Initial values concern only unknown cells: they wait for another pack.
+
+use crate::alarm::{Observation, Rule};
+use crate::health::HealthConfig;
+use crate::monitor::Monitor;
+use crate::monitor::config::{MonitorConfig, ReconfigureError, Reconfigured};
+use crate::monitor::message::{Event, EventKind, Outputs};
+use crate::monitor::stage::publisher::Publisher;
+use crate::quantity::Timestamp;
+
+impl Monitor {
+    /// Continues with another configuration, as if between two inputs. `now` is the time of the request: it stamps the
+    /// event, and no time passes.
+    ///
+    /// # Errors
+    /// The first setting that needs a restart; the monitor is unchanged.
+    pub fn reconfigure(
+        &mut self,
+        config: MonitorConfig,
+        now: Timestamp,
+        out: &mut Outputs,
+    ) -> Result<Reconfigured, ReconfigureError> {
+        self.config.check_fits(&config)?;
+        let old = std::mem::replace(&mut self.config, config.clone());
+        let first_event = out.events.len();
+        let at = self.clock.now;
+        if !old.estimates_as(&config) {
+            // Earlier samples are judged by the earlier settings.
+            self.stages.step_waiting(at, true, out);
+        }
+        let changed = old.changed_tables(&config);
+        self.intake.reconfigure(&config);
+        let stages = &mut self.stages;
+        stages.modelling.reconfigure(&config);
+        stages.estimation.reconfigure(&config, &stages.modelling, &stages.learning.state.learner);
+        stages.findings.reconfigure(&config);
+        stages.sampling.reconfigure(&config);
+        stages.sleep.reconfigure(&config);
+        stages.sending.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);
+        if old.j1939 != config.j1939 {
+            stages.sending.reconfigure_j1939(at, &config, self.clock.has_started, out);
+        }
+        stages.learning.config = config.health;
+        self.forget_measures(&old.health, out);
+        let alarms_ended = self.stages.alarming.reconfigure(at, &config);
+        let period = self.stages.learning.known_recharge_period().unwrap_or_default();
+        let (learning, mut publisher) = self.stages.learning_and_publisher(at, out);
+        publisher.publish_alarms();
+        if old.health.recharge != config.health.recharge {
+            publisher.observe(Rule::RechargePeriodLow, None, period);
+        }
+        if old.health.end_of_life_ah != config.health.end_of_life_ah {
+            learning.lives.observe(true, &mut publisher);
+        }
+        publisher.update_trouble_codes();
+        let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);
+        out.events.push(Event { time: now.max(at), kind: EventKind::Reconfigured { alarms_ended: alarms } });
+        self.stages.statistics.note_events(&out.events[first_event..]);
+        self.find_due();
+        Ok(Reconfigured { changed, alarms_ended })
+    }
+
+    /// Forgets values measured by another window or load, before new thresholds are set.
+    fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
+        let now = self.clock.now;
+        let cells = self.stages.estimation.cell_indices();
+        let new = self.stages.learning.config;
+        self.stages.packs.forget_measures(old.recharge != new.recharge, old.usable != new.usable);
+        let (learning, mut publisher) = self.stages.learning_and_publisher(now, out);
+        if old.recharge != new.recharge {
+            publisher.observe(Rule::RechargePeriodLow, None, Observation::default());
+            learning.restate_recharge(&old.recharge);
+        }
+        if old.end_of_life_ah != new.end_of_life_ah {
+            learning.lives.restate(&new, &mut publisher);
+        }
+        if old.usable == new.usable {
+            return;
+        }
+        learning.cells.iter_mut().for_each(|cell| cell.usable = None);
+        let Publisher { alarming, .. } = &mut publisher;
+        for cell in cells {
+            let unknown = Observation::default();
+            alarming.engine.observe(now, Rule::UsableCapacityLow, Some(cell), &unknown, &mut alarming.changes);
+        }
+        publisher.publish_alarms();
+    }
+}

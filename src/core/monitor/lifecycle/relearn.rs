@@ -1,0 +1,45 @@
+//! Begins with what a history has kept of the cells, where the state of the last run is lost.
+//!
+//! In: capacity (Ah) and resistance (relative to new) of cells, in a monitor without any input. Out: a monitor that knows
+//! them and nothing else; its snapshot is checked like any other when it is restored.
+
+use crate::filter::ScalarGaussian;
+use crate::health::CapacityMethod;
+use crate::monitor::Monitor;
+use crate::monitor::message::LearnedCell;
+use crate::monitor::stages::Stages;
+
+impl Monitor {
+    /// Sets what was learned of the cells. Returns `false`, and changes nothing, when one of them does not exist or a number
+    /// is impossible: then the history is of another pack.
+    pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
+        let Stages { estimation, learning, .. } = &mut self.stages;
+        let is_valid =
+            |x: ScalarGaussian| x.mean.is_finite() && x.mean > 0.0 && x.variance.is_finite() && x.variance > 0.0;
+        let fits = |cell: &LearnedCell| {
+            cell.cell.index() < learning.cells.len()
+                && [Some(cell.capacity), cell.usable, cell.resistance].into_iter().flatten().all(is_valid)
+        };
+        if !learned.iter().all(fits) {
+            return false;
+        }
+        let config = learning.config.capacity;
+        for LearnedCell { cell, capacity, usable, resistance } in learned {
+            let index = cell.index();
+            let learner = &mut learning.state.learner;
+            estimation.bank.change(index, |estimator| {
+                if let Some(ratio) = resistance {
+                    // Of ln x: dx / x.
+                    estimator.relearn_resistance(ScalarGaussian::from_std(ratio.mean.ln(), ratio.std() / ratio.mean));
+                }
+                match config.method {
+                    CapacityMethod::Swing => estimator.restate_capacity(*capacity),
+                    CapacityMethod::Nominal { .. } => estimator.hold_capacity(capacity.mean),
+                }
+                learner.relearn(&config, index, *capacity, estimator);
+            });
+            learning.cells[index].usable = *usable;
+        }
+        true
+    }
+}

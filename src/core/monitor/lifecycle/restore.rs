@@ -1,0 +1,247 @@
+//! Takes a snapshot of a monitor, and restores one.
+
+use crate::alarm::{AlarmSnapshot, StoredAlarm};
+use crate::cell::CellEstimator;
+use crate::filter::ScalarGaussian;
+use crate::monitor::Monitor;
+use crate::monitor::message::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Outputs};
+use crate::monitor::snapshot::{Beginning, PendingRestore, RestoreError, SNAPSHOT_VERSION, Snapshot};
+use crate::monitor::stage::estimation::batch::CellBatch;
+use crate::monitor::stage::learning::LearningState;
+use crate::monitor::stage::learning::life::CellLife;
+use crate::monitor::stage::modelling::ModellingState;
+use crate::monitor::stage::sending::alarm_queue::AlarmKey;
+use crate::monitor::stages::Stages;
+use crate::monitor::stages::pack_memory::{StoredCell, StoredPack};
+use crate::quantity::Timestamp;
+
+/// A longer time without an input, s, is a break of the program, whatever its stamps: a running one ticks.
+const BREAK_S: f64 = 30.0;
+
+impl Monitor {
+    /// The state, to be stored.
+    pub fn snapshot(&self) -> Snapshot {
+        if let Some(PendingRestore { snapshot, .. }) = &self.pending {
+            return (**snapshot).clone();
+        }
+        let Stages { sampling, estimation, modelling, learning, findings, alarming, sending, statistics, sleep, packs } =
+            &self.stages;
+        Snapshot {
+            version: SNAPSHOT_VERSION,
+            time: self.clock.now,
+            may_continue: true,
+            time_backwards: self.clock.time_backwards,
+            intake: self.intake.snapshot(),
+            sampling: sampling.snapshot(),
+            estimation: estimation.snapshot(),
+            cells: (0..estimation.cells()).map(|cell| self.stages.stored_cell(cell)).collect(),
+            modelling: modelling.stored(),
+            learning: learning.state.clone(),
+            diagnosis: findings.stored(),
+            alarming: alarming.snapshot(),
+            sending: sending.snapshot(),
+            statistics: statistics.clone(),
+            asleep_since: sleep.since,
+            packs: packs.clone(),
+        }
+    }
+
+    /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
+    /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
+    /// other. [`Downtime::AsStamped`] says that the same clock continues: then frames, events and estimates are, byte for byte,
+    /// those of a monitor that had not stopped, unless half a minute is without an input or the state was stored
+    /// [for a restart](Snapshot::for_restart).
+    ///
+    /// # Errors
+    /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
+    /// damaged number leaves the others in doubt.
+    pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
+        if snapshot.version != SNAPSHOT_VERSION {
+            let found = snapshot.version;
+            return Err(RestoreError::Unfit(format!(
+                "snapshot version {found}, this program reads {SNAPSHOT_VERSION}"
+            )));
+        }
+        let Stages { sampling, estimation, .. } = &self.stages;
+        let (bank, cells) = (&estimation.bank, estimation.cells());
+        let fits = snapshot.cells.len() == cells
+            && snapshot.learning.learner.fits(cells)
+            && sampling.sampler.fits(&snapshot.sampling.sampler)
+            && snapshot.waiting_fits()
+            && snapshot.cells.iter().enumerate().all(|(index, cell)| cell.fits(bank, index));
+        if !fits {
+            let (found, branches) = (snapshot.cells.len(), bank.own_model().branches.len());
+            return Err(RestoreError::Unfit(format!(
+                "snapshot is of {found} cells, another number of branches, or samples of no cell, the configuration has \
+                 {cells} cells of {branches} branches"
+            )));
+        }
+        snapshot.check()?;
+        let config = sampling.sampler.config();
+        snapshot.check_charges(config)?;
+        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
+        Ok(())
+    }
+
+    /// Continues from the waiting snapshot, if there is one; the clock then shows when it was taken. The downtime is left
+    /// to the caller.
+    pub(crate) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
+        let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
+        let is_brief = now.since(snapshot.time).abs() <= BREAK_S;
+        if downtime == Downtime::AsStamped && snapshot.may_continue && is_brief {
+            self.continue_from(*snapshot, now, out);
+            return Beginning::Continued;
+        }
+        let taken = match downtime {
+            Downtime::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
+            Downtime::Seconds(seconds) => Some(now.plus_secs(-seconds)),
+            Downtime::AsStamped | Downtime::Unknown => None,
+        };
+        snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
+        let (buses, taken_at) = (std::mem::take(&mut snapshot.intake.buses), snapshot.time);
+        snapshot.intake.buses = buses.restored(taken_at, now);
+        self.continue_from(snapshot.for_restart(), now, out);
+        if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
+    }
+
+    fn continue_from(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
+        (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
+        self.intake.restore(snapshot.intake.clone());
+        self.stages.restore(snapshot, now, out);
+    }
+}
+
+impl Stages {
+    fn stored_cell(&self, cell: usize) -> StoredCell {
+        let Self { estimation, learning, .. } = self;
+        StoredCell {
+            estimator: estimation.bank.cell(cell).snapshot(),
+            consumed: estimation.consumed(cell),
+            trusted: estimation.is_trusted(cell),
+            model_check: estimation.model_check(cell),
+            health: learning.cells[cell],
+            forecast: learning.lives.cells[cell].forecast.clone(),
+            updated_in_round: estimation.batch.has_reported(cell),
+        }
+    }
+
+    /// Continues from a checked and rebased snapshot.
+    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
+        let is_continued = snapshot.may_continue;
+        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
+        let batch = CellBatch::restore(has_reported, snapshot.estimation.waiting);
+        let is_current_doubtful = snapshot.estimation.is_current_doubtful;
+        self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch, is_current_doubtful);
+        self.findings.restore(snapshot.diagnosis, (!is_continued).then_some((snapshot.time, now)));
+        self.note_faulty_channels();
+        self.sampling.restore(snapshot.sampling);
+        self.packs = snapshot.packs;
+        let bank = &self.estimation.bank;
+        self.packs.retain(|pack| pack.fits(bank));
+        self.sending.schedule = snapshot.sending.schedule.clone();
+        if !is_continued {
+            self.sending.begin_freshness(now);
+        }
+        self.sleep.since = snapshot.asleep_since;
+        self.restore_alarms(now, &snapshot.alarming.alarms, is_continued, out);
+        if is_continued {
+            self.alarming.resume(&snapshot.alarming);
+            self.sending.resume(&snapshot.sending);
+        }
+        self.statistics = snapshot.statistics;
+        self.statistics.restores = self.statistics.restores.saturating_add(1);
+    }
+
+    /// Restores the cells' model, filters and learned values of all cells.
+    fn restore_learned(
+        &mut self,
+        cells: &[StoredCell],
+        model: Option<ModellingState>,
+        state: LearningState,
+        batch: CellBatch,
+        is_current_doubtful: bool,
+    ) {
+        let Self { estimation, modelling, learning, .. } = self;
+        if let Some(stored) = model {
+            modelling.restore(stored);
+            estimation.use_model(modelling, &state.learner);
+        }
+        learning.state = state;
+        for (index, cell) in cells.iter().enumerate() {
+            if estimation.is_other_cell(index, &cell.model_check) {
+                // A module that was replaced while the program did not run: what is stored was of the cells before.
+                learning.state.learner.begin(&learning.config.capacity, index, estimation.bank.cell(index).capacity());
+                continue;
+            }
+            learning.cells[index] = cell.health;
+            learning.lives.cells[index] = CellLife::restore(cell.forecast.clone(), &learning.config);
+            let branches = estimation.bank.model(index).branches.len();
+            if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
+                estimation.bank.put(index, &estimator);
+            }
+        }
+        let stored = cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
+        estimation.restore(stored, batch, is_current_doubtful);
+        let configured_a = learning.config.capacity.current_offset_std_a;
+        estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
+    }
+
+    /// What is learned of the connected pack, under its number.
+    pub(crate) fn stored_pack(&self) -> StoredPack {
+        let cells = 0..self.estimation.cells();
+        let cells = cells.map(|cell| StoredCell { consumed: None, updated_in_round: false, ..self.stored_cell(cell) });
+        let mut modelling = self.modelling.stored();
+        modelling.iter_mut().for_each(ModellingState::restart);
+        StoredPack {
+            number: self.sampling.identity.known.unwrap_or(0.0),
+            cells: cells.collect(),
+            modelling,
+            diagnosis: self.findings.stored(),
+            learning: self.learning.state.learned_only(),
+        }
+    }
+
+    /// Continues with a pack that was connected before, after a time of unknown length.
+    pub(crate) fn restore_pack(&mut self, now: Timestamp, pack: StoredPack, out: &mut Outputs) {
+        let batch = CellBatch::new(pack.cells.len());
+        let is_current_doubtful = self.estimation.is_current_doubtful;
+        self.restore_learned(&pack.cells, pack.modelling, pack.learning, batch, is_current_doubtful);
+        self.modelling.end_stretch();
+        self.estimation.handle_unknown_gap();
+        // Of the time since, no balancing is counted: the charge is forgotten.
+        self.findings.restore(pack.diagnosis, Some((now, now)));
+        self.findings.diagnosis.forget_charge();
+        self.note_faulty_channels();
+        let capacity = self.learning.weakest().map(|(_, capacity)| capacity);
+        let kind = EventKind::PackReturned {
+            identity: pack.number,
+            capacity_ah: capacity.map(|capacity| capacity.mean),
+            capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
+        };
+        out.events.push(Event { time: now, kind });
+        // The alarms of the pack that was here ended: these values are new to the rules.
+        self.restate_known(now, false, true, out);
+        self.publisher(now, out).publish_alarms();
+    }
+
+    /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
+        self.alarming.state.knows_all_valid = false;
+        let orphans = self.alarming.engine.restore(state);
+        if !is_continued {
+            self.sending.compare_first(time);
+            self.sending.skip_counters(time, &self.alarming.engine);
+        }
+        let has_changed = !is_continued || !orphans.is_empty();
+        for orphan in orphans {
+            let StoredAlarm { rule, severity, cell, .. } = orphan;
+            let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
+            let kind = EventKind::AlarmDropped { rule, severity, cell, active, occurrences };
+            out.events.push(Event { time, kind });
+            self.sending.note_change(time, AlarmKey::new(rule, severity, cell));
+        }
+        if has_changed {
+            self.sending.send_changed_alarms(time, &self.alarming.engine, out);
+        }
+    }
+}

@@ -1,0 +1,40 @@
+//! Commands to the daemon, from this computer or from the bus.
+
+use serde::{Deserialize, Serialize};
+
+use crate::alarm::{Rule, Selector};
+use crate::quantity::BusIndex;
+
+/// A command to the daemon.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "command")]
+pub enum Command {
+    /// Acknowledge alarms.
+    Acknowledge(Selector),
+    /// End latched alarms and forget past ones; learned values stay.
+    Clear(Selector),
+    /// Another pack is connected: forget the values learned of the old one.
+    PackReplaced,
+    /// Send no diagnostic requests, or send them again.
+    Poll {
+        /// Send none.
+        standby: bool,
+    },
+    /// Send a rule's alarm frame, marked as a test, for a while.
+    Test {
+        /// Which rule.
+        rule: Rule,
+        /// How long, s.
+        seconds: f64,
+    },
+}
+
+/// Origin of a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Source {
+    /// This computer.
+    Local,
+    /// A frame.
+    Bus(BusIndex),
+}

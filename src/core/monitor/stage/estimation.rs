@@ -1,0 +1,424 @@
+//! Estimation stage: from cell samples to the estimate of every cell.
+//!
+//! In: batches of samples, and what half-cycles have taught ([`Learner`]). Out: one filter step per sample, and whether
+//! each cell's innovations agree with their covariance and its model is its own ([`ModelCheck`]). A sample whose filter fails
+//! resets that filter, no other.
+
+use serde::{Deserialize, Serialize};
+
+pub(crate) mod batch;
+
+use batch::CellBatch;
+
+use super::modelling::{Adoption, Modelling};
+use crate::cell::model_check::model_id;
+use crate::cell::{
+    AdoptedState, CellModel, CellModule, CellStep, EstimatorConfig, ModelCheck, ModelEvidence, PackBank,
+};
+use crate::filter::ScalarGaussian;
+use crate::health::{CapacityConfig, Learner};
+use crate::monitor::config::MonitorConfig;
+use crate::monitor::message::{Estimate, MeasuredValues};
+use crate::quantity::{CellIndex, Timestamp};
+use crate::sample::CellSample;
+
+/// Contradiction score of an estimate that is known to be wrong (multiples of the consistency limit); it trips an alarm at the limit.
+const DOUBT: f64 = 2.0;
+
+/// The estimation stage.
+#[derive(Debug)]
+pub(crate) struct Estimation {
+    pub(crate) bank: PackBank,
+    /// Cells of other kinds.
+    modules: Vec<CellModule>,
+    pub(crate) batch: CellBatch,
+    /// One per cell.
+    progress: Vec<CellProgress>,
+    /// Per cell: whether its innovations agree with their covariance.
+    trusted: Vec<bool>,
+    pub(crate) all_trusted: bool,
+    /// One per cell.
+    checks: Vec<ModelCheck>,
+    any_check_open: bool,
+    pub(crate) any_mismatched: bool,
+    /// The current is contradicted by the voltages.
+    pub(crate) is_current_doubtful: bool,
+    ambient_c: f64,
+    /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
+    after_gap: Vec<usize>,
+}
+
+/// What continues of the stage besides its cells.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct EstimationState {
+    /// Samples without their step.
+    pub(crate) waiting: Vec<CellSample>,
+    /// The current is contradicted by the voltages.
+    pub(crate) is_current_doubtful: bool,
+}
+
+/// How far a cell's samples have been used. Kept separate for cache locality: every sample updates it.
+#[derive(Debug, Clone, Copy, Default)]
+struct CellProgress {
+    /// Sampler totals at the last step; `None` before the first.
+    consumed: Option<Consumed>,
+    /// The sample of the latest estimate.
+    sample: Option<CellSample>,
+}
+
+/// Totals of the sampler that a cell's steps have used.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Consumed {
+    pub(crate) time: Timestamp,
+    pub(crate) charge_as: f64,
+    offset_s: f64,
+    pub(crate) unmeasured_s: f64,
+}
+
+impl Estimation {
+    pub(crate) fn new(config: &MonitorConfig) -> Self {
+        let cells = usize::from(config.sample.cells);
+        let bank = PackBank::new(&config.model, &config.estimator, cells, &config.modules);
+        Self {
+            checks: ids_of_models(&bank).into_iter().map(ModelCheck::new).collect(),
+            bank,
+            modules: config.modules.clone(),
+            batch: CellBatch::new(cells),
+            progress: vec![CellProgress::default(); cells],
+            trusted: vec![true; cells],
+            all_trusted: true,
+            any_check_open: true,
+            any_mismatched: false,
+            is_current_doubtful: false,
+            ambient_c: config.sample.ambient_c,
+            after_gap: Vec::new(),
+        }
+    }
+
+    /// Other settings for the same cells.
+    pub(crate) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
+        self.modules.clone_from(&config.modules);
+        self.use_model(modelling, learner);
+        let ids = ids_of_models(&self.bank);
+        self.checks.iter_mut().zip(ids).for_each(|(check, id)| *check = check.or_new(id));
+        self.note_checks();
+        self.ambient_c = config.sample.ambient_c;
+    }
+
+    /// The model in force for the same cells.
+    pub(crate) fn use_model(&mut self, modelling: &Modelling, learner: &Learner) {
+        let (model, estimator) = modelling.in_force();
+        self.reconfigure_bank(&model, &estimator, learner);
+    }
+
+    fn reconfigure_bank(&mut self, model: &CellModel, estimator: &EstimatorConfig, learner: &Learner) {
+        let learned = |config: &EstimatorConfig| {
+            let mut config = *config;
+            config.sensor.current_offset_a = learner.current_offset().std_a(config.sensor.current_offset_a);
+            config
+        };
+        let modules: Vec<CellModule> = self
+            .modules
+            .iter()
+            .map(|module| CellModule { estimator: learned(&module.estimator), ..module.clone() })
+            .collect();
+        self.bank.reconfigure(model, &learned(estimator), &modules);
+    }
+
+    /// Forgets all cells: another pack is connected.
+    pub(crate) fn forget(&mut self, modelling: &Modelling) {
+        let (cells, (model, estimator)) = (self.cells(), modelling.in_force());
+        self.bank = PackBank::new(&model, &estimator, cells, &self.modules);
+        self.progress.fill(CellProgress::default());
+        self.trusted.fill(true);
+        self.all_trusted = true;
+        self.begin_checks();
+    }
+
+    fn begin_checks(&mut self) {
+        self.checks = ids_of_models(&self.bank).into_iter().map(ModelCheck::new).collect();
+        self.note_checks();
+    }
+
+    /// Temperature where none is measured, degrees C.
+    pub(crate) fn ambient_c(&self) -> f64 {
+        self.ambient_c
+    }
+
+    /// Number of cells.
+    pub(crate) fn cells(&self) -> usize {
+        self.progress.len()
+    }
+
+    /// Every cell.
+    pub(crate) fn cell_indices(&self) -> impl ExactSizeIterator<Item = CellIndex> + use<> {
+        (0..u16::try_from(self.cells()).unwrap_or(u16::MAX)).map(CellIndex)
+    }
+
+    /// Steps the filters of all waiting samples; returns these, for [`finish`](Self::finish).
+    pub(crate) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
+        let samples = std::mem::take(&mut self.batch.waiting);
+        for sample in &samples {
+            let (cell, step) = (sample.cell.index(), self.next_step(sample, learner));
+            if self.bank.is_own(cell) {
+                modelling.note(&step);
+            }
+            self.bank.add(cell, &step);
+        }
+        self.bank.step();
+        self.check_models(&samples);
+        if modelling.has_row() {
+            modelling.close_row(self.mean_soc());
+        }
+        samples
+    }
+
+    /// Mean SOC of the cells whose model is learned, fraction; without any, half.
+    fn mean_soc(&self) -> f64 {
+        let own = self.bank.own_cells().iter();
+        let socs = own.filter_map(|&cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
+        let (count, sum) = socs.fold((0.0, 0.0), |(count, sum), soc| (count + 1.0, sum + soc));
+        if count > 0.0 { sum / count } else { 0.5 }
+    }
+
+    /// Continues with another model. The cells keep their differences from the mean cell.
+    pub(crate) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
+        let Adoption { model, config: estimator, mean, with_capacity, is_learned } = adoption;
+        let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
+        let soc = differences(own.iter().map(|&cell| bank.filtered_soc(cell).map(|soc| soc.mean)));
+        let log_resistance = differences(own.iter().map(|&cell| Some(bank.log_resistance(cell).mean)));
+        let log_capacity = differences(own.iter().map(|&cell| Some(libm::log(learner.capacity(cell).mean))));
+        self.reconfigure_bank(model, estimator, learner);
+        let (estimator, bank) = (*self.bank.own_config(), &mut self.bank);
+        for (at, cell) in own.into_iter().enumerate() {
+            let ratio = libm::exp(log_capacity[at]);
+            let fitted =
+                ScalarGaussian { mean: mean.capacity.mean * ratio, variance: mean.capacity.variance * ratio * ratio };
+            let capacity = with_capacity.then_some(fitted);
+            let state = AdoptedState {
+                soc: mean.soc.map(|mean| ScalarGaussian { mean: mean.mean + soc[at], ..mean }),
+                capacity: capacity.unwrap_or(learner.capacity(cell)),
+                log_resistance: log_resistance[at],
+                ..*mean
+            };
+            bank.change(cell, |cell| cell.adopt(model, &estimator, &state));
+            learner.adopt(config, cell, capacity.map(|capacity| (capacity, *is_learned)), state.soc, &bank.cell(cell));
+        }
+        let ids = ids_of_models(&self.bank);
+        for &cell in self.bank.own_cells() {
+            self.checks[cell] = ModelCheck::new(ids[cell]);
+        }
+        self.note_checks();
+    }
+
+    /// Ends the work on stepped samples.
+    pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
+        samples.clear();
+        self.batch.waiting = samples;
+        let bank = &self.bank;
+        self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, bank.filtered_soc(cell)));
+    }
+
+    /// The filter step from the sample before to this one.
+    fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
+        let index = sample.cell.index();
+        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
+        let now =
+            Consumed { time: sample.time, charge_as: charge, offset_s: sample.offset_s, unmeasured_s: unmeasured };
+        let (mut measured_s, mut charge_as, mut offset_s, mut unmeasured_s) = (0.0, 0.0, 0.0, 0.0);
+        // Before the first reading, and after a gap of unknown length, nothing was measured for ever.
+        let mut gap_s = f64::INFINITY;
+        if let Some(before) = self.progress[index].consumed.replace(now) {
+            charge_as = charge - before.charge_as;
+            offset_s = sample.offset_s - before.offset_s;
+            unmeasured_s = unmeasured - before.unmeasured_s;
+            measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
+            gap_s = unmeasured_s;
+        }
+        if self.any_check_open {
+            self.checks[index].add_step(measured_s, charge_as, unmeasured_s);
+        }
+        if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
+            self.after_gap.push(index);
+        }
+        // The part of the current that is the sensor's, not the cell's; a reading of exactly zero has none.
+        let offset_a = learner.current_offset().mean_a();
+        let corrected = |current_a: f64| if current_a == 0.0 { 0.0 } else { current_a - offset_a };
+        CellStep {
+            measured_s,
+            charge_as: charge_as - offset_a * offset_s,
+            offset_s,
+            unmeasured_s,
+            current_a: sample.current_a.map(corrected),
+            temperature_c: sample.temperature_c,
+            ambient_c: self.ambient_c,
+            voltage_v: sample.voltage_v,
+        }
+    }
+
+    /// Records the sample of a cell's latest step; whether that step reset its filter.
+    #[inline]
+    pub(crate) fn record(&mut self, sample: &CellSample) -> bool {
+        self.progress[sample.cell.index()].sample = Some(*sample);
+        self.bank.result(sample.cell.index()).reset
+    }
+
+    /// Whether a cell's innovations agree with their covariance.
+    pub(crate) fn is_trusted(&self, index: usize) -> bool {
+        self.trusted[index]
+    }
+
+    /// Takes the evidence about the cells' models that is due.
+    fn check_models(&mut self, samples: &[CellSample]) {
+        if !self.any_check_open {
+            return;
+        }
+        let mut has_judged = false;
+        let Self { bank, checks, .. } = self;
+        for index in samples.iter().map(|sample| sample.cell.index()) {
+            if !checks[index].is_due() {
+                continue;
+            }
+            let update = bank.result(index).update.filter(|_| !bank.result(index).reset);
+            let evidence = update.zip(bank.filtered_soc(index)).map(|(update, soc)| ModelEvidence {
+                update,
+                soc: soc.mean,
+                log_resistance: bank.log_resistance(index).mean,
+                log_resistance_std: bank.config(index).initial.log_resistance_std,
+            });
+            checks[index].judge(evidence, bank.model(index).rated_capacity_ah);
+            has_judged = true;
+        }
+        if has_judged {
+            self.note_checks();
+        }
+    }
+
+    fn note_checks(&mut self) {
+        self.any_check_open = self.checks.iter().any(ModelCheck::is_open);
+        self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
+    }
+
+    /// Whether a stored cell with this check was another one than that of its module.
+    pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
+        let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
+        !self.bank.is_own(index) && check.is_of_other(id())
+    }
+
+    /// The check of a cell's model, for the snapshot.
+    pub(crate) fn model_check(&self, index: usize) -> ModelCheck {
+        self.checks[index]
+    }
+
+    /// How much a cell contradicts its estimate: the mean normalised innovation squared, or, in the same scale (times the
+    /// consistency limit), the mismatch of a model that is another cell's, or [`DOUBT`]: an estimate that no cell can have, or
+    /// a current that is not the cell's.
+    pub(crate) fn contradiction(&self, index: usize) -> f64 {
+        let (mean_nis, check) = (self.bank.mean_nis(index), &self.checks[index]);
+        let limit = self.bank.own_config().consistency.limit;
+        let mismatch = if check.is_mismatched() { check.mismatch() } else { 0.0 };
+        let doubt = if self.is_current_doubtful || !self.bank.is_plausible(index) { DOUBT } else { 0.0 };
+        if mismatch.max(doubt) > 0.0 { mean_nis.max(mismatch.max(doubt) * limit) } else { mean_nis }
+    }
+
+    /// Judges a cell's innovations; whether it is trusted, when that has changed.
+    pub(crate) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
+        let is_trusted = self.contradiction(cell.index()) <= self.bank.own_config().consistency.limit;
+        if is_trusted == self.trusted[cell.index()] {
+            return None;
+        }
+        self.trusted[cell.index()] = is_trusted;
+        self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
+        Some(is_trusted)
+    }
+
+    /// A gap of unknown length: no charge counts over it.
+    pub(crate) fn handle_unknown_gap(&mut self) {
+        self.bank.change_all(|_, cell| cell.handle_unknown_gap());
+        self.progress.iter_mut().for_each(|cell| cell.consumed = None);
+    }
+
+    /// A cell's estimate after its latest step; `None` before the first.
+    pub(crate) fn estimate(&self, index: usize, capacity: ScalarGaussian) -> Option<Estimate> {
+        let sample = self.progress[index].sample.as_ref()?;
+        let soc = self.bank.soc(index)?;
+        let update = self.bank.result(index).update;
+        let resistance = self.resistance(index);
+        Some(Estimate {
+            time: sample.time,
+            cell: sample.cell,
+            soc: soc.mean,
+            soc_std: soc.std(),
+            branch_v: self.bank.branch_v(index),
+            capacity_ah: capacity.mean,
+            capacity_std_ah: capacity.std(),
+            resistance_ratio: resistance.mean,
+            resistance_ratio_std: resistance.std(),
+            innovation_v: update.map_or(f64::NAN, |u| u.innovation),
+            innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
+            accepted: update.is_some_and(|u| u.accepted),
+            measured: MeasuredValues {
+                voltage_v: sample.voltage_v,
+                current_a: sample.current_a.unwrap_or(f64::NAN),
+                temperature_c: self.bank.temperature_c(index).unwrap_or(f64::NAN),
+            },
+        })
+    }
+
+    /// Resistance of a cell relative to new.
+    pub(crate) fn resistance(&self, index: usize) -> ScalarGaussian {
+        resistance(&self.bank, index)
+    }
+
+    /// Totals that a cell's steps have used, for the snapshot.
+    pub(crate) fn consumed(&self, cell: usize) -> Option<Consumed> {
+        self.progress[cell].consumed
+    }
+
+    /// What continues besides the cells.
+    pub(crate) fn snapshot(&self) -> EstimationState {
+        EstimationState { waiting: self.batch.waiting.clone(), is_current_doubtful: self.is_current_doubtful }
+    }
+
+    /// Continues from stored cells: what their steps have used, whether they are trusted, the checks of their models, and the
+    /// batch.
+    pub(crate) fn restore(
+        &mut self,
+        cells: impl Iterator<Item = (Option<Consumed>, bool, ModelCheck)>,
+        batch: CellBatch,
+        is_current_doubtful: bool,
+    ) {
+        let ids = ids_of_models(&self.bank);
+        for (index, (consumed, trusted, check)) in cells.enumerate() {
+            self.progress[index].consumed = consumed;
+            self.trusted[index] = trusted;
+            self.checks[index] = check.or_new(ids[index]);
+        }
+        self.note_checks();
+        self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
+        self.batch = batch;
+        self.is_current_doubtful = is_current_doubtful;
+    }
+}
+
+/// Difference of each value from the mean of those that are known; 0 where it is not.
+fn differences(values: impl Iterator<Item = Option<f64>> + Clone) -> Vec<f64> {
+    let known = values.clone().flatten();
+    let mean = known.clone().sum::<f64>() / known.count().max(1) as f64;
+    values.map(|value| value.map_or(0.0, |value| value - mean)).collect()
+}
+
+/// Per cell, what identifies its model and the spread expected of its resistance.
+fn ids_of_models(bank: &PackBank) -> Vec<u64> {
+    let of_kinds: Vec<u64> =
+        bank.kinds().map(|(model, config)| model_id(model, config.initial.log_resistance_std)).collect();
+    (0..bank.cells()).map(|cell| of_kinds[bank.kind(cell)]).collect()
+}
+
+/// Resistance of a cell relative to new.
+pub(crate) fn resistance(bank: &PackBank, index: usize) -> ScalarGaussian {
+    let log_resistance = bank.log_resistance(index);
+    let ratio = libm::exp(log_resistance.mean);
+    ScalarGaussian::from_std(ratio, ratio * log_resistance.std())
+}

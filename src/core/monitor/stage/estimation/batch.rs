@@ -1,0 +1,59 @@
+//! Cells mostly report in turn: their samples wait until each cell has one, and are stepped together.
+//!
+//! An estimate does not depend on how long its sample waited: a step uses its own sample's time and charge, and no other
+//! cell.
+
+use crate::quantity::CellIndex;
+use crate::sample::CellSample;
+
+/// Which cells have reported since the pack's values were last combined.
+#[derive(Debug)]
+pub(crate) struct CellBatch {
+    /// Samples that wait for their step, in the order of arrival, at most one per cell.
+    pub(crate) waiting: Vec<CellSample>,
+    has_reported: Vec<bool>,
+    pub(crate) reported: usize,
+}
+
+impl CellBatch {
+    pub(crate) fn new(cells: usize) -> Self {
+        Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0 }
+    }
+
+    /// Continues a stored batch.
+    pub(crate) fn restore(has_reported: Vec<bool>, waiting: Vec<CellSample>) -> Self {
+        let reported = has_reported.iter().filter(|&&reported| reported).count();
+        Self { waiting, has_reported, reported }
+    }
+
+    pub(crate) fn has_reported(&self, cell: usize) -> bool {
+        self.has_reported[cell]
+    }
+
+    /// Whether the cell has not reported in this batch.
+    #[inline]
+    pub(crate) fn awaits(&self, cell: CellIndex) -> bool {
+        self.has_reported.get(cell.index()) == Some(&false)
+    }
+
+    /// Adds a sample that is [awaited](Self::awaits).
+    #[inline]
+    pub(crate) fn add(&mut self, sample: CellSample) {
+        debug_assert!(!self.has_reported[sample.cell.index()], "a second sample of {:?}", sample.cell);
+        self.has_reported[sample.cell.index()] = true;
+        self.reported += 1;
+        self.waiting.push(sample);
+    }
+
+    #[inline]
+    pub(crate) fn is_complete(&self) -> bool {
+        self.reported == self.has_reported.len()
+    }
+
+    /// Begins the next batch; the steps of the last are made.
+    pub(crate) fn begin(&mut self) {
+        debug_assert!(self.waiting.is_empty(), "{} samples without their step", self.waiting.len());
+        self.has_reported.fill(false);
+        self.reported = 0;
+    }
+}

@@ -1,0 +1,147 @@
+//! Findings stage: from cell samples to findings about single cells.
+//!
+//! In: the samples of all cells with their estimates. Out: an event for each finding that is new ([`EventKind::Finding`]).
+//! It only watches: no estimate and no capacity depends on it. What it finds goes to the rules about single cells when a row of
+//! the diagnosis ends.
+
+use super::estimation::Estimation;
+use super::learning::Learning;
+use crate::cell_faults::fault::OFFSET_PER_H;
+use crate::cell_faults::gain::Learned;
+use crate::cell_faults::{BalancingConfig, CellFaultDetector, CellFaultKind, MeanCell};
+use crate::filter::ScalarGaussian;
+use crate::monitor::config::MonitorConfig;
+use crate::monitor::message::{Event, EventKind, Outputs};
+use crate::quantity::{CellIndex, Fault, Timestamp};
+use crate::sample::CellSample;
+
+/// The findings stage.
+#[derive(Debug)]
+pub(crate) struct Findings {
+    pub(crate) diagnosis: CellFaultDetector,
+    cells: usize,
+    /// The cells that are compared: those in no module of another kind.
+    compared: Vec<usize>,
+    /// The BMS lets fuller cells lose charge.
+    is_balanced: bool,
+    /// Where bits show which cells are bled.
+    balancing: Option<BalancingConfig>,
+}
+
+impl Findings {
+    /// `compared`: the cells of the pack's own kind.
+    pub(crate) fn new(config: &MonitorConfig, compared: &[usize]) -> Self {
+        let cells = usize::from(config.sample.cells);
+        let (is_balanced, balancing) = (config.is_balanced, config.balancing);
+        let compared = compared.to_vec();
+        Self { diagnosis: CellFaultDetector::among(cells, &compared), cells, compared, is_balanced, balancing }
+    }
+
+    /// Other settings for the same cells.
+    pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
+        (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
+    }
+
+    /// Forgets everything: another pack is connected.
+    pub(crate) fn forget(&mut self) {
+        self.diagnosis = CellFaultDetector::among(self.cells, &self.compared);
+    }
+
+    /// The state, to be stored; `None` = the pack is too small for a comparison.
+    pub(crate) fn stored(&self) -> Option<CellFaultDetector> {
+        self.diagnosis.is_active().then(|| self.diagnosis.clone())
+    }
+
+    /// Continues from a checked state. `away`: from when to when the daemon did not run; `None` = it continues without a break.
+    pub(crate) fn restore(&mut self, stored: Option<CellFaultDetector>, away: Option<(Timestamp, Timestamp)>) {
+        let Some(stored) = stored.filter(|_| self.diagnosis.is_active()) else { return };
+        self.diagnosis = stored;
+        self.diagnosis.compare_only(&self.compared);
+        if let Some((from, to)) = away {
+            self.diagnosis.interrupt();
+            self.diagnosis.note_unheard(from, to);
+        }
+    }
+
+    /// The cells whose channel is faulty.
+    pub(crate) fn faulty_channels(&self) -> Vec<CellIndex> {
+        let is_faulty = |cell: &CellIndex| self.diagnosis.has_channel_fault(*cell) == Some(true);
+        (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
+    }
+
+    /// Takes a bit that shows whether a cell is bled.
+    pub(crate) fn handle_balancing(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
+        if let Some(balancing) = &self.balancing {
+            let is_bled = reading.ok().map(|value| value != 0.0);
+            self.diagnosis.handle_balancing(cell.index(), now, is_bled, now.plus_secs(balancing.max_age_s));
+        }
+    }
+
+    /// Takes whether the reading of the current is frozen. No row ends without a current: the finding does not wait for one.
+    pub(crate) fn watch_current(&mut self, now: Timestamp, is_frozen: bool, out: &mut Outputs) {
+        let is_found = || self.diagnosis.findings().iter().any(|found| found.kind == CellFaultKind::CurrentFrozen);
+        if self.diagnosis.is_active() && is_frozen != is_found() {
+            let size = ScalarGaussian { mean: 1.0, variance: 0.0 };
+            let new =
+                self.diagnosis.note_sensor(now, CellFaultKind::CurrentFrozen, f64::from(u8::from(is_frozen)), size);
+            out.events.extend(new.map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+        }
+    }
+
+    /// Takes samples that have made their step; whether a row ended.
+    #[inline]
+    pub(crate) fn observe(
+        &mut self,
+        now: Timestamp,
+        samples: &[CellSample],
+        estimation: &Estimation,
+        learning: &Learning,
+        out: &mut Outputs,
+    ) -> bool {
+        if !self.diagnosis.is_active() {
+            return false;
+        }
+        for sample in samples.iter().filter(|sample| estimation.bank.is_own(sample.cell.index())) {
+            let CellSample { cell, time, voltage_v, current_a, temperature_c, .. } = *sample;
+            self.diagnosis.add(cell.index(), time, voltage_v, current_a, temperature_c);
+        }
+        let middle = self.diagnosis.middle();
+        let Some(sample) = samples.iter().find(|sample| sample.cell.index() == middle) else { return false };
+        let bank = &estimation.bank;
+        let (Some(soc), Some(current_a)) = (bank.filtered_soc(middle), sample.current_a) else {
+            self.diagnosis.interrupt();
+            return false;
+        };
+        let (model, capacity_ah) = (bank.own_model(), learning.capacity(middle).mean);
+        let temperature_c = bank.temperature_c(middle).unwrap_or(estimation.ambient_c());
+        let position = model.grid_position(soc.mean.clamp(0.0, 1.0), temperature_c);
+        let ohm = model.r0_ohm(&position) * libm::exp(bank.log_resistance(middle).mean);
+        let drop_v = current_a * ohm + bank.branch_v(middle)[..model.branches.len()].iter().sum::<f64>();
+        let charge_ah = sample.charge_as / 3600.0;
+        let mean = MeanCell { soc: soc.mean, current_a, drop_v, temperature_c, charge_ah };
+        let is_complete = self.diagnosis.note(sample.time, &mean, capacity_ah);
+        if is_complete {
+            let socs = |cell: usize| bank.filtered_soc(cell).filter(|_| bank.is_own(cell)).map(|soc| soc.mean);
+            let mut reported = self.diagnosis.close_row(model, capacity_ah, socs, self.is_balanced, self.balancing);
+            let (probability, size) = current_offset(learning, model.rated_capacity_ah);
+            reported.extend(self.diagnosis.note_sensor(now, CellFaultKind::CurrentOffset, probability, size));
+            let cell = |index: usize| Learned {
+                capacity_ah: learning.capacity(index),
+                log_resistance: bank.log_resistance(index).mean,
+            };
+            reported.extend(self.diagnosis.note_day(now, temperature_c, self.compared.iter().copied().map(cell)));
+            out.events
+                .extend(reported.into_iter().map(|finding| Event { time: now, kind: EventKind::Finding(finding) }));
+        }
+        is_complete
+    }
+}
+
+/// How probable it is that the current's sensor is off, and by how much, by the learned offset; part of the rated capacity per hour.
+fn current_offset(learning: &Learning, rated_ah: f64) -> (f64, ScalarGaussian) {
+    let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
+    let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });
+    let size = ScalarGaussian { mean: offset.mean / rated_ah, variance: offset.variance / (rated_ah * rated_ah) };
+    let beyond = (size.mean.abs() - OFFSET_PER_H) / (size.std() * std::f64::consts::SQRT_2).max(1e-12);
+    (0.5 * libm::erfc(-beyond), size)
+}

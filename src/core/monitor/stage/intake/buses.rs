@@ -1,0 +1,150 @@
+//! Whether the interfaces are in order, for the rule about them.
+//!
+//! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame comes, and
+//! while frames of ours cannot be sent. Before its first report it is unknown. A fault lasts over a restart, from when it
+//! began until the interface is reported in order.
+
+use serde::{Deserialize, Serialize};
+
+use crate::monitor::message::BusEvent;
+use crate::quantity::{BusIndex, Timestamp};
+
+/// Error class bits of an error frame (linux/can/error.h).
+pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
+const CAN_ERR_RESTARTED: u32 = 0x100;
+
+/// Without another report for this long frames can be sent again, s: four of the drivers' report periods.
+const SEND_RECOVERED_S: f64 = 1.0;
+
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
+struct BusState {
+    is_known: bool,
+    down_since: Option<Timestamp>,
+    off_since: Option<Timestamp>,
+    /// First and latest report that frames could not be sent.
+    unsent: Option<(Timestamp, Timestamp)>,
+}
+
+/// All interfaces with a report.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub(crate) struct Buses {
+    states: Vec<BusState>,
+}
+
+impl Buses {
+    /// Takes a report of an interface.
+    pub(crate) fn handle_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent) {
+        let state = self.state(bus);
+        state.is_known = true;
+        match event {
+            BusEvent::Up => *state = BusState { is_known: true, unsent: state.unsent, ..BusState::default() },
+            BusEvent::Down | BusEvent::Missing => state.down_since = state.down_since.or(Some(now)),
+            BusEvent::ErrorFrame { class } if class & CAN_ERR_RESTARTED != 0 => state.off_since = None,
+            BusEvent::ErrorFrame { class } if class & CAN_ERR_BUSOFF != 0 => {
+                state.off_since = state.off_since.or(Some(now));
+            }
+            BusEvent::SendFailed { .. } => {
+                let first = state.unsent.filter(|(_, latest)| now.since(*latest) <= SEND_RECOVERED_S);
+                state.unsent = Some((first.map_or(now, |(first, _)| first), now));
+            }
+            BusEvent::ErrorFrame { .. } | BusEvent::Dropped { .. } => {}
+        }
+    }
+
+    /// A frame came: the interface is not bus-off.
+    #[inline]
+    pub(crate) fn handle_frame(&mut self, bus: BusIndex) {
+        let state = self.state(bus);
+        (state.is_known, state.off_since) = (true, None);
+    }
+
+    /// For how long the worst of `interfaces` has been out of order, s; 0 = all that have reported are in order, `None` =
+    /// none has. And whether each has reported.
+    pub(crate) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
+        let known = self.states.iter().filter(|state| state.is_known);
+        let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
+        (worst_s, known.count() >= interfaces)
+    }
+
+    /// Moves stored stamps onto another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        let moved = |stamp: Timestamp| stamp.plus_nanos(by_nanos);
+        for state in &mut self.states {
+            (state.down_since, state.off_since) = (state.down_since.map(moved), state.off_since.map(moved));
+            state.unsent = state.unsent.map(|(first, latest)| (moved(first), moved(latest)));
+        }
+    }
+
+    /// Continues at `now` with the faults stored at `taken`: whether a fault lasts is not known before the interface is
+    /// reported, nor whether frames can be sent again before a second has passed.
+    pub(crate) fn restored(mut self, taken: Timestamp, now: Timestamp) -> Self {
+        for state in &mut self.states {
+            let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
+            state.unsent = unsent.map(|(first, _)| (first, now));
+            state.is_known = false;
+        }
+        self
+    }
+
+    fn state(&mut self, bus: BusIndex) -> &mut BusState {
+        if self.states.len() <= bus.index() {
+            self.states.resize(bus.index() + 1, BusState::default());
+        }
+        &mut self.states[bus.index()]
+    }
+}
+
+impl BusState {
+    fn fault_s(&self, now: Timestamp) -> f64 {
+        let unsent = self.unsent.filter(|(_, latest)| now.since(*latest) <= SEND_RECOVERED_S);
+        let since = [self.down_since, self.off_since, unsent.map(|(first, _)| first)];
+        // A fault in this very moment lasts already: 0 would say that there is none.
+        since.into_iter().flatten().map(|since| now.since(since).max(1e-9)).fold(0.0, f64::max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BUS: BusIndex = BusIndex(1);
+
+    fn at(seconds: f64) -> Timestamp {
+        Timestamp::from_secs(seconds)
+    }
+
+    #[test]
+    fn an_interface_is_out_of_order_from_the_first_report_to_the_last() {
+        for (fault, end) in [
+            (BusEvent::Down, Some(BusEvent::Up)),
+            (BusEvent::Missing, Some(BusEvent::Up)),
+            (BusEvent::ErrorFrame { class: 0x40 }, Some(BusEvent::ErrorFrame { class: 0x100 })),
+            (BusEvent::ErrorFrame { class: 0x40 }, Some(BusEvent::Up)),
+            (BusEvent::SendFailed { frames: 3 }, None),
+        ] {
+            let mut buses = Buses::default();
+            assert_eq!(buses.worst_s(at(0.0), 1).0, None);
+            buses.handle_event(at(1.0), BUS, BusEvent::Up);
+            assert_eq!(buses.worst_s(at(2.0), 1).0, Some(0.0));
+            buses.handle_event(at(3.0), BUS, fault);
+            assert!(buses.worst_s(at(3.0), 1).0.is_some_and(|fault_s| fault_s > 0.0));
+            buses.handle_event(at(3.8), BUS, fault);
+            assert_eq!(buses.worst_s(at(4.5), 1).0, Some(1.5), "{fault:?}");
+            if let Some(end) = end {
+                assert_eq!(buses.worst_s(at(9.0), 1).0, Some(6.0), "{fault:?}");
+                buses.handle_event(at(9.0), BUS, end);
+            }
+            assert_eq!(buses.worst_s(at(9.0), 1).0, Some(0.0), "{fault:?}");
+        }
+    }
+
+    #[test]
+    fn a_frame_ends_bus_off_and_other_errors_are_no_fault() {
+        let mut buses = Buses::default();
+        buses.handle_event(at(0.0), BUS, BusEvent::ErrorFrame { class: 0x40 });
+        buses.handle_frame(BUS);
+        buses.handle_event(at(1.0), BUS, BusEvent::ErrorFrame { class: 0x4 });
+        buses.handle_event(at(1.0), BUS, BusEvent::Dropped { frames: 9 });
+        assert_eq!(buses.worst_s(at(2.0), 1).0, Some(0.0));
+    }
+}

@@ -1,0 +1,93 @@
+//! The end of the data path: events, alarm values and the frames that follow from them, at the time of one input.
+//!
+//! A stage publishes an event or the value of a rule; what changes in an alarm by it follows at once, as an event, as the
+//! alarm's frame and as J1939 trouble codes.
+
+use super::alarming::Alarming;
+use super::sending::Sending;
+use super::sending::alarm_queue::AlarmKey;
+use crate::alarm::{Alarm, AlarmChange, AlarmInput, CommandOutcome, Observation, Rule};
+use crate::filter::ScalarGaussian;
+use crate::monitor::message::{Event, EventKind, Outputs};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Alarms, frames and outputs at one moment.
+pub(crate) struct Publisher<'a> {
+    pub(crate) now: Timestamp,
+    pub(crate) alarming: &'a mut Alarming,
+    pub(crate) sending: &'a mut Sending,
+    pub(crate) out: &'a mut Outputs,
+}
+
+impl Publisher<'_> {
+    /// Publishes an event.
+    pub(crate) fn event(&mut self, kind: EventKind) {
+        self.out.events.push(Event { time: self.now, kind });
+    }
+
+    /// Passes a value to its rule, and publishes what it changes. Values from a faulty channel are ignored.
+    pub(crate) fn observe(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
+        if !self.alarming.depends_on_faulty_channel(rule, cell) {
+            self.restate(rule, cell, observation);
+        }
+    }
+
+    /// Passes a previously learned value to its rule again, even if the channel is now faulty.
+    pub(crate) fn restate(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
+        self.apply(AlarmInput::Observe { rule, cell, observation });
+        self.publish_alarms();
+    }
+
+    /// Passes an input to the alarm engine; changes wait for [`publish_alarms`](Self::publish_alarms).
+    pub(crate) fn apply(&mut self, input: AlarmInput) -> CommandOutcome {
+        if self.out.want_alarm_inputs {
+            self.out.alarm_inputs.push((self.now, input));
+        }
+        self.alarming.engine.apply(self.now, &input, &mut self.alarming.changes)
+    }
+
+    /// Publishes waiting changes of alarms, and sends each changed alarm as it is now.
+    pub(crate) fn publish_alarms(&mut self) {
+        if self.alarming.changes.is_empty() {
+            return;
+        }
+        let mut changes = std::mem::take(&mut self.alarming.changes);
+        for change in changes.drain(..) {
+            self.event(alarm_event(&change));
+            let Alarm { rule, severity, cell, .. } = change.alarm;
+            self.sending.note_change(self.now, AlarmKey::new(rule, severity, cell));
+        }
+        self.alarming.changes = changes;
+        self.sending.send_changed_alarms(self.now, &self.alarming.engine, self.out);
+        self.update_trouble_codes();
+        self.sending.poll_j1939(self.now, self.out);
+    }
+
+    /// Passes the present alarms to the J1939 node.
+    pub(crate) fn update_trouble_codes(&mut self) {
+        self.sending.update_trouble_codes(self.now, &self.alarming.engine);
+    }
+}
+
+/// The value of a rule that was learned now.
+pub(crate) fn learned(value: ScalarGaussian) -> Observation {
+    Observation::new(Some(value.mean)).with_std(value.std())
+}
+
+fn alarm_event(change: &AlarmChange) -> EventKind {
+    let Alarm { rule, cell, state, severity, value, probability, threshold, occurrences, is_acknowledged, .. } =
+        change.alarm;
+    EventKind::Alarm {
+        rule,
+        cell,
+        change: change.change,
+        state,
+        active: state.is_raised(),
+        severity,
+        value,
+        probability,
+        threshold,
+        occurrences,
+        acknowledged: is_acknowledged,
+    }
+}

@@ -1,0 +1,176 @@
+//! Sampling stage: from readings to cell samples, and which pack is connected.
+//!
+//! In: judged readings. Out: a [`CellSample`] for each good voltage, events on each change of a signal, and the pack's
+//! identity once enough readings in a row agree. Bad readings and single odd identities change nothing. The identity is
+//! kept over restarts, so that a pack changed meanwhile is found.
+
+use serde::{Deserialize, Serialize};
+
+use crate::monitor::config::MonitorConfig;
+use crate::monitor::message::{Event, EventKind, Outputs};
+use crate::quantity::{CellIndex, Channel, Fault, Reading, Timestamp};
+use crate::sample::{CellSample, Sampler, SamplerState, SignalChange, VoltageSource};
+
+/// The sampling stage.
+#[derive(Debug)]
+pub(crate) struct Sampling {
+    pub(crate) sampler: Sampler,
+    pub(crate) identity: Identity,
+    identity_readings: u32,
+    /// Whether a usable reading has come since the first input.
+    pub(crate) has_usable_reading: bool,
+    /// An input message has a second sender.
+    pub(crate) has_second_sender: bool,
+    /// Changes of the input at hand, kept for their memory.
+    changes: Vec<SignalChange>,
+}
+
+/// What continues of the stage.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SamplingState {
+    pub(crate) sampler: SamplerState,
+    identity: Identity,
+    has_usable_reading: bool,
+    has_second_sender: bool,
+}
+
+impl SamplingState {
+    /// What a program that is started again knows: signals and pack, but no reading of its own.
+    pub(crate) fn restart(&mut self) {
+        self.identity.candidate = None;
+        (self.has_usable_reading, self.has_second_sender) = (false, false);
+    }
+}
+
+/// The pack's identity as its signal gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(crate) struct Identity {
+    pub(crate) known: Option<f64>,
+    /// Another number, and how many readings in a row have given it.
+    candidate: Option<(f64, u32)>,
+}
+
+impl Identity {
+    /// Takes a reading; the new number when `readings` in a row have given it.
+    fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
+        if self.known == Some(value) {
+            self.candidate = None;
+            return None;
+        }
+        let count = self.candidate.filter(|(number, _)| *number == value).map_or(0, |(_, count)| count) + 1;
+        self.candidate = Some((value, count));
+        if count < readings {
+            return None;
+        }
+        let is_replacement = self.known.is_some();
+        *self = Self { known: Some(value), candidate: None };
+        Some((value, is_replacement))
+    }
+}
+
+impl Identity {
+    /// Whether a reading gives another number than that of the connected pack.
+    pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
+        let value = reading.ok().filter(|value| value.is_finite())?;
+        Some(self.known? != value)
+    }
+}
+
+impl Sampling {
+    pub(crate) fn new(config: &MonitorConfig) -> Self {
+        Self {
+            sampler: Sampler::new(config.sample.clone()),
+            identity: Identity::default(),
+            identity_readings: config.identity_readings,
+            has_usable_reading: false,
+            has_second_sender: false,
+            changes: Vec::new(),
+        }
+    }
+
+    /// What continues.
+    pub(crate) fn snapshot(&self) -> SamplingState {
+        SamplingState {
+            sampler: self.sampler.snapshot(),
+            identity: self.identity,
+            has_usable_reading: self.has_usable_reading,
+            has_second_sender: self.has_second_sender,
+        }
+    }
+
+    /// Continues from a state whose shape [fits](Sampler::fits).
+    pub(crate) fn restore(&mut self, state: SamplingState) {
+        self.sampler.restore(state.sampler);
+        self.identity = state.identity;
+        (self.has_usable_reading, self.has_second_sender) = (state.has_usable_reading, state.has_second_sender);
+    }
+
+    /// Other limits for the same signals.
+    pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
+        self.sampler.reconfigure(&config.sample);
+        self.identity_readings = config.identity_readings;
+    }
+
+    /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
+    /// [`handle_reading`](Self::handle_reading) has still to take it.
+    #[inline]
+    pub(crate) fn take_ordinary_voltage(
+        &mut self,
+        now: Timestamp,
+        cell: CellIndex,
+        voltage_v: f64,
+    ) -> Option<CellSample> {
+        let sample = self.sampler.take_ordinary_voltage(now, cell, voltage_v)?;
+        self.has_usable_reading = true;
+        Some(sample)
+    }
+
+    /// Takes any reading of a signal; the sample it completes, if it is a good voltage.
+    pub(crate) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
+        let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
+        self.has_usable_reading =
+            self.has_usable_reading || (reading.value.is_ok() && self.sampler.is_fresh(reading.channel, now));
+        self.report(now, out);
+        sample
+    }
+
+    /// Takes a reading of the identity signal. Returns another identity, and whether another pack was known before.
+    pub(crate) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
+        let value = reading.ok().filter(|value| value.is_finite())?;
+        self.identity.observe(value, self.identity_readings)
+    }
+
+    /// Finds signals that have become stale.
+    pub(crate) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sampler.poll(now, &mut self.changes);
+        self.report(now, out);
+    }
+
+    /// The channel of a cell's voltage.
+    pub(crate) fn voltage_channel(&self, cell: CellIndex) -> Channel {
+        match self.sampler.config().voltage_source {
+            VoltageSource::Cells => Channel::CellVoltage(cell),
+            VoltageSource::PackTotal { .. } => Channel::PackVoltage,
+        }
+    }
+
+    /// Whether the current and a cell's voltage come: the inputs of its estimate.
+    pub(crate) fn inputs_valid(&self, cell: CellIndex, now: Timestamp) -> bool {
+        let is_lost = |channel| self.sampler.is_lost(channel, now);
+        !is_lost(Channel::Current) && !is_lost(self.voltage_channel(cell))
+    }
+
+    fn report(&mut self, time: Timestamp, out: &mut Outputs) {
+        if self.changes.is_empty() {
+            return;
+        }
+        for SignalChange { channel, state } in self.changes.drain(..) {
+            let kind = match state {
+                Err(fault) => EventKind::SignalBad { channel, fault },
+                Ok(bad_readings) => EventKind::SignalGood { channel, bad_readings },
+            };
+            out.events.push(Event { time, kind });
+        }
+    }
+}

@@ -1,0 +1,565 @@
+//! Sending stage: cyclic frames, alarm frames, replies to commands, tests, and the J1939 node.
+//!
+//! In: fields of the frames from the other stages, alarms, ticks. Out: frames in [`Outputs`]. Missed periods are skipped,
+//! not made up for. Without `[output]` nothing but the J1939 node sends.
+
+use serde::{Deserialize, Serialize};
+
+pub(crate) mod alarm_queue;
+mod digest;
+pub(crate) mod j1939;
+
+use alarm_queue::{AlarmKey, AlarmQueue};
+use j1939::J1939;
+
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule};
+use crate::can::Frame;
+use crate::can::encode::{
+    AlarmFields, FRESHNESS_PERIOD_MS, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields,
+    SendCounters, StatusFields,
+};
+use crate::can::j1939::Node;
+use crate::can::poll::{PollOutputs, PollProgress, Poller};
+use crate::monitor::config::{MonitorConfig, OutputConfig, SupplyConfig};
+use crate::monitor::message::{Event, EventKind, Outputs, Secured, Transmit};
+use crate::quantity::{BusIndex, Fault, Timestamp};
+
+/// Period of a test's frames, s: a consumer that reads once a second receives several.
+const TEST_PERIOD_S: f64 = 0.1;
+/// Longest test, s: a forgotten test ends by itself.
+pub const MAX_TEST_S: f64 = 600.0;
+
+/// Replies at once after a pause; then one each [`REPLY_DELAY_MS`]. A sender of commands waits for each reply.
+const REPLY_BURST: i64 = 5;
+const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
+
+/// Freshness values skipped at a start: three hours of the most frames, sent since the state was stored.
+const RESTART_FRESHNESS: u64 = 1 << 20;
+/// Least freshness per second of the clock: more than the frames of a second.
+const FRESHNESS_PER_S: u64 = 256;
+
+/// The sending stage.
+#[derive(Debug)]
+pub(crate) struct Sending {
+    config: Option<OutputConfig>,
+    pub(crate) schedule: Schedule,
+    /// A running test of an alarm frame; it ends with the process.
+    test: Option<AlarmTest>,
+    pub(crate) j1939: Option<J1939>,
+    pub(crate) poller: Option<Poller>,
+    supply: Option<SupplyConfig>,
+    /// A change of an alarm gave the next tick something to do.
+    is_rescheduled: bool,
+    /// Outputs of the poller, kept for their memory.
+    polled: PollOutputs,
+}
+
+/// What continues of the stage.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SendingState {
+    pub(crate) schedule: Schedule,
+    test: Option<AlarmTest>,
+    poller: Option<PollProgress>,
+    node: Option<Node>,
+}
+
+impl SendingState {
+    /// What a program that is started again knows: a test ends with the process, requests and address begin again.
+    pub(crate) fn restart(&mut self) {
+        (self.test, self.poller, self.node) = (None, None, None);
+    }
+}
+
+/// A running test of an alarm frame.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct AlarmTest {
+    rule: Rule,
+    next: Timestamp,
+    end: Timestamp,
+}
+
+/// When each cyclic piece of work is due next.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub(crate) struct Schedule {
+    housekeeping: Timestamp,
+    status: Timestamp,
+    health: Timestamp,
+    alarm: Timestamp,
+    /// Which of the alarms that cannot be judged is next in the cycle.
+    alarm_turn: usize,
+    digest: Timestamp,
+    /// Which threshold is next in the digest.
+    threshold_turn: usize,
+    /// From when on another reply may be sent.
+    reply: Timestamp,
+    pub(crate) alarms: AlarmQueue,
+    /// Counters of the frames' end-to-end protection.
+    counters: SendCounters,
+    /// When the freshness of commands is announced next.
+    freshness: Timestamp,
+    /// Freshness of the last authenticated frame; one row for all messages.
+    sent_freshness: u64,
+}
+
+impl Schedule {
+    /// Moves stored times onto another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        for due in self.dues() {
+            *due = due.plus_nanos(by_nanos);
+        }
+        self.reply = self.reply.plus_nanos(by_nanos);
+        self.alarms.rebase(by_nanos);
+    }
+
+    /// When each piece of work is due.
+    fn dues(&mut self) -> [&mut Timestamp; 6] {
+        let Self { housekeeping, status, health, alarm, digest, freshness, .. } = self;
+        [housekeeping, status, health, alarm, digest, freshness]
+    }
+
+    /// Other periods; a shorter one begins now, not when the longer one is over.
+    fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
+        let periods_s =
+            |of: &OutputConfig| [of.status_period_s, of.health_period_s, of.alarm_period_s, of.digest_period_s];
+        let dues = [&mut self.status, &mut self.health, &mut self.alarm, &mut self.digest];
+        for (due, (before_s, after_s)) in dues.into_iter().zip(periods_s(before).into_iter().zip(periods_s(after))) {
+            if before_s != after_s {
+                *due = (*due).min(now.plus_secs(after_s));
+            }
+        }
+    }
+}
+
+/// The interfaces of a frame: all, or that of `bus` alone where something is sent on it.
+fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item = BusIndex> + '_ {
+    let only = bus.filter(|bus| output.buses.contains(bus));
+    output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
+}
+
+/// Whether work is due; if so, its next time is set, with missed periods skipped.
+fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
+    if now < *due {
+        return false;
+    }
+    let next = due.plus_secs(period_s);
+    *due = if next > now { next } else { now.plus_secs(period_s) };
+    true
+}
+
+impl Sending {
+    pub(crate) fn new(config: &MonitorConfig) -> Self {
+        Self {
+            config: config.output.clone(),
+            schedule: Schedule::default(),
+            test: None,
+            j1939: config.j1939.clone().map(J1939::new),
+            poller: config.poll.as_ref().map(Poller::new),
+            supply: config.supply,
+            is_rescheduled: false,
+            polled: PollOutputs::default(),
+        }
+    }
+
+    /// What continues.
+    pub(crate) fn snapshot(&self) -> SendingState {
+        SendingState {
+            schedule: self.schedule.clone(),
+            test: self.test,
+            poller: self.poller.as_ref().map(|poller| poller.progress().clone()),
+            node: self.j1939.as_ref().map(|j1939| j1939.node.clone()),
+        }
+    }
+
+    /// Continues what was under way; the schedule is restored before.
+    pub(crate) fn resume(&mut self, state: &SendingState) {
+        self.test = state.test;
+        if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
+            poller.resume(stored);
+        }
+        if let (Some(j1939), Some(stored)) = (&mut self.j1939, &state.node) {
+            j1939.node.resume(stored);
+        }
+    }
+
+    /// Other cyclic frames. Without any, a running test ends.
+    pub(crate) fn reconfigure(
+        &mut self,
+        now: Timestamp,
+        config: Option<&OutputConfig>,
+        engine: &AlarmEngine,
+        out: &mut Outputs,
+    ) {
+        let before = std::mem::replace(&mut self.config, config.cloned());
+        match (before, config) {
+            (_, None) => {
+                self.end_test(now, engine, out);
+                self.schedule.alarms.clear();
+            }
+            (Some(before), Some(after)) => self.schedule.reconfigure(now, &before, after),
+            (None, Some(_)) => {}
+        }
+    }
+
+    /// Another J1939 configuration: the same node keeps its address, another one claims it.
+    pub(crate) fn reconfigure_j1939(
+        &mut self,
+        now: Timestamp,
+        config: &MonitorConfig,
+        has_started: bool,
+        out: &mut Outputs,
+    ) {
+        let Some(config) = &config.j1939 else {
+            self.j1939 = None;
+            return;
+        };
+        if !self.j1939.as_mut().is_some_and(|running| running.reconfigure(config)) {
+            self.j1939 = Some(J1939::new(config.clone()));
+            if has_started {
+                self.claim_address(now, out);
+            }
+        }
+    }
+
+    /// Values are compared before anything is sent: after a restart none is known.
+    pub(crate) fn compare_first(&mut self, now: Timestamp) {
+        self.schedule.housekeeping = self.schedule.housekeeping.min(now);
+    }
+
+    /// Makes everything due now: after a start and after time asleep.
+    pub(crate) fn restart(&mut self, now: Timestamp) {
+        self.schedule.dues().into_iter().for_each(|due| *due = now);
+        self.schedule.reply = self.schedule.reply.min(now);
+        self.schedule.alarms.restart(now);
+    }
+
+    /// Begins the freshness of authenticated frames beyond all that an earlier process can have sent: a receiver accepts none
+    /// twice. The clock counts where the stored state was lost.
+    pub(crate) fn begin_freshness(&mut self, now: Timestamp) {
+        let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
+        let sent = &mut self.schedule.sent_freshness;
+        *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
+    }
+
+    /// Skips the counters of the frames that an earlier process has sent since its state was stored, or would have sent by
+    /// `now`: for a receiver the frames of the downtime are lost ones, and no counter comes twice.
+    pub(crate) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
+        let Some(config) = &self.config else { return };
+        let Schedule { status, health, alarm, digest, alarms, counters, .. } = &mut self.schedule;
+        let periods = |due: Timestamp, period_s: f64| {
+            let periods = (now.since(due) / period_s).floor() + 1.0;
+            // Of a saturating cast: a negative number of periods is none.
+            periods.max(0.0) as u64
+        };
+        let pages = |count: usize| u64::try_from(count).unwrap_or(0);
+        // After a restart all alarms are unknown; those that the earlier process announced as unknown are noted.
+        let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
+        alarms.limit(now, config.alarm_period_s);
+        for (message, frames) in [
+            (LayoutMessage::Status, periods(*status, config.status_period_s)),
+            (
+                LayoutMessage::Health,
+                periods(*health, config.health_period_s).saturating_mul(pages(config.plan.health_pages())),
+            ),
+            (
+                LayoutMessage::Digest,
+                periods(*digest, config.digest_period_s).saturating_mul(pages(config.plan.digest_pages())),
+            ),
+            (LayoutMessage::Alarm, alarms.frames_until(now, engine, config.alarm_period_s).saturating_add(unknown)),
+            // A refused command changes nothing that is stored at once: its reply may be one that the stored counter has not seen.
+            (LayoutMessage::Reply, 1),
+        ] {
+            config.plan.skip(message, frames, counters);
+        }
+    }
+
+    /// When a tick next does something.
+    pub(crate) fn next_due(&self) -> Timestamp {
+        let schedule = &self.schedule;
+        let sending = self.config.as_ref().map(|config| {
+            let digest = (config.plan.digest_pages() > 0).then_some(schedule.digest);
+            let freshness = config.plan.authentication(LayoutMessage::Freshness).map(|_| schedule.freshness);
+            let changing = digest.into_iter().chain(schedule.alarms.next_due()).chain(freshness);
+            changing.fold(schedule.status.min(schedule.health).min(schedule.alarm), Timestamp::min)
+        });
+        let test = self.test.map(|test| test.next.min(test.end));
+        let node = self.j1939.as_ref().and_then(J1939::next_due);
+        let poller = self.poller.as_ref().and_then(Poller::next_due);
+        [sending, test, node, poller].into_iter().flatten().fold(schedule.housekeeping, Timestamp::min)
+    }
+
+    /// Whether housekeeping is due.
+    pub(crate) fn take_housekeeping_due(&mut self, now: Timestamp, period_s: f64) -> bool {
+        take_due(&mut self.schedule.housekeeping, now, period_s)
+    }
+
+    /// Whether status, health and alarm frames and the digest are due; `None` = none is configured.
+    pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
+        let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
+        Some([
+            take_due(&mut schedule.status, now, config.status_period_s),
+            take_due(&mut schedule.health, now, config.health_period_s),
+            take_due(&mut schedule.alarm, now, config.alarm_period_s),
+            take_due(&mut schedule.digest, now, config.digest_period_s),
+        ])
+    }
+
+    /// Whether the freshness of commands is to be announced.
+    pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
+        let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
+        let due = &mut self.schedule.freshness;
+        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
+    }
+
+    /// Announces the freshness of commands that come on `bus`.
+    pub(crate) fn send_freshness(&mut self, time: Timestamp, bus: Option<BusIndex>, freshness: u64, out: &mut Outputs) {
+        let Some(output) = &self.config else { return };
+        let secoc = output.plan.authentication(LayoutMessage::Freshness);
+        let (Some(mut frame), Some(authentication)) = (output.plan.freshness(), secoc) else { return };
+        authentication.write_freshness(frame.data_mut(), freshness);
+        let secured = Some(Secured { authentication, freshness });
+        let transmit = |bus| Transmit { time, bus, frame, announces: false, secured };
+        out.frames.extend(buses_of(output, bus).map(transmit));
+    }
+
+    /// Sends the status frame.
+    pub(crate) fn send_status(&mut self, now: Timestamp, fields: &StatusFields, out: &mut Outputs) {
+        self.send(now, LayoutMessage::Status, out, |plan, counters| Some(plan.status(fields, counters)));
+    }
+
+    /// Sends all pages of the health frame.
+    pub(crate) fn send_health(&mut self, now: Timestamp, fields: &HealthFields, out: &mut Outputs) {
+        let pages = self.config.as_ref().map_or(0, |output| output.plan.health_pages());
+        for page in 0..pages {
+            self.send(now, LayoutMessage::Health, out, |plan, counters| Some(plan.health(page, fields, counters)));
+        }
+    }
+
+    /// Sends one of the alarms that cannot be judged in turn, and notes those that can be judged again.
+    pub(crate) fn send_unknown_alarm(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let turn = self.schedule.alarm_turn;
+        self.schedule.alarm_turn = turn.wrapping_add(1);
+        self.schedule.alarms.note_known(now, engine);
+        if let Some(alarm) = self.schedule.alarms.take_unknown(now, engine, turn) {
+            self.send_alarm(now, &alarm, out);
+        }
+    }
+
+    /// Sends the alarms that are due within the budget.
+    pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
+        // Ends with the budget.
+        while let Some(key) = self.schedule.alarms.take(now, engine, period_s) {
+            self.send_key(now, key, engine, out);
+        }
+    }
+
+    /// Notes that an alarm changed; the caller then calls [`send_changed_alarms`](Self::send_changed_alarms).
+    pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
+        if self.config.is_some() {
+            self.schedule.alarms.note_change(now, key);
+            self.is_rescheduled = true;
+        }
+    }
+
+    /// Sends changed alarms as they are now, within the budget; the rest and the repetitions follow.
+    pub(crate) fn send_changed_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        while let Some(key) = self.schedule.alarms.take_changed(now) {
+            self.send_key(now, key, engine, out);
+        }
+    }
+
+    /// Whether something is due at another time than before.
+    #[inline]
+    pub(crate) fn take_rescheduled(&mut self) -> bool {
+        std::mem::take(&mut self.is_rescheduled)
+    }
+
+    /// Sends an alarm as it is now; the state of one that no threshold watches any more is unknown.
+    fn send_key(&mut self, now: Timestamp, key: AlarmKey, engine: &AlarmEngine, out: &mut Outputs) {
+        let (rule, severity, cell) = key.parts();
+        if let Some(alarm) = engine.find(rule, severity, cell) {
+            return self.send_alarm(now, &alarm, out);
+        }
+        let (rule, state, severity) = (rule as u8, Some(AlarmState::Unknown.wire_code()), Some(severity as u8));
+        self.send_alarm_fields(now, &AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
+    }
+
+    fn send_alarm(&mut self, now: Timestamp, alarm: &Alarm, out: &mut Outputs) {
+        let fields = AlarmFields {
+            rule: alarm.rule as u8,
+            state: Some(alarm.state.wire_code()),
+            severity: Some(alarm.severity as u8),
+            test: false,
+            acknowledged: alarm.is_acknowledged,
+            cell: alarm.cell,
+            value: alarm.value,
+            threshold: Some(alarm.threshold),
+        };
+        self.send_alarm_fields(now, &fields, out);
+    }
+
+    /// Sends all pages of the digest.
+    pub(crate) fn send_digest(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(config) = &self.config else { return };
+        let (pages, period_s) = (config.plan.digest_pages(), config.alarm_period_s);
+        if pages == 0 {
+            return;
+        }
+        let turn = self.schedule.threshold_turn;
+        self.schedule.threshold_turn = turn.wrapping_add(1);
+        let fields = digest::fields(engine, period_s, turn);
+        for page in 0..pages {
+            self.send(now, LayoutMessage::Digest, out, |plan, counters| plan.digest(page, &fields, counters));
+        }
+    }
+
+    /// Sends the reply to a command that came on `bus`, on that interface or, where nothing else is sent on it, on all.
+    pub(crate) fn send_reply(&mut self, now: Timestamp, bus: BusIndex, fields: &ReplyFields, out: &mut Outputs) {
+        if self.schedule.reply > now || self.config.as_ref().is_none_or(|output| !output.plan.has_reply()) {
+            return;
+        }
+        let earliest = now.plus_nanos(-(REPLY_BURST - 1) * REPLY_DELAY_NS);
+        self.schedule.reply = self.schedule.reply.max(earliest).plus_nanos(REPLY_DELAY_NS);
+        self.send_on(now, LayoutMessage::Reply, Some(bus), out, |plan, counters| plan.reply(fields, counters));
+    }
+
+    fn send_alarm_fields(&mut self, now: Timestamp, fields: &AlarmFields, out: &mut Outputs) {
+        self.send(now, LayoutMessage::Alarm, out, |plan, counters| Some(plan.alarm(fields, counters)));
+    }
+
+    /// Sends a frame, if there is one, on every interface.
+    fn send(
+        &mut self,
+        time: Timestamp,
+        message: LayoutMessage,
+        out: &mut Outputs,
+        encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Option<Frame>,
+    ) {
+        self.send_on(time, message, None, out, encode);
+    }
+
+    /// Sends a frame, if there is one, as an answer to what came on `bus`; `None` = it is no answer.
+    fn send_on(
+        &mut self,
+        time: Timestamp,
+        message: LayoutMessage,
+        bus: Option<BusIndex>,
+        out: &mut Outputs,
+        encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Option<Frame>,
+    ) {
+        let Some(output) = &self.config else { return };
+        let Some(mut frame) = encode(&output.plan, &mut self.schedule.counters) else { return };
+        let secured = output.plan.authentication(message).map(|authentication| {
+            let freshness = self.schedule.sent_freshness.saturating_add(1);
+            self.schedule.sent_freshness = freshness;
+            authentication.write_freshness(frame.data_mut(), freshness);
+            Secured { authentication, freshness }
+        });
+        let announces = message != LayoutMessage::Status;
+        let transmit = |bus| Transmit { time, bus, frame, announces, secured };
+        out.frames.extend(buses_of(output, bus).map(transmit));
+    }
+
+    /// Begins to send a rule's alarm frame marked as a test, in place of a running one; of 0 s, only ends that one.
+    /// `false` = there is no output to send it on.
+    pub(crate) fn start_test(
+        &mut self,
+        now: Timestamp,
+        rule: Rule,
+        seconds: f64,
+        engine: &AlarmEngine,
+        out: &mut Outputs,
+    ) -> bool {
+        if self.config.is_none() {
+            return false;
+        }
+        self.end_test(now, engine, out);
+        if seconds.is_nan() || seconds <= 0.0 {
+            return true;
+        }
+        self.test = Some(AlarmTest { rule, next: now, end: now.plus_secs(seconds.min(MAX_TEST_S)) });
+        out.events.push(Event { time: now, kind: EventKind::Test { rule, running: true } });
+        self.update_trouble_codes(now, engine);
+        self.poll_j1939(now, out);
+        self.continue_test(now, engine, out);
+        true
+    }
+
+    /// Sends the test's frame when it is due, and ends the test in time.
+    pub(crate) fn continue_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(test) = &mut self.test else { return };
+        if now >= test.end {
+            self.end_test(now, engine, out);
+        } else if take_due(&mut test.next, now, TEST_PERIOD_S) {
+            let rule = test.rule;
+            self.send_test(now, rule, AlarmState::Active, out);
+        }
+    }
+
+    /// Ends a running test.
+    pub(crate) fn end_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(AlarmTest { rule, .. }) = self.test.take() else { return };
+        self.send_test(now, rule, AlarmState::Inactive, out);
+        out.events.push(Event { time: now, kind: EventKind::Test { rule, running: false } });
+        self.update_trouble_codes(now, engine);
+        self.poll_j1939(now, out);
+    }
+
+    /// Sends no value and no threshold, so that no part of a test can be taken for a measurement.
+    fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
+        let (rule, state) = (rule as u8, Some(state.wire_code()));
+        self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
+    }
+
+    /// Does something with the poller, if there is one, and sends what it wants to.
+    pub(crate) fn poll_with(
+        &mut self,
+        now: Timestamp,
+        out: &mut Outputs,
+        act: impl FnOnce(&mut Poller, &mut PollOutputs),
+    ) {
+        let Some(poller) = &mut self.poller else { return };
+        act(poller, &mut self.polled);
+        let transmit = |(bus, frame)| Transmit { time: now, bus, frame, announces: false, secured: None };
+        out.frames.extend(self.polled.frames.drain(..).map(transmit));
+        let event = |change| Event { time: now, kind: EventKind::Poll(change) };
+        out.events.extend(self.polled.changes.drain(..).map(event));
+    }
+
+    /// Takes a reading of the vehicle's supply voltage.
+    pub(crate) fn handle_supply(&mut self, now: Timestamp, value: Result<f64, Fault>) {
+        if let (Some(poller), Some(supply)) = (&mut self.poller, self.supply) {
+            let is_good = value.is_ok_and(|volts| volts >= supply.minimum_v);
+            poller.set_supply(is_good.then(|| now.plus_secs(supply.max_age_s)));
+        }
+    }
+
+    /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.
+    pub(crate) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.claim_address(now, out);
+        }
+    }
+
+    /// Passes a frame to the J1939 node, if it came on the node's interface.
+    pub(crate) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.handle_frame(now, bus, frame, out);
+        }
+    }
+
+    /// Sends what is due from the J1939 node.
+    pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.poll(now, out);
+        }
+    }
+
+    /// Passes the present alarms to the J1939 node.
+    pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.update_trouble_codes(now, engine, self.test.is_some());
+        }
+    }
+}

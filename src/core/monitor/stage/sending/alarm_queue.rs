@@ -1,0 +1,241 @@
+//! Which alarm is sent next: changes at once and repeated, raised alarms in turn, all within a budget of frames.
+//!
+//! In: changed alarms, the alarm engine, the time. Out: one alarm after the other, worst first. The budget is a token bucket:
+//! [`BURST`] frames at once, then one each [`ALARM_DELAY_MS`]. First frames of changes precede everything, repetitions
+//! follow the frames in turn, which take at most half of the budget.
+//!
+//! Deviation from one frame per change: an alarm is sent as it is when its frame leaves. Of two changes while the budget is
+//! used up, the receiver sees the second.
+
+use std::cmp::Reverse;
+
+use serde::{Deserialize, Serialize};
+
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
+use crate::can::encode::{ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Frames at once after a pause: an event changes the alarms of a few cells, or one rule of each of the pack's modules.
+const BURST: i64 = 20;
+/// Frames in turn are at least this far apart, in units of [`ALARM_DELAY_MS`]: the other half is for changes.
+const TURN_DELAYS: u32 = 2;
+/// Alarms that are remembered as announced unknown; 17 rules of three severities are 51. Beyond it no more are announced;
+/// the digest shows their rules.
+const MAX_UNKNOWN: usize = 64;
+
+const NANOS_PER_MS: i64 = 1_000_000;
+const DELAY_NS: i64 = ALARM_DELAY_MS as i64 * NANOS_PER_MS;
+const REPETITION_NS: i64 = CHANGE_REPETITION_MS as i64 * NANOS_PER_MS;
+
+/// Identity of an alarm; the order is worst first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub(crate) struct AlarmKey {
+    severity: Reverse<Severity>,
+    rule: Rule,
+    cell: Option<CellIndex>,
+}
+
+impl AlarmKey {
+    pub(crate) fn new(rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Self {
+        Self { severity: Reverse(severity), rule, cell }
+    }
+
+    fn of(alarm: &Alarm) -> Self {
+        Self::new(alarm.rule, alarm.severity, alarm.cell)
+    }
+
+    /// Rule, severity and cell.
+    pub(crate) fn parts(self) -> (Rule, Severity, Option<CellIndex>) {
+        (self.rule, self.severity.0, self.cell)
+    }
+
+    fn find(self, engine: &AlarmEngine) -> Option<Alarm> {
+        engine.find(self.rule, self.severity.0, self.cell)
+    }
+}
+
+/// A changed alarm with frames still to be sent.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct ChangedAlarm {
+    key: AlarmKey,
+    /// Frames still to be sent.
+    frames: u32,
+    /// When the next one is due.
+    due: Timestamp,
+}
+
+impl ChangedAlarm {
+    const fn is_first(&self) -> bool {
+        self.frames > CHANGE_REPETITIONS
+    }
+}
+
+/// See the module.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub(crate) struct AlarmQueue {
+    /// Worst first, each alarm once.
+    changed: Vec<ChangedAlarm>,
+    /// Alarms announced as unknown whose end is still to be announced.
+    unknown: Vec<AlarmKey>,
+    /// The raised alarm that was sent last in turn.
+    last: Option<AlarmKey>,
+    /// When the next raised alarm is due in turn; `None` = none is raised.
+    turn: Option<Timestamp>,
+    /// From when on the budget has a frame.
+    free: Timestamp,
+}
+
+impl AlarmQueue {
+    /// Whether alarms are being announced as unknown.
+    pub(crate) fn has_unknown(&self) -> bool {
+        !self.unknown.is_empty()
+    }
+
+    /// Time between two frames of one raised alarm while nothing changes, s.
+    pub(crate) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
+        let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
+        Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()
+    }
+
+    /// Time between two frames in turn, ns: all raised alarms in each period, as far as the budget allows.
+    fn turn_ns(engine: &AlarmEngine, period_s: f64) -> i64 {
+        let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
+        let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
+        let least_ns = i64::from(TURN_DELAYS) * DELAY_NS;
+        period_ns.saturating_add(count - 1).checked_div(count).unwrap_or(period_ns).max(least_ns)
+    }
+
+    /// Notes that an alarm changed: it is sent at once and repeated.
+    pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
+        let entry = ChangedAlarm { key, frames: 1 + CHANGE_REPETITIONS, due: now };
+        match self.changed.binary_search_by_key(&key, |changed| changed.key) {
+            Ok(place) => self.changed[place] = entry,
+            Err(place) => self.changed.insert(place, entry),
+        }
+    }
+
+    /// The next alarm whose first frame after a change is due and within the budget.
+    pub(crate) fn take_changed(&mut self, now: Timestamp) -> Option<AlarmKey> {
+        self.take_entry(now, ChangedAlarm::is_first)
+    }
+
+    /// The next alarm to be sent; `None` = none is due, or the budget is used up.
+    pub(crate) fn take(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
+        self.take_changed(now)
+            .or_else(|| self.take_turn(now, engine, period_s))
+            .or_else(|| self.take_entry(now, |_| true))
+    }
+
+    fn take_entry(&mut self, now: Timestamp, accepts: impl Fn(&ChangedAlarm) -> bool) -> Option<AlarmKey> {
+        if self.free > now {
+            return None;
+        }
+        let place = self.changed.iter().position(|changed| changed.due <= now && accepts(changed))?;
+        self.pay(now);
+        let entry = &mut self.changed[place];
+        let key = entry.key;
+        (entry.frames, entry.due) = (entry.frames.saturating_sub(1), now.plus_nanos(REPETITION_NS));
+        if entry.frames == 0 {
+            self.changed.remove(place);
+        }
+        Some(key)
+    }
+
+    /// The raised alarm whose turn it is.
+    fn take_turn(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
+        if engine.count() == 0 {
+            self.turn = None;
+            return None;
+        }
+        let step_ns = Self::turn_ns(engine, period_s);
+        let due = *self.turn.get_or_insert(now.plus_nanos(step_ns));
+        if due > now || self.free > now {
+            return None;
+        }
+        // Missed turns are skipped, except those of a late tick.
+        let earliest = now.plus_nanos(-BURST * DELAY_NS);
+        self.turn = Some(due.max(earliest).plus_nanos(step_ns));
+        let keys = || engine.raised().map(|alarm| AlarmKey::of(&alarm));
+        let next = keys().filter(|key| self.last.is_none_or(|last| *key > last)).min().or_else(|| keys().min())?;
+        self.last = Some(next);
+        self.pay(now);
+        Some(next)
+    }
+
+    /// An alarm that cannot be judged, in turn, within the budget.
+    pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {
+        let alarm = engine.unknown_alarm(turn).filter(|_| self.free <= now)?;
+        let key = AlarmKey::of(&alarm);
+        if !self.unknown.contains(&key) {
+            if self.unknown.len() >= MAX_UNKNOWN {
+                return None;
+            }
+            self.unknown.push(key);
+        }
+        self.pay(now);
+        Some(alarm)
+    }
+
+    /// Notes a change of each alarm that was announced as unknown and is not any more.
+    pub(crate) fn note_known(&mut self, now: Timestamp, engine: &AlarmEngine) {
+        let is_open = |key: &AlarmKey| {
+            let state = key.find(engine).map(|alarm| alarm.state);
+            matches!(state, Some(AlarmState::Unknown | AlarmState::Pending))
+        };
+        let known: Vec<AlarmKey> = self.unknown.extract_if(.., |key| !is_open(key)).collect();
+        for key in known {
+            self.note_change(now, key);
+        }
+    }
+
+    /// Takes one frame from the budget.
+    fn pay(&mut self, now: Timestamp) {
+        self.free = self.free.max(now.plus_nanos(-(BURST - 1) * DELAY_NS)).plus_nanos(DELAY_NS);
+    }
+
+    /// When something is due next and within the budget; `None` = nothing waits.
+    pub(crate) fn next_due(&self) -> Option<Timestamp> {
+        let changed = self.changed.iter().map(|changed| changed.due).min();
+        changed.into_iter().chain(self.turn).min().map(|due| due.max(self.free))
+    }
+
+    /// Frames that are due up to `now` when nothing changes.
+    pub(crate) fn frames_until(&self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> u64 {
+        let due = |from: Timestamp, step_ns: i64| {
+            let past_ns = now.nanos().saturating_sub(from.nanos());
+            if past_ns < 0 { 0 } else { u64::try_from(past_ns / step_ns.max(1)).unwrap_or(0) + 1 }
+        };
+        let repeated = self.changed.iter().map(|it| due(it.due, REPETITION_NS).min(it.frames.into()));
+        let turns = self.turn.map_or(0, |turn| due(turn, Self::turn_ns(engine, period_s)));
+        repeated.fold(turns, u64::saturating_add)
+    }
+
+    /// Nothing is due later than at `now`: after a start, after time asleep, and when the clock was set back.
+    pub(crate) fn restart(&mut self, now: Timestamp) {
+        self.free = self.free.min(now);
+        self.turn = self.turn.map(|turn| turn.min(now));
+        self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
+    }
+
+    /// Nothing waits longer than it would after a frame at `now`, whatever a stored state says.
+    pub(crate) fn limit(&mut self, now: Timestamp, period_s: f64) {
+        self.free = self.free.min(now.plus_nanos(DELAY_NS));
+        self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));
+        self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now.plus_nanos(REPETITION_NS)));
+    }
+
+    /// Moves stored times onto another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.free = self.free.plus_nanos(by_nanos);
+        self.turn = self.turn.map(|turn| turn.plus_nanos(by_nanos));
+        self.changed.iter_mut().for_each(|changed| changed.due = changed.due.plus_nanos(by_nanos));
+    }
+
+    /// Nothing is sent any more.
+    pub(crate) fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,155 @@
+//! What was learned of the packs that were connected before, by their number, so that it is known again when one comes back.
+//!
+//! In: the parts of the state that belong to the connected pack, when readings begin to give another number; the new number,
+//! once it is certain. Out: what is known of that pack. Kept are capacities, resistances, remaining lives, recharge periods and
+//! the offset of the current (a pack often has its own sensor); not the half-cycle under way and not the state of charge, which
+//! the first voltage decides. A pack of which nothing was learned is not kept, so that invented numbers displace none.
+
+use serde::{Deserialize, Serialize};
+
+use crate::cell::{CellEstimator, CellState, ModelCheck, PackBank};
+use crate::cell_faults::CellFaultDetector;
+use crate::health::{Axis, Forecast};
+use crate::monitor::stage::estimation::Consumed;
+use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, check_positive};
+use crate::monitor::stage::modelling::ModellingState;
+use crate::quantity::{InvalidState, bounds};
+
+/// Packs kept beside the connected one: more than a vehicle exchanges in turn.
+const MAX_PACKS: usize = 8;
+/// Cells of all of them together, but always one pack: a cell takes 2.6 kB of the stored state.
+const MAX_CELLS: usize = 384;
+
+/// The packs, the one connected least lately first.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct PackMemory {
+    packs: Vec<StoredPack>,
+    /// The connected pack as it was before the first reading of another number.
+    aside: Option<Box<StoredPack>>,
+}
+
+/// What was learned of one pack.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct StoredPack {
+    pub(crate) number: f64,
+    pub(crate) cells: Vec<StoredCell>,
+    /// What is learned of the cells' model.
+    pub(crate) modelling: Option<ModellingState>,
+    /// What is known of single cells.
+    pub(crate) diagnosis: Option<CellFaultDetector>,
+    pub(crate) learning: LearningState,
+}
+
+/// One cell of a snapshot.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct StoredCell {
+    pub(crate) estimator: CellState,
+    pub(crate) consumed: Option<Consumed>,
+    pub(crate) trusted: bool,
+    pub(crate) model_check: ModelCheck,
+    #[serde(flatten)]
+    pub(crate) health: CellHealth,
+    pub(crate) forecast: Forecast,
+    pub(crate) updated_in_round: bool,
+}
+
+impl PackMemory {
+    /// Whether the connected pack is put aside.
+    pub(crate) fn has_aside(&self) -> bool {
+        self.aside.is_some()
+    }
+
+    /// Puts the connected pack aside: its next voltages may be those of another.
+    pub(crate) fn put_aside(&mut self, pack: StoredPack) {
+        self.aside = Some(Box::new(pack));
+    }
+
+    /// The number was that of the connected pack again, or what was learned of it does not hold.
+    pub(crate) fn drop_aside(&mut self) {
+        self.aside = None;
+    }
+
+    /// Keeps the pack that was put aside, and takes out what is known of `number`.
+    pub(crate) fn exchange(&mut self, number: f64) -> Option<StoredPack> {
+        let found = self.packs.iter().position(|pack| pack.number == number).map(|place| self.packs.remove(place));
+        if let Some(pack) = self.aside.take().filter(|pack| pack.has_learned()) {
+            self.packs.retain(|other| other.number != pack.number);
+            let room = (MAX_CELLS / pack.cells.len().max(1)).clamp(1, MAX_PACKS);
+            self.packs.drain(..(self.packs.len() + 1).saturating_sub(room));
+            self.packs.push(*pack);
+        }
+        found
+    }
+
+    /// Forgets values that were measured by another window or load.
+    pub(crate) fn forget_measures(&mut self, is_other_recharge: bool, is_other_load: bool) {
+        for pack in &mut self.packs {
+            if is_other_recharge {
+                (pack.learning.recharge_period_s, pack.learning.normalised_recharge) = (None, None);
+            }
+            if is_other_load {
+                pack.cells.iter_mut().for_each(|cell| cell.health.usable = None);
+            }
+        }
+    }
+
+    /// Drops packs of another shape, from a stored state of another configuration.
+    pub(crate) fn retain(&mut self, fits: impl Fn(&StoredPack) -> bool) {
+        self.packs.retain(&fits);
+        self.aside.take_if(|pack| !fits(pack));
+    }
+
+    /// Checks that every number is possible.
+    pub(crate) fn check(&self) -> Result<(), InvalidState> {
+        for pack in self.packs.iter().chain(self.aside.as_deref()) {
+            InvalidState::unless(pack.number.is_finite(), "the number of a pack", pack.number, "a finite number")?;
+            pack.learning.check()?;
+            pack.modelling.iter().try_for_each(ModellingState::check)?;
+            pack.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(pack.cells.len()))?;
+            pack.cells.iter().try_for_each(StoredCell::check)?;
+        }
+        Ok(())
+    }
+}
+
+impl StoredPack {
+    fn has_learned(&self) -> bool {
+        let mut cells = self.cells.iter().enumerate();
+        cells
+            .any(|(index, cell)| self.learning.learner.has_learned(index) || cell.health.discharge_resistance.is_some())
+    }
+}
+
+impl StoredPack {
+    /// Whether it is a pack of so many cells, each of so many branches.
+    pub(crate) fn fits(&self, bank: &PackBank) -> bool {
+        self.cells.len() == bank.cells()
+            && self.learning.learner.fits(bank.cells())
+            && self.cells.iter().enumerate().all(|(index, cell)| cell.fits(bank, index))
+    }
+}
+
+impl StoredCell {
+    pub(crate) fn check(&self) -> Result<(), InvalidState> {
+        self.estimator.check()?;
+        self.model_check.check()?;
+        bounds::STORED_SOC.check("the SOC of a full cell", self.health.full_soc)?;
+        check_positive("the usable capacity", self.health.usable)?;
+        check_positive("the resistance of discharge", self.health.discharge_resistance)?;
+        let Throughput { charge_ah, charging_s, discharging_s } = self.health.throughput;
+        InvalidState::unless_natural("the charge moved", charge_ah)?;
+        bounds::TIME_S.check_all("the time of charges and discharges", [charging_s, discharging_s])?;
+        self.forecast.check(Axis::Cycles)?;
+        let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
+        bounds::CHARGE_AS.check("the charge taken in", charge_as)?;
+        bounds::TIME_S.check("the unmeasured time taken in", unmeasured_s)
+    }
+
+    /// Whether the filter has the branches of this cell of the bank; a module's may have been replaced.
+    pub(crate) fn fits(&self, bank: &PackBank, index: usize) -> bool {
+        !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
+    }
+}
