@@ -50,10 +50,10 @@ fn square(x: f64) -> f64 {
     x * x
 }
 
-/// Evidence about one cell's model. Sums that earlier programs stored about another SOC are passed over: the window continues without them.
+/// Evidence about one cell's model.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ModelCheck {
-    /// The model that is checked ([`model_id`]); 0 in a state stored by a program without a check.
+    /// The model that is checked ([`model_id`]); 0 = nothing is checked.
     model: u64,
     /// Time of use judged so far, s.
     use_s: f64,
@@ -368,19 +368,6 @@ mod tests {
         };
         assert_eq!(kept.check(), Ok(()));
         assert!((kept.explained() / sums.explained() - 1.0).abs() < 1e-5, "{} {}", kept.explained(), sums.explained());
-    }
-
-    #[test]
-    fn sums_of_earlier_versions_are_passed_over() {
-        let check = after(1800, 0.6, |soc| 0.1 * soc);
-        let mut stored = serde_json::to_value(check).unwrap();
-        let fields = stored.as_object_mut().unwrap();
-        fields.remove("voltages").unwrap();
-        fields.insert("information".into(), serde_json::json!([3e4, 1e4, 5e3]));
-        fields.insert("score".into(), serde_json::json!([40.0, 10.0]));
-        let kept: ModelCheck = serde_json::from_value(stored).unwrap();
-        assert_eq!(kept, ModelCheck { voltages: VoltageSums::default(), ..check });
-        assert_eq!((kept.check(), kept.is_mismatched()), (Ok(()), check.is_mismatched()));
     }
 
     #[test]

@@ -422,7 +422,8 @@ fn counters_survive_a_restart_and_a_change_of_the_profile() {
     let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
     let settings = LayoutSettings { status, ..Default::default() };
     let plan = OutputPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
-    let mut counters: SendCounters = serde_json::from_str(r#"{"status":200,"health":0,"alarm":3}"#).unwrap();
+    let stored = r#"{"status":200,"health":0,"alarm":3,"digest":0,"reply":0}"#;
+    let mut counters: SendCounters = serde_json::from_str(stored).unwrap();
     let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
     assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
     let stored = serde_json::to_string(&counters).unwrap();
