@@ -62,30 +62,6 @@ fn decode_a_page_of_96_multiplexed_cells(bencher: Bencher) {
 }
 
 #[divan::bench]
-fn decode_three_signals_plainly(bencher: Bencher) {
-    let map = three_signals();
-    let frame = Frame::classic(CanId::Standard(256), &[0x80, 0x1A, 0x06, 0x10, 0x27, 0, 0xC4, 9]).expect("8 bytes");
-    bencher.bench_local(|| {
-        let mut sum = 0.0;
-        map.decode_plainly(BusIndex(0), black_box(&frame), |reading| sum += reading.value.unwrap_or(0.0));
-        sum
-    });
-}
-
-#[divan::bench]
-fn decode_a_page_of_96_multiplexed_cells_plainly(bencher: Bencher) {
-    let map = cells();
-    let mut frames = Vec::new();
-    InputEncoder::new(&map).encode(&values(), &mut frames);
-    let (_, last) = frames.last().expect("one frame for each page");
-    bencher.bench_local(|| {
-        let mut sum = 0.0;
-        map.decode_plainly(BusIndex(0), black_box(last), |reading| sum += reading.value.unwrap_or(0.0));
-        sum
-    });
-}
-
-#[divan::bench]
 fn decode_an_unmapped_frame(bencher: Bencher) {
     decode(bencher, &cells(), &Frame::classic(CanId::Standard(0x595), &[0; 8]).expect("8 bytes"));
 }

@@ -1,4 +1,4 @@
-//! How fast candump logs become frames and readings: as `replay` does it, and in the plain form that says the same, beside
+//! How fast candump logs become frames and readings: as `replay` does it, beside
 //! the newline scan that any reader must do.
 #![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
 
@@ -6,7 +6,6 @@ use divan::Bencher;
 use divan::counter::ItemsCount;
 use packwatch_host::can::dbc::Database;
 use packwatch_host::can::decode::{Binding, InputMap};
-use packwatch_host::io::candump::{Line, parse_line};
 use packwatch_host::io::csv_log::CsvOptions;
 use packwatch_host::io::log::{Batch, LogOptions, LogSource};
 use packwatch_host::monitor::{Record, RecordKind};
@@ -61,24 +60,6 @@ fn lines(bencher: Bencher, mut each: impl FnMut(&[u8])) {
 fn newline_scan(bencher: Bencher) {
     lines(bencher, |line| {
         divan::black_box(line);
-    });
-}
-
-#[divan::bench]
-fn parse_plainly(bencher: Bencher) {
-    lines(bencher, |line| {
-        divan::black_box(parse_line(line).unwrap());
-    });
-}
-
-#[divan::bench]
-fn parse_and_decode_plainly(bencher: Bencher) {
-    let map = three_signals();
-    lines(bencher, |line| {
-        let Ok(Line::Frame { frame, .. }) = parse_line(line) else { panic!("a frame") };
-        let mut sum = 0.0;
-        map.decode_plainly(BusIndex(0), &frame, |reading| sum += value(reading));
-        divan::black_box(sum);
     });
 }
 

@@ -72,7 +72,7 @@
 //! | how the history is verified, and how long it is kept | `host/store/segments.rs` |
 //! | what a start takes from the history | `host/store/learned.rs`, `core/monitor/lifecycle/relearn.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
-//! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
+//! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump/parser.rs` |
 //! | segments of a recording | `host/io/segments.rs` |
 //! | a column of `replay --estimates` | `host/replay/rows.rs` |
 //! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |

@@ -20,6 +20,9 @@ use serde::{Deserialize, Serialize};
 pub struct Timestamp(i64);
 
 impl Timestamp {
+    /// Earlier than any event.
+    pub const LONG_AGO: Self = Self::from_nanos(i64::MIN);
+
     /// The clock's origin.
     pub const ZERO: Self = Self(0);
 

@@ -71,24 +71,6 @@ impl ReplaySettings {
     pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
         Self { sleep_gap_s, interfaces, ..Self::default() }
     }
-
-    /// Whether every record is replayed as fast as possible and no state is stored.
-    fn is_simple(&self) -> bool {
-        // Every field, so that a new one is not overlooked.
-        let Self {
-            speed,
-            from,
-            until,
-            snapshot_at,
-            store,
-            sleep_gap_s: _,
-            snapshot: _,
-            restore: _,
-            away: _,
-            interfaces: _,
-        } = self;
-        speed.is_none() && from.is_none() && until.is_none() && snapshot_at.is_none() && store.is_none()
-    }
 }
 
 /// Called with each input and its outputs.
@@ -162,9 +144,11 @@ pub fn run(
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
-    while source.next_batch(&mut batch)? {
-        if !replay.take_batch(&batch)? {
-            break;
+    'log: while source.next_batch(&mut batch)? {
+        for record in batch.records() {
+            if !replay.take(record, batch.carries_ticks())? {
+                break 'log;
+            }
         }
         unreported += batch.records().len();
         if unreported >= REPORT_EVERY || replay.pace.speed.is_some() {
@@ -190,8 +174,11 @@ pub fn play(
     send: &mut dyn FnMut(BusIndex, &Frame) -> io::Result<()>,
     report: &mut dyn FnMut(ReplayProgress),
 ) -> Result<u64, ReplayError> {
-    let (mut span, mut pace, mut window) =
-        (RecordSpan::new(settings.sleep_gap_s), Pace::new(settings.speed), TimeWindow::new(settings));
+    let (mut span, mut pace, mut window) = (
+        RecordSpan::new(settings.sleep_gap_s),
+        Pace::new(settings.speed),
+        TimeWindow::new(settings.from, settings.until),
+    );
     let mut sent = 0;
     while let Some(record) = source.next_record()? {
         match window.judge(record.time) {
@@ -222,8 +209,6 @@ struct Replay {
     window: TimeWindow,
     sinks: Sinks,
     settings: ReplaySettings,
-    /// Whether every record is replayed at full speed and only its outputs are written: then the fast path serves.
-    is_simple: bool,
     /// When the snapshot is due, once the first stamp is known.
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
@@ -248,8 +233,7 @@ impl Replay {
             ticks: Ticks::new(TICK_PERIOD_MS, settings.sleep_gap_s),
             pace: Pace::new(settings.speed),
             span: RecordSpan::new(settings.sleep_gap_s),
-            window: TimeWindow::new(&settings),
-            is_simple: settings.is_simple() && sinks.watch.is_none(),
+            window: TimeWindow::new(settings.from, settings.until),
             sinks,
             settings,
             snapshot_at: None,
@@ -259,26 +243,6 @@ impl Replay {
             usable: BTreeMap::new(),
             steps_before: Some(0),
         })
-    }
-
-    /// Records in a row; `false` when the rest of the log is not wanted.
-    fn take_batch(&mut self, batch: &Batch) -> Result<bool, ReplayError> {
-        for record in batch.records() {
-            if matches!(record.kind, RecordKind::Frame { .. })
-                && self.is_simple
-                && !batch.carries_ticks()
-                && self.ticks.advance_within(record.time, self.monitor.next_due())
-            {
-                self.span.advance(record.time);
-                self.monitor.handle(record, &mut self.out);
-                if !self.out.is_empty() {
-                    self.write_out()?;
-                }
-            } else if !self.take(record, batch.carries_ticks())? {
-                return Ok(false);
-            }
-        }
-        Ok(true)
     }
 
     /// One record; `false` when the rest of the log is not wanted.

@@ -11,9 +11,10 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::limit::LimitCheck;
+use super::limit::{LimitCheck, Observation, RuleConfig};
 use super::machine::{AlarmState, Change, IndexEntry, Machine, Refusal};
-use super::{CommandOutcome, Observation, Rule, RuleConfig, Scope, Selector, Severity};
+use super::rule::{Rule, Scope, Severity};
+use super::selector::{CommandOutcome, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// An alarm as it is now.

@@ -5,8 +5,11 @@
 //! monitor with those thresholds would have done (except `input_missing`: its strictest threshold decides whether a
 //! silence is passed to the engine at all).
 
+use super::engine::{AlarmChange, AlarmEngine};
+use super::limit::Observation;
 use super::machine::Machine;
-use super::{AlarmChange, AlarmEngine, CommandOutcome, Observation, Rule, Selector};
+use super::rule::Rule;
+use super::selector::{CommandOutcome, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// One input of an engine.

@@ -18,13 +18,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Direction, Rule, Severity};
-
-/// Highest probability of being beyond the clear threshold that clears.
-const CLEAR_LEVEL: f64 = 0.5;
-
-/// Highest probability of being beyond the clear threshold that clears an alarm of a learned value.
-const LEARNED_CLEAR_LEVEL: f64 = 0.05;
+use super::rule::{Direction, Rule, Severity};
 
 /// How a value is compared with a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -115,7 +109,8 @@ impl LimitCheck {
         };
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
-        let clear_level = if rule.rule.spec().is_learned { LEARNED_CLEAR_LEVEL } else { CLEAR_LEVEL };
+        // Highest probability of being beyond the clear threshold that clears, for a learned value and any other.
+        let clear_level = if rule.rule.spec().is_learned { 0.05 } else { 0.5 };
         let (is_beyond, is_healthy) = match rule.when {
             Comparison::Mean => {
                 (set < 0.0, clear >= 0.0 && std.is_none_or(|std| probability_beyond(clear, std) <= clear_level))

@@ -21,8 +21,7 @@
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 
-use super::limit::LimitCheck;
-use super::{Observation, RuleConfig};
+use super::limit::{LimitCheck, Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
 /// State of an alarm.

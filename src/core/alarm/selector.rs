@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Rule, Severity};
+use super::rule::{Rule, Severity};
 use crate::quantity::CellIndex;
 
 /// Alarms of a rule, a severity and a cell; a field without a value selects all.

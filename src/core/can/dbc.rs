@@ -22,9 +22,6 @@ mod write;
 /// Most nested multiplexors; deeper nesting counts as a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
 
-/// Pseudo message in which editors keep signals without a message.
-const ORPHANS: &str = "VECTOR__INDEPENDENT_SIG_MSG";
-
 /// Why a text is not a usable DBC.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}")]
@@ -139,7 +136,8 @@ impl Database {
         check_identifiers(&closed)?;
         let dbc = can_dbc::Dbc::try_from(closed.as_str()).map_err(|error| grammar_fault(&error))?;
         let details = DetailTable::new(&dbc);
-        let messages = dbc.messages.iter().filter(|message| message.name != ORPHANS);
+        // Pseudo message in which editors keep signals without a message.
+        let messages = dbc.messages.iter().filter(|message| message.name != "VECTOR__INDEPENDENT_SIG_MSG");
         let messages: Result<Vec<_>, _> =
             messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
         let nodes = dbc.nodes.iter().map(|node| node.0.clone()).collect();
@@ -159,7 +157,8 @@ impl Database {
             return Err(DbcError { line: 1, what: what.to_owned() });
         }
         // Some editors put the mark before Latin-1 text too.
-        let bytes = bytes.strip_prefix(UTF_8_MARK).unwrap_or(bytes);
+        // The byte-order mark U+FEFF in UTF-8.
+        let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
             Err(_) => Self::parse(&bytes.iter().copied().map(char::from).collect::<String>()),
@@ -194,9 +193,6 @@ impl Database {
         Ok(())
     }
 }
-
-/// The byte-order mark U+FEFF in UTF-8.
-const UTF_8_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 /// Whether the bytes begin with a byte-order mark of UTF-16, or with a Latin letter in UTF-16.
 fn is_utf_16(bytes: &[u8]) -> bool {

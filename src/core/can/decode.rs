@@ -5,11 +5,9 @@
 //! reading; one that is present but unusable gives a reading with its fault. The same identifier on another interface is
 //! another message, and so is the extended identifier of the same number.
 
-mod fast;
+mod message_table;
 
-use std::ops::Range;
-
-use fast::FastDecoder;
+use message_table::MessageTable;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::signal::{LayoutFault, SignalPlan};
@@ -116,32 +114,14 @@ impl Binding {
 pub struct InputMap {
     /// Sorted by message, then channel.
     bindings: Vec<Binding>,
-    /// Neighbours in `bindings` of one message and with equal multiplexors: present or absent together.
-    runs: Vec<Range<usize>>,
-    /// Runs of each message, sorted by interface and identifier.
-    messages: Vec<(BusIndex, CanId, Range<usize>)>,
-    fast: FastDecoder,
+    messages: MessageTable,
 }
 
 impl InputMap {
     /// Sorts the bindings by message and channel.
     pub fn new(mut bindings: Vec<Binding>) -> Self {
         bindings.sort_by_key(|binding| (binding.bus, binding.id, binding.channel));
-        let mut runs: Vec<Range<usize>> = Vec::new();
-        let together = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id) && a.mux == b.mux;
-        for run in bindings.chunk_by(together) {
-            let start = runs.last().map_or(0, |last| last.end);
-            runs.push(start..start + run.len());
-        }
-        let message = |run: &Range<usize>| (bindings[run.start].bus, bindings[run.start].id);
-        let mut first = 0;
-        let messages = runs.chunk_by(|a, b| message(a) == message(b)).map(|runs| {
-            let ((bus, id), start) = (message(&runs[0]), first);
-            first += runs.len();
-            (bus, id, start..first)
-        });
-        let messages = messages.collect();
-        Self { fast: FastDecoder::new(&bindings, &runs), bindings, runs, messages }
+        Self { messages: MessageTable::new(&bindings), bindings }
     }
 
     /// Passes the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those that are
@@ -150,24 +130,14 @@ impl InputMap {
     #[inline]
     pub fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
         if frame.kind() != FrameKind::Remote {
-            self.fast.decode(&self.bindings, bus, frame, each);
-        }
-    }
-
-    /// The readings of [`decode`](Self::decode), computed signal by signal from the bindings: the slow reference of the
-    /// compiled decoder.
-    pub fn decode_plainly(&self, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
-        let found = self.messages.binary_search_by_key(&(bus, frame.id()), |(bus, id, _)| (*bus, *id));
-        let Some(message) = found.ok().filter(|_| frame.kind() != FrameKind::Remote) else { return };
-        for run in &self.runs[self.messages[message].2.clone()] {
-            fast::decode_plainly(&self.bindings[run.clone()], frame.data(), &mut each);
+            self.messages.decode(&self.bindings, bus, frame, each);
         }
     }
 
     /// Every configured message, by interface and identifier, with the number of its groups of signals that are present
     /// together: its multiplexer pages, or a few more; 1 without pages.
     pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
-        self.messages.iter().map(|(bus, id, runs)| (*bus, *id, runs.len()))
+        self.messages.messages()
     }
 
     /// Identifiers configured on an interface, ascending, for kernel filters.

@@ -14,11 +14,6 @@ use crate::can::CanId;
 use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Length of the burst that passes at once, ns: a tenth of a second's frames.
-const BURST_NS: i64 = 100_000_000;
-/// Without a dropped frame for this long the flood is over, s: dropping that comes and goes is one flood.
-const OVER_AFTER_S: f64 = 1.0;
-
 /// Allowed frames of one identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FloodConfig {
@@ -101,7 +96,8 @@ impl FloodGate {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
-            let burst_ns = BURST_NS.max(pages_ns).max(frame_ns);
+            // Length of the burst that passes at once, ns: a tenth of a second's frames.
+            let burst_ns = 100_000_000.max(pages_ns).max(frame_ns);
             LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };
         let mut buckets: Vec<_> = messages.into_iter().map(bucket).collect();
@@ -142,7 +138,8 @@ impl FloodGate {
 
     /// Ends the floods that are over.
     pub fn poll(&mut self, now: Timestamp) {
-        self.end(|last| now.since(last) >= OVER_AFTER_S);
+        // Without a dropped frame for this long the flood is over, s: dropping that comes and goes is one flood.
+        self.end(|last| now.since(last) >= 1.0);
     }
 
     /// After sleep or a step of the clock: the whole budget is available, and every flood is over.

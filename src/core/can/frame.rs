@@ -103,14 +103,14 @@ impl Frame {
     }
 
     /// An FD frame of at least `len` bytes, rounded up to an FD length; `None` above 64.
-    pub(crate) fn fd_padded(id: CanId, brs: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
+    pub fn fd_padded(id: CanId, brs: bool, esi: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
         let len = (len..=MAX_DATA).find(|len| is_frame_length(*len))?;
-        Self::fd(id, brs, false, &payload[..len])
+        Self::fd(id, brs, esi, &payload[..len])
     }
 
     /// A frame of at least `len` bytes: classic up to 8, FD above; `None` above 64.
     pub(crate) fn padded(id: CanId, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
-        if len <= 8 { Self::classic(id, &payload[..len]) } else { Self::fd_padded(id, false, len, payload) }
+        if len <= 8 { Self::classic(id, &payload[..len]) } else { Self::fd_padded(id, false, false, len, payload) }
     }
 
     /// A remote request for `len` bytes, or `None` for more than 8.
@@ -125,6 +125,11 @@ impl Frame {
         let mut data = [0; MAX_DATA];
         data[..8].copy_from_slice(&word.to_le_bytes());
         Self { id, kind: FrameKind::Classic, len, data: Data(data) }
+    }
+
+    /// A classic data frame without payload.
+    pub const fn empty(id: CanId) -> Self {
+        Self { id, kind: FrameKind::Classic, len: 0, data: Data([0; MAX_DATA]) }
     }
 
     fn build(id: CanId, kind: FrameKind, bytes: &[u8]) -> Self {

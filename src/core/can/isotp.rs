@@ -12,6 +12,9 @@ pub const FRAME_TIMEOUT_NS: i64 = 1_000_000_000;
 /// Longest message: lengths beyond 4,095 (the escape of 2016) are accepted up to here.
 pub const MAX_MESSAGE: usize = 65_535;
 
+/// Flow control that lets everything come at once, without a pause.
+pub(crate) const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
+
 /// Longest classic payload, bytes.
 const CLASSIC: usize = 8;
 

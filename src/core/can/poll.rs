@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::isotp::segment;
+use super::isotp::{FLOW_CONTROL, segment};
 use super::uds::{Controller, PENDING, Question, Refusal};
 use super::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
@@ -20,16 +20,6 @@ pub const FOREIGN_SILENCE_NS: i64 = 60_000_000_000;
 pub const ASLEEP_AFTER_NS: i64 = 2_000_000_000;
 /// Longest wait for the next sign of an answer, ns (P2 is 50 ms, N_Cr 1 s).
 const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
-/// Longest wait after "wait", ns (P2*).
-const PENDING_WITHIN_NS: i64 = 5_000_000_000;
-/// Longest wait in all, ns: a gateway may say "wait" for ever.
-const GIVE_UP_AFTER_NS: i64 = 30_000_000_000;
-/// Longest pause of a question that fails, s.
-const LONGEST_PAUSE_S: f64 = 600.0;
-/// Refusals that will not change: service not supported, request out of range, security access denied.
-const NEVER_AGAIN: [u8; 3] = [0x11, 0x31, 0x33];
-/// Flow control: everything at once, without a pause.
-const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
 /// What the car does, as far as the pack's current says it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
@@ -171,12 +161,10 @@ pub struct PollProgress {
     silence: Option<PollSilence>,
 }
 
-const LONG_AGO: Timestamp = Timestamp::from_nanos(i64::MIN);
-
 impl Poller {
     /// A poller that has heard nothing yet: silent.
     pub fn new(config: &PollConfig) -> Self {
-        let item = Item { due: LONG_AGO, failures: 0, is_refused: false };
+        let item = Item { due: Timestamp::LONG_AGO, failures: 0, is_refused: false };
         let mut buses: Vec<BusIndex> = config.requests.iter().map(|request| request.question.controller.bus).collect();
         buses.sort_unstable();
         buses.dedup();
@@ -185,12 +173,12 @@ impl Poller {
                 items: vec![item; config.requests.len()],
                 outstanding: None,
                 latest: None,
-                rate_allows_at: LONG_AGO,
+                rate_allows_at: Timestamp::LONG_AGO,
                 state: CarState::default(),
                 is_standby: false,
-                supply_good_until: LONG_AGO,
-                foreign_until: LONG_AGO,
-                heard: buses.into_iter().map(|bus| (bus, LONG_AGO)).collect(),
+                supply_good_until: Timestamp::LONG_AGO,
+                foreign_until: Timestamp::LONG_AGO,
+                heard: buses.into_iter().map(|bus| (bus, Timestamp::LONG_AGO)).collect(),
                 silence: Some(PollSilence::BusAsleep),
             },
             config: config.clone(),
@@ -246,7 +234,7 @@ impl Poller {
 
     /// Takes a reading of the supply voltage: until when it may be counted on, `None` = it is low or bad.
     pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
-        self.progress.supply_good_until = good_until.unwrap_or(LONG_AGO);
+        self.progress.supply_good_until = good_until.unwrap_or(Timestamp::LONG_AGO);
     }
 
     /// Sets or ends the standby.
@@ -257,7 +245,7 @@ impl Poller {
     /// Begins again after time without the buses: nothing was heard.
     pub fn restart(&mut self) {
         self.progress.outstanding = None;
-        self.progress.heard.iter_mut().for_each(|(_, at)| *at = LONG_AGO);
+        self.progress.heard.iter_mut().for_each(|(_, at)| *at = Timestamp::LONG_AGO);
     }
 
     /// Takes a frame of others; those of [`Self::poll`] do not come back.
@@ -318,10 +306,12 @@ impl Poller {
             return;
         };
         if code == PENDING {
-            return self.extend_wait(now, PENDING_WITHIN_NS);
+            // Longest wait after "wait", ns (P2*).
+            return self.extend_wait(now, 5_000_000_000);
         }
         let Some(Outstanding { index, .. }) = self.progress.outstanding.take() else { return };
-        if NEVER_AGAIN.contains(&code) {
+        // Refusals that will not change: service not supported, request out of range, security access denied.
+        if [0x11, 0x31, 0x33].contains(&code) {
             self.progress.items[index].is_refused = true;
             let (id, service) = (controller.response, question.service as u8);
             out.changes.push(PollChange::Refused { id, service, identifier: question.identifier, code });
@@ -439,7 +429,8 @@ impl Poller {
     /// Waits longer, but not for ever.
     fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
         if let Some(outstanding) = &mut self.progress.outstanding {
-            outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(GIVE_UP_AFTER_NS));
+            // Longest wait in all, ns: a gateway may say "wait" for ever.
+            outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(30_000_000_000));
         }
     }
 
@@ -449,7 +440,8 @@ impl Poller {
         let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
-        item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(LONGEST_PAUSE_S))));
+        // Longest pause of a question that fails, s.
+        item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(600.0))));
     }
 
     fn outstanding_of(&self, controller: &Controller) -> Option<Question> {

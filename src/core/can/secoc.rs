@@ -31,8 +31,6 @@ pub use window::{ANNOUNCEMENT_STEP, FreshnessWindow};
 
 /// Longest input of an authenticator: data id, payload, freshness, bytes.
 const MAX_INPUT: usize = 2 + MAX_DATA + 8;
-/// Bits of a whole authenticator.
-const MAC_BITS: u32 = 128;
 
 /// Bytes of a whole authenticator, AES-128-CMAC.
 pub type Mac = [u8; 16];
@@ -162,7 +160,8 @@ impl Authentication {
     }
 
     const fn first_bits(&self, mac: Mac) -> u128 {
-        u128::from_be_bytes(mac) >> (MAC_BITS - self.profile.mac_bits())
+        // Bits of a whole authenticator.
+        u128::from_be_bytes(mac) >> (128 - self.profile.mac_bits())
     }
 
     /// The end of the payload as a number.

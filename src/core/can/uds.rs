@@ -12,16 +12,10 @@ use super::isotp::{IsoTpFault, Progress, Receiver};
 use super::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Channel, Fault, Reading, Timestamp};
 
-/// First byte of a refusal (ISO 14229-1, table A.1).
-const NEGATIVE: u8 = 0x7F;
 /// Added to the service in an answer.
 const POSITIVE: u8 = 0x40;
 /// Code of a refusal that only says "wait" (requestCorrectlyReceived-ResponsePending).
 pub const PENDING: u8 = 0x78;
-/// An answer later than this after its request belongs to no request: the longest P2* of ISO 14229-2, ns.
-const ANSWER_WITHIN_NS: i64 = 5_000_000_000;
-/// Lost messages of a controller are reported at most this often, ns.
-const REPORT_EVERY_NS: i64 = 60_000_000_000;
 
 /// A service that only reads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -398,7 +392,8 @@ impl Listener {
         let Self { answers, links, .. } = self;
         let Some(link) = links.get_mut(controller) else { return Heard::Nothing };
         let message = link.receiver.message();
-        if let &[NEGATIVE, service, code, ..] = message {
+        // First byte of a refusal (ISO 14229-1, table A.1).
+        if let &[0x7F, service, code, ..] = message {
             if code == PENDING {
                 link.counts.pending = link.counts.pending.saturating_add(1);
                 link.asked = link.asked.map(|(head, _)| (head, now));
@@ -418,7 +413,8 @@ impl Listener {
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
-            asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= ANSWER_WITHIN_NS
+            // An answer later than this after its request belongs to no request: the longest P2* of ISO 14229-2, ns.
+            asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
         Heard::Whole { controller, answer, data: &link.receiver.message()[head.len()..], is_single }
@@ -446,7 +442,8 @@ impl Link {
         if let Some(count) = place.and_then(|place| self.counts.lost.get_mut(place)) {
             *count = count.saturating_add(1);
         }
-        if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= REPORT_EVERY_NS) {
+        // Lost messages of a controller are reported at most this often, ns.
+        if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= 60_000_000_000) {
             self.reported_at = Some(now);
             let Controller { bus, response: id, .. } = self.controller;
             losses.push(MessageLoss { bus, id, fault, lost: self.counts.lost_in_all() });

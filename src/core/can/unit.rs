@@ -32,9 +32,6 @@ pub struct SignalUnit {
     pub offset: f64,
 }
 
-/// Absolute zero, degrees C.
-const ZERO_KELVIN_C: f64 = -273.15;
-
 impl SignalUnit {
     /// Reads a unit, whatever the case of its letters; `None` = unknown, or none.
     pub fn parse(text: &str) -> Option<Self> {
@@ -50,7 +47,8 @@ impl SignalUnit {
             "uv" => (Quantity::Voltage, 1e-6, 0.0),
             "kv" => (Quantity::Voltage, 1e3, 0.0),
             "c" | "degc" | "celsius" | "degcelsius" | "degreec" | "degreesc" => (Quantity::Temperature, 1.0, 0.0),
-            "k" | "kelvin" | "degk" => (Quantity::Temperature, 1.0, ZERO_KELVIN_C),
+            // Absolute zero, degrees C.
+            "k" | "kelvin" | "degk" => (Quantity::Temperature, 1.0, -273.15),
             "f" | "degf" | "fahrenheit" => (Quantity::Temperature, 5.0 / 9.0, -160.0 / 9.0),
             other => (Quantity::Other(other_quantity(other)?), 1.0, 0.0),
         };

@@ -74,20 +74,9 @@ impl Stages {
         (&mut self.learning, publisher)
     }
 
-    /// Takes a reading. Nearly all are ordinary cell voltages: they alone are inlined into the loop over a frame's signals.
+    /// Takes a reading.
     #[inline]
     pub(crate) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
-        if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
-            && let Some(sample) = self.sampling.take_ordinary_voltage(now, cell, voltage_v)
-        {
-            self.handle_sample(now, sample, out);
-        } else {
-            self.handle_other_reading(now, bus, reading, out);
-        }
-    }
-
-    #[inline(never)]
-    fn handle_other_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
             Channel::PackIdentity => return self.handle_identity(now, bus, reading, out),
             Channel::Balancing(cell) => return self.findings.handle_balancing(now, cell, reading.value),
@@ -136,7 +125,7 @@ impl Stages {
                     self.handle_sample(now, sample.measured_at(moment), out);
                 }
             }
-            _ => self.handle_other_reading(now, bus, reading, out),
+            _ => self.handle_reading(now, bus, reading, out),
         }
     }
 

@@ -7,8 +7,6 @@
 //! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records are stored
 //! together and not field by field. Nothing is allocated per reading.
 
-use std::ops::Range;
-
 use serde::{Deserialize, Serialize};
 
 use super::cell_sample::{CellSample, Moment};
@@ -90,8 +88,6 @@ pub struct Sampler {
     sensors: usize,
     /// Number of voltage channels.
     voltages: usize,
-    /// Signals of the cells' own voltages; empty where the pack's total is measured.
-    cell_voltages: Range<usize>,
     flow_a: f64,
     /// Step of a voltage that is no noise, V.
     step_v: f64,
@@ -121,21 +117,19 @@ impl Sampler {
     /// A sampler before its first reading.
     pub fn new(config: SampleConfig) -> Self {
         let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
-        let (voltages, own_voltages) = match config.voltage_source {
-            VoltageSource::Cells => (usize::from(config.cells), usize::from(config.cells)),
-            VoltageSource::PackTotal { .. } => (1, 0),
+        let voltages = match config.voltage_source {
+            VoltageSource::Cells => usize::from(config.cells),
+            VoltageSource::PackTotal { .. } => 1,
         };
         let channels = channels(&config, sensors);
         let state = SamplerState { signals: vec![Signal::default(); channels.len()], ..SamplerState::default() };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
-        let first = 1 + sensors;
         Self {
             step_v: frozen::step_v(config.voltage_noise_v),
             config,
             channels,
             sensors,
             voltages,
-            cell_voltages: first..first + own_voltages,
             flow_a,
             state,
             next_stale: None,
@@ -244,24 +238,6 @@ impl Sampler {
             self.state.charge.close(time, measured_a, max_age_s);
         }
         self.shared.is_known = false;
-    }
-
-    /// Handles the most frequent reading, a cell's good voltage after many others, as
-    /// [`handle_reading`](Self::handle_reading) would, with less work. `None` when it may be any other reading: the caller
-    /// then calls `handle_reading`.
-    #[inline]
-    pub fn take_ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
-        let time = self.advance(time);
-        self.refresh_shared_inputs(time);
-        let Self { config, state, cell_voltages, shared, .. } = self;
-        let signal = state.signals[cell_voltages.clone()].get_mut(cell.index())?;
-        let clock_s = should_move_s(Channel::CellVoltage(cell), &shared.totals);
-        if !signal.take_ordinary(time, voltage_v, &config.voltage, clock_s) {
-            return None;
-        }
-        state.counts.accepted = state.counts.accepted.saturating_add(1);
-        state.frozen.handle_voltage(time, cell.index(), voltage_v, self.step_v);
-        Some(self.sample(cell, voltage_v))
     }
 
     /// Checks the ages at `now`; appends signals that have become stale to `changes`.

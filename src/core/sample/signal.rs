@@ -95,27 +95,6 @@ impl Signal {
         SignalUpdate { value, change: self.turn(value.err(), 1), is_new_level }
     }
 
-    /// Handles a good reading of a signal that has been good for long, as [`handle`](Self::handle) would, with fewer
-    /// checks; returns `false` and changes nothing when it may be any other reading.
-    #[inline]
-    pub(super) fn take_ordinary(&mut self, time: Timestamp, value: f64, limits: &Limits, should_move_s: f64) -> bool {
-        let (Some(good), None, 0) = (self.good, self.fault, self.refused_count) else { return false };
-        // Also false for NaN.
-        let is_plausible = value >= limits.min && value <= limits.max;
-        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, TimedValue { value, time }, rate)) {
-            return false;
-        }
-        if self.rests_at != Some(value) {
-            (self.rests_at, self.rests_since_s) = (Some(value), should_move_s);
-        } else if limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s) {
-            return false;
-        }
-        self.good = Some(TimedValue { value, time });
-        self.received = Some(time);
-        self.count(false);
-        true
-    }
-
     /// Turns a good signal stale; returns the fault.
     pub(super) fn turn_stale(&mut self) -> Fault {
         self.turn(Some(Fault::Stale), 0);

@@ -26,11 +26,6 @@ impl Balancing {
     }
 }
 
-/// Shortest charge, s: regeneration is none.
-const MIN_CHARGE_S: f64 = 60.0;
-/// Largest current at rest, capacities per hour.
-const REST_C: f64 = 0.002;
-
 /// The BMS while it runs.
 #[derive(Debug, Clone)]
 pub(crate) struct Balancer {
@@ -48,9 +43,11 @@ impl Balancer {
 
     /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` gives a channel's offset.
     pub(crate) fn update(&mut self, pack: &mut Pack, current_a: f64, dt_s: f64, offset_v: impl Fn(usize) -> f64) {
-        let is_rest = current_a.abs() <= REST_C * pack.lowest_capacity_ah();
+        // Largest current at rest, capacities per hour.
+        let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        let ends_charge = self.charging_s >= MIN_CHARGE_S && pack.highest_soc() >= self.settings.from_soc;
+        // Shortest charge, s: regeneration is none.
+        let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);
         } else if is_rest {

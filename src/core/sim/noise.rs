@@ -25,9 +25,6 @@ pub(crate) enum Stream {
     CellVoltage(u16),
 }
 
-/// Number of the first stream of constant errors of sensors; the streams of noise are all below.
-const CHANNEL: u64 = 0x10_0000;
-
 impl Stream {
     fn number(self) -> u64 {
         match self {
@@ -56,7 +53,8 @@ impl Noise {
 
     /// The numbers of the constant errors of a sensor whose noise is `stream`.
     pub(crate) fn of_channel(seed: u64, stream: Stream) -> Self {
-        Self::of_number(seed, CHANNEL + stream.number())
+        // Number of the first stream of constant errors of sensors; the streams of noise are all below.
+        Self::of_number(seed, 0x10_0000 + stream.number())
     }
 
     fn of_number(seed: u64, number: u64) -> Self {

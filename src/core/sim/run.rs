@@ -16,9 +16,6 @@ use super::truth::Pack;
 use crate::cell::CellModel;
 use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
-/// Longest step of the truth during sleep, s: the resolution of tables and temperature.
-const ASLEEP_STEP_S: f64 = 60.0;
-
 /// Wiring and sensors of the pack.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wiring {
@@ -229,7 +226,8 @@ impl Simulation {
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
         self.current_a = 0.0;
-        let steps = (duration_s / ASLEEP_STEP_S).ceil().max(1.0) as u32;
+        // Longest step of the truth during sleep, s: the resolution of tables and temperature.
+        let steps = (duration_s / 60.0).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 

@@ -66,13 +66,6 @@ impl Scenario {
     }
 }
 
-/// Sensor errors of the paper's scenario in the accuracy requirement.
-const PAPER_SENSORS: Sensors = Sensors {
-    current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::NONE },
-    voltage: SensorError { noise_std: 0.005, ..SensorError::NONE },
-    temperature: SensorError { noise_std: 0.1, ..SensorError::NONE },
-};
-
 const SECOND_NS: i64 = 1_000_000_000;
 
 impl Settings {
@@ -92,7 +85,12 @@ impl Settings {
                 leakage_a: 0.0,
                 ambient_c: 25.0,
             },
-            sensors: PAPER_SENSORS,
+            // Sensor errors of the paper's scenario in the accuracy requirement.
+            sensors: Sensors {
+                current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::NONE },
+                voltage: SensorError { noise_std: 0.005, ..SensorError::NONE },
+                temperature: SensorError { noise_std: 0.1, ..SensorError::NONE },
+            },
             current_period_ns: SECOND_NS,
             cell_period_ns: SECOND_NS,
             cycles: None,

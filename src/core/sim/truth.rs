@@ -76,14 +76,8 @@ pub struct PackSettings {
     pub ambient_c: f64,
 }
 
-/// A capacity never falls below this fraction of the new one: SOC divides by it.
-const CAPACITY_FLOOR: f64 = 0.01;
 /// Spread beyond this many standard deviations is cut off, so that no cell gets a negative capacity.
 const SPREAD_LIMIT: f64 = 3.0;
-
-/// Where the resistance of a contact is compared with the cell's: SOC, and temperature in degrees C.
-const REFERENCE_SOC: f64 = 0.5;
-const REFERENCE_C: f64 = 25.0;
 
 /// True state of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,7 +108,8 @@ pub struct TruthCell {
 impl TruthCell {
     fn new(settings: &PackSettings, noise: &mut Noise) -> Self {
         let mut spread = |std: f64| std * noise.normal().clamp(-SPREAD_LIMIT, SPREAD_LIMIT);
-        let floor_ah = settings.capacity_ah * CAPACITY_FLOOR;
+        // A capacity never falls below this fraction of the new one: SOC divides by it.
+        let floor_ah = settings.capacity_ah * 0.01;
         Self {
             capacity_ah: (settings.capacity_ah * (1.0 + spread(settings.spread.capacity))).max(floor_ah),
             resistance_ratio: (1.0 + spread(settings.spread.resistance)).max(0.1),
@@ -245,7 +240,8 @@ impl Pack {
         match fault {
             FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
             FaultKind::Contact { cell, resistance } => {
-                let place = self.model.grid_position(REFERENCE_SOC, REFERENCE_C);
+                // Where the resistance of a contact is compared with the cell's: SOC, and temperature in degrees C.
+                let place = self.model.grid_position(0.5, 25.0);
                 let cell = &mut self.cells[cell.index()];
                 cell.contact_ohm += match resistance {
                     ContactResistance::Ohm(ohm) => ohm,

@@ -20,8 +20,6 @@ const MAX_PIECES: usize = 64;
 
 /// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
-/// Period of looking whether the thread has ended.
-const FINISH_POLL: Duration = Duration::from_millis(5);
 
 /// A file and the thread that writes it.
 #[derive(Debug)]
@@ -109,7 +107,8 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
         if began.elapsed() > MAX_FINISH {
             return false;
         }
-        std::thread::sleep(FINISH_POLL);
+        // Period of looking whether the thread has ended.
+        std::thread::sleep(Duration::from_millis(5));
     }
     true
 }

@@ -19,10 +19,6 @@ use crate::config::KeySource;
 
 /// Bytes of a key.
 const KEY_BYTES: usize = 16;
-/// Longest file that can be a key: hex digits and a line feed of any kind, and one byte more.
-const MAX_FILE_BYTES: u64 = 2 * KEY_BYTES as u64 + 3;
-/// Access of others to the file.
-const OTHERS: u32 = 0o077;
 
 /// See the module.
 #[derive(Clone)]
@@ -55,11 +51,13 @@ impl CanKey {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
         let file = File::open(path).map_err(|why| error(why.to_string()))?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
-        if is_private && mode & OTHERS != 0 {
+        // Access of others to the file.
+        if is_private && mode & 0o077 != 0 {
             return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
         }
         let mut content = Vec::new();
-        file.take(MAX_FILE_BYTES).read_to_end(&mut content).map_err(|why| error(why.to_string()))?;
+        // Longest file that can be a key: hex digits and a line feed of any kind, and one byte more.
+        file.take(2 * KEY_BYTES as u64 + 3).read_to_end(&mut content).map_err(|why| error(why.to_string()))?;
         Self::parse(&content).map_err(error)
     }
 

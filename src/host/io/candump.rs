@@ -1,7 +1,6 @@
 //! candump log lines: the grammar that `candump -L` writes and `canplayer` reads, both ways.
 //!
-//! Input is one line without its line feed; output is a [`Line`] that borrows the interface name. Nothing is
-//! allocated and nothing is read twice. Accepted, beyond the usual `(1700000000.123456) can0 123#1122`:
+//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. Accepted, beyond the usual `(1700000000.123456) can0 123#1122`:
 //! nanosecond and relative stamps, padded names, the direction suffix of `-x`, remote frames, raw length codes,
 //! CAN FD, error frames, bytes separated by dots, drop counts of `-d`. CAN XL is recognised and not decoded.
 //! A line that does not begin with `(` is no frame line ([`Line::Other`]), as for canplayer; a line that does
@@ -9,21 +8,17 @@
 //!
 //! FD payloads of a length the bus cannot carry are padded with zeros to the next one, as canplayer does.
 
-pub(super) mod fast_line;
+mod digits;
+mod parser;
 
 use std::io::{self, Write};
 
 use crate::can::{CanId, Frame, FrameKind, MAX_DATA};
 use crate::quantity::Timestamp;
 
-/// Most payload bytes of a CAN XL frame.
-const MAX_XL_DATA: usize = 2048;
-/// Payload lengths above 8 that CAN FD can carry.
-const FD_STEPS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
-/// Bit of an 8-digit identifier that marks an error frame.
-const ERROR_FLAG: u32 = 0x2000_0000;
-/// Largest 29-bit identifier, and the mask of an error frame's class bits.
-const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
+use parser::Cursor;
+pub(super) use parser::{Body, LineHead};
+pub use parser::{LineParser, ParsedLine};
 
 /// A line of a candump log.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -92,38 +87,12 @@ impl LineError {
     }
 }
 
-/// Hex digit values; 0xFF for anything else.
-const HEX: [u8; 256] = {
-    let mut table = [0xFF; 256];
-    let mut digit = 0;
-    while digit < 16 {
-        table[b"0123456789ABCDEF"[digit] as usize] = digit as u8;
-        table[b"0123456789abcdef"[digit] as usize] = digit as u8;
-        digit += 1;
-    }
-    table
-};
-
 /// Reads one line (without its line feed; a carriage return at its end is ignored).
 ///
 /// # Errors
 /// When the line begins with `(` and breaks the grammar.
 pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
-    if line.first() != Some(&b'(') {
-        return Ok(parse_drop_count(line).unwrap_or(Line::Other));
-    }
-    let mut cursor = Cursor { text: line, at: 0 };
-    let time = cursor.stamp()?;
-    cursor.spaces("a space after the stamp")?;
-    let interface = cursor.word();
-    cursor.spaces("a space after the interface's name")?;
-    let body = cursor.frame()?;
-    let transmitted = cursor.suffix()?;
-    Ok(match body {
-        Body::Frame(frame) => Line::Frame { time, interface, frame, transmitted },
-        Body::Error(class) => Line::ErrorFrame { time, interface, class },
-        Body::Xl => Line::Xl { time, interface },
-    })
+    LineParser::new(&[]).parse(line).map(|parsed| parsed.line)
 }
 
 /// Reads a stamp `(seconds.fraction)` at the start of `text`; the rest of the text with it.
@@ -138,266 +107,11 @@ pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
 
 /// Reads an interface's name and a frame at the start of `text`; the rest of the text with them. `None` = they are not there.
 pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
-    let mut cursor = Cursor { text, at: 0 };
-    let interface = cursor.word();
-    cursor.spaces("").ok()?;
-    match cursor.frame().ok()? {
-        Body::Frame(frame) => Some((interface, frame, &text[cursor.at..])),
-        Body::Error(_) | Body::Xl => None,
-    }
-}
-
-fn parse_drop_count(line: &[u8]) -> Option<Line<'_>> {
-    let rest = line.strip_prefix(b"DROPCOUNT: dropped ")?;
-    let digits = rest.iter().take_while(|b| b.is_ascii_digit()).count();
-    let frames = std::str::from_utf8(&rest[..digits]).ok()?.parse().ok()?;
-    let open = memchr::memchr(b'\'', rest)?;
-    let name = &rest[open + 1..];
-    let interface = &name[..memchr::memchr(b'\'', name)?];
-    Some(Line::Dropped { interface, frames })
-}
-
-/// The part of a line after the interface's name.
-enum Body {
-    Frame(Frame),
-    Error(u32),
-    Xl,
-}
-
-/// A place in a line.
-struct Cursor<'a> {
-    text: &'a [u8],
-    at: usize,
-}
-
-impl<'a> Cursor<'a> {
-    fn fail<T>(&self, expected: &'static str) -> Result<T, LineError> {
-        Err(LineError { column: self.at + 1, expected })
-    }
-
-    fn expect<T>(&self, found: Option<T>, expected: &'static str) -> Result<T, LineError> {
-        found.ok_or(LineError { column: self.at + 1, expected })
-    }
-
-    fn demand(&mut self, byte: u8, expected: &'static str) -> Result<(), LineError> {
-        if self.take(byte) { Ok(()) } else { self.fail(expected) }
-    }
-
-    fn peek(&self) -> Option<u8> {
-        self.text.get(self.at).copied()
-    }
-
-    fn take(&mut self, byte: u8) -> bool {
-        let found = self.peek() == Some(byte);
-        self.at += usize::from(found);
-        found
-    }
-
-    /// Value of the hex digit at `offset` from here; above 15 when there is none.
-    fn hex_at(&self, offset: usize) -> u8 {
-        self.text.get(self.at + offset).map_or(0xFF, |&b| HEX[usize::from(b)])
-    }
-
-    fn hex(&mut self) -> Option<u8> {
-        let value = self.hex_at(0);
-        (value < 16).then(|| {
-            self.at += 1;
-            value
-        })
-    }
-
-    /// `(` seconds `.` six or nine digits `)`, to nanoseconds. A minus sign is taken too: it is what
-    /// [`write_stamp`] writes for a time before the clock's origin.
-    fn stamp(&mut self) -> Result<Timestamp, LineError> {
-        self.demand(b'(', "a stamp in parentheses")?;
-        let negative = self.take(b'-');
-        let (seconds, digits) = self.decimal();
-        if !(1..=10).contains(&digits) {
-            return self.fail("seconds of 1 to 10 digits");
-        }
-        self.demand(b'.', "a decimal point")?;
-        let (fraction, digits) = self.decimal();
-        let nanos = match digits {
-            6 => fraction * 1000,
-            9 => fraction,
-            _ => return self.fail("a fraction of 6 or 9 digits"),
-        };
-        self.demand(b')', "a closing parenthesis after the stamp")?;
-        let total = seconds.checked_mul(1_000_000_000).and_then(|s| s.checked_add(nanos));
-        let total = self.expect(total, "a stamp below 9223372036 s")?;
-        Ok(Timestamp::from_nanos(if negative { -total } else { total }))
-    }
-
-    /// Decimal digits (saturating far above what a stamp may be) and how many there were.
-    fn decimal(&mut self) -> (i64, usize) {
-        let start = self.at;
-        let mut value: i64 = 0;
-        while let Some(digit) = self.peek().map(|b| b.wrapping_sub(b'0')).filter(|&d| d < 10) {
-            value = value.saturating_mul(10).saturating_add(i64::from(digit));
-            self.at += 1;
-        }
-        (value, self.at - start)
-    }
-
-    fn spaces(&mut self, expected: &'static str) -> Result<(), LineError> {
-        self.demand(b' ', expected)?;
-        while self.take(b' ') {}
-        Ok(())
-    }
-
-    fn word(&mut self) -> &'a [u8] {
-        let start = self.at;
-        while self.peek().is_some_and(|b| b != b' ') {
-            self.at += 1;
-        }
-        &self.text[start..self.at]
-    }
-
-    fn frame(&mut self) -> Result<Body, LineError> {
-        let delimiter = |offset: usize| self.text.get(self.at + offset) == Some(&b'#');
-        if delimiter(3) {
-            let raw = self.number(3)?;
-            let Some(id) = CanId::standard(raw) else {
-                self.at -= 3;
-                return self.fail("a standard identifier of at most 7FF");
-            };
-            self.at += 1;
-            self.payload(id).map(Body::Frame)
-        } else if delimiter(8) {
-            self.extended()
-        } else if delimiter(5) {
-            self.xl().map(|()| Body::Xl)
-        } else {
-            self.fail("an identifier of 3 or 8 hex digits and #")
-        }
-    }
-
-    fn extended(&mut self) -> Result<Body, LineError> {
-        let raw = self.number(8)?;
-        self.at += 1;
-        if let Some(id) = CanId::extended(raw) {
-            return self.payload(id).map(Body::Frame);
-        }
-        if raw & !MAX_EXTENDED != ERROR_FLAG {
-            self.at -= 9;
-            return self.fail("an identifier of at most 1FFFFFFF, or an error frame's (bit 20000000)");
-        }
-        let class = raw & MAX_EXTENDED;
-        self.classic(CanId::Extended(class))?;
-        Ok(Body::Error(class))
-    }
-
-    /// `digits` hex digits.
-    fn number(&mut self, digits: usize) -> Result<u32, LineError> {
-        let mut value = 0;
-        for _ in 0..digits {
-            let digit = self.hex();
-            value = value << 4 | u32::from(self.expect(digit, "a hex digit")?);
-        }
-        Ok(value)
-    }
-
-    fn payload(&mut self, id: CanId) -> Result<Frame, LineError> {
-        if self.take(b'#') { self.fd(id) } else { self.classic(id) }
-    }
-
-    fn classic(&mut self, id: CanId) -> Result<Frame, LineError> {
-        if self.take(b'R') || self.take(b'r') {
-            return self.remote(id);
-        }
-        let mut data = [0; MAX_DATA];
-        let len = self.bytes(&mut data[..8])?;
-        self.raw_length_code(len)?;
-        self.expect(Frame::classic(id, &data[..len]), "at most 8 bytes")
-    }
-
-    fn remote(&mut self, id: CanId) -> Result<Frame, LineError> {
-        let len = match self.peek() {
-            Some(digit @ b'0'..=b'8') => {
-                self.at += 1;
-                digit - b'0'
-            }
-            _ => 0,
-        };
-        self.raw_length_code(usize::from(len))?;
-        self.expect(Frame::remote(id, len), "a length of 0 to 8")
-    }
-
-    /// `_9` to `_F` after a length of 8: the length code that was on the wire; the payload is 8 bytes all the same.
-    fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
-        if len != 8 || !self.take(b'_') {
-            return Ok(());
-        }
-        let is_code = (9..=15).contains(&self.hex_at(0));
-        self.at += usize::from(is_code);
-        if is_code { Ok(()) } else { self.fail("a raw length code of 9 to F") }
-    }
-
-    fn fd(&mut self, id: CanId) -> Result<Frame, LineError> {
-        let Some(flags) = self.hex() else { return self.fail("one hex digit of FD flags") };
-        let mut data = [0; MAX_DATA];
-        let len = self.bytes(&mut data)?;
-        let padded = if len <= 8 { len } else { FD_STEPS.into_iter().find(|&step| step >= len).unwrap_or(MAX_DATA) };
-        self.expect(Frame::fd(id, flags & 1 != 0, flags & 2 != 0, &data[..padded]), "at most 64 bytes")
-    }
-
-    /// Bytes of two hex digits, dots between them allowed, as many as there are up to the room in `data`.
-    fn bytes(&mut self, data: &mut [u8]) -> Result<usize, LineError> {
-        let mut len = 0;
-        while len < data.len() {
-            let dot = usize::from(len > 0 && self.peek() == Some(b'.'));
-            let (high, low) = (self.hex_at(dot), self.hex_at(dot + 1));
-            if high > 15 {
-                break;
-            }
-            if low > 15 {
-                self.at += dot;
-                return self.fail("two hex digits per byte");
-            }
-            data[len] = high << 4 | low;
-            len += 1;
-            self.at += dot + 2;
-        }
-        if len == data.len() && self.hex_at(0) < 16 {
-            return self.fail("no more bytes (at most 8, with ## at most 64)");
-        }
-        Ok(len)
-    }
-
-    /// vcid(2) prio(3) # flags(2) : sdt(2) : af(8) # bytes.
-    fn xl(&mut self) -> Result<(), LineError> {
-        self.number(5)?;
-        self.at += 1;
-        for (digits, end) in [(2, b':'), (2, b':'), (8, b'#')] {
-            self.number(digits)?;
-            self.demand(end, "CAN XL's flags:sdt:af#")?;
-        }
-        let mut data = [0; MAX_XL_DATA];
-        match self.bytes(&mut data)? {
-            0 => self.fail("1 to 2048 bytes of CAN XL data"),
-            _ => Ok(()),
-        }
-    }
-
-    /// The direction that `-x` adds, then nothing but blanks. Whether the frame was sent here.
-    fn suffix(&mut self) -> Result<bool, LineError> {
-        let blank = |b: Option<u8>| matches!(b, None | Some(b' ' | b'\r' | b'\t'));
-        if !blank(self.peek()) {
-            return self.fail("the frame's end");
-        }
-        self.skip_blanks();
-        let transmitted = self.peek() == Some(b'T');
-        if transmitted || self.peek() == Some(b'R') {
-            self.at += 1;
-        }
-        self.skip_blanks();
-        if self.peek().is_some() { self.fail("R, T or the line's end after the frame") } else { Ok(transmitted) }
-    }
-
-    fn skip_blanks(&mut self) {
-        while matches!(self.peek(), Some(b' ' | b'\r' | b'\t')) {
-            self.at += 1;
-        }
+    let (interface, at) = Cursor { text, at: 0 }.interface().ok()?;
+    let mut cursor = Cursor { text, at };
+    match cursor.frame() {
+        Ok(Body::Frame(frame)) => Some((interface, frame, &text[cursor.at..])),
+        _ => None,
     }
 }
 

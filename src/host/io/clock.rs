@@ -20,15 +20,8 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// A stamp may be this much older than the moment the socket was last found empty, ns: between stamping and
-/// queueing lie a soft interrupt and, with USB adapters, a batch.
-const QUEUEING_SLACK_NS: i64 = 20_000_000;
-
 /// Half the memory of the least hardware offset, ns. A quartz 100 ppm off bends times by 1 ms over it.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
-
-/// Readings of the boot clock that lie this close together, ns, need no repetition: two system calls on a slow processor.
-const CLOSE_NS: i64 = 20_000;
 
 /// Most readings of the wall clock for one [`Reading`].
 const MOST_READINGS: usize = 4;
@@ -59,7 +52,8 @@ impl Reading {
         };
         let mut closest = read();
         for _ in 1..MOST_READINGS {
-            if closest.0 <= CLOSE_NS {
+            // Readings of the boot clock that lie this close together, ns, need no repetition: two system calls on a slow processor.
+            if closest.0 <= 20_000 {
                 break;
             }
             let again = read();
@@ -187,7 +181,9 @@ impl StampMapper {
 
     /// Whether a frame read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        (self.emptied_ns - QUEUEING_SLACK_NS..=reading.boottime_ns).contains(&arrived_ns)
+        // A stamp may be this much older than the moment the socket was last found empty, ns: between stamping and
+        // queueing lie a soft interrupt and, with USB adapters, a batch.
+        (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }
 

@@ -20,11 +20,6 @@ use crate::config::VehicleIdentity;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
-/// Repeated faults of one interface are logged as a sum after this long, s; then after twice that, and so on.
-const SUMMARY_S: f64 = 10.0;
-/// Longest time between two sums, s.
-const LONGEST_SUMMARY_S: f64 = 3600.0;
-
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
 pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(&serde_json::to_vec(event)?)?;
@@ -59,7 +54,8 @@ impl EventSum {
         }
         // After a pause it is logged at once again.
         let continues = since_s < 2.0 * self.period_s;
-        self.period_s = if continues { (2.0 * self.period_s).min(LONGEST_SUMMARY_S) } else { SUMMARY_S };
+        // Repeated faults of one interface are logged as a sum after this long, s; then after twice that, up to an hour.
+        self.period_s = if continues { (2.0 * self.period_s).min(3600.0) } else { 10.0 };
         self.reported = Some(time);
         Some(std::mem::take(&mut self.unreported))
     }

@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicU64;
 
 use serde::Serialize;
 
-use super::candump::{self, Line, fast_line};
+use super::candump::{Body, Line, LineHead, LineParser, ParsedLine};
 use super::csv_log::{CsvLog, CsvOptions, RowTime};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
@@ -25,8 +25,6 @@ pub use super::record::Batch;
 use super::record::UNUSED;
 pub use super::table::TableError as LogError;
 
-/// Distance between the records so far and a part with an unknown gap before it.
-const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Names of unconfigured interfaces counted apart; more are counted together under "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
@@ -107,7 +105,7 @@ struct ReadState {
     strict: bool,
     interfaces: Vec<String>,
     /// Knows the interfaces.
-    fast_line: fast_line::FastLineParser,
+    parser: LineParser,
     /// Interfaces that are not configured get a number too.
     adopt: bool,
     shift_ns: i64,
@@ -133,7 +131,7 @@ impl LogSource {
             state: ReadState {
                 counts: LogCounts::default(),
                 strict: options.strict,
-                fast_line: fast_line::FastLineParser::new(&options.interfaces),
+                parser: LineParser::new(&options.interfaces),
                 interfaces: options.interfaces,
                 adopt: false,
                 shift_ns: 0,
@@ -187,7 +185,7 @@ impl LogSource {
             }
             if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
                 && let mut slot = [UNUSED]
-                && self.state.fast_records(lines, &mut slot) > 0
+                && self.state.next_frames(lines, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
             }
@@ -240,7 +238,7 @@ impl LogSource {
             && self.queue.is_empty()
         {
             batch.carries_ticks = *journal;
-            batch.len = self.state.fast_records(lines, &mut batch.slots);
+            batch.len = self.state.next_frames(lines, &mut batch.slots);
             if batch.len > 0 {
                 return Ok(true);
             }
@@ -279,32 +277,49 @@ fn named_csv(path: &Path) -> bool {
 }
 
 impl ReadState {
-    /// Fills slots with the next records of a text log, as long as they are frames in fast lines of known interfaces and not
-    /// the first of their file; returns how many. The result equals that of the full grammar ([`next_text`](Self::next_text),
-    /// [`place`](Self::place)).
-    fn fast_records(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
+    /// Fills slots with the next records of a text log, as long as they are frames in whole lines that were read from the file,
+    /// and not the first of the file; returns how many.
+    fn next_frames(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
-        let (mut text, mut count, mut backwards) = (all, 0, 0);
-        for slot in slots {
-            let Some(line) = self.fast_line.parse(text) else { break };
-            *slot = Record::frame(line.time, line.bus, &line.frame());
-            text = &text[line.line_len..];
+        let (mut text, mut count, mut read_lines, mut backwards) = (all, 0, 0, 0);
+        while let Some(slot) = slots.get_mut(count)
+            && let Ok(LineHead { time, interface, bus, rest }) = self.parser.parse_head(text)
+        {
+            let time = time.plus_nanos(self.shift_ns);
+            // Two assignments: the usual frame is made in its place, not copied to it.
+            let (len, is_known) = if let (Some(bus), Some((frame, len))) = (bus, rest.usual_frame_and_end()) {
+                *slot = Record::frame(time, bus, &frame);
+                (len, true)
+            } else {
+                let Ok((Body::Frame(frame), _, len)) = rest.frame_and_end() else { break };
+                if len == text.len() {
+                    break;
+                }
+                let bus = bus.or_else(|| self.bus(interface));
+                *slot = Record::frame(time, bus.unwrap_or(BusIndex(0)), &frame);
+                (len, bus.is_some())
+            };
+            text = &text[len + 1..];
+            read_lines += 1;
+            if !is_known {
+                continue;
+            }
             count += 1;
-            if line.time < latest {
+            if time < latest {
                 std::hint::cold_path();
                 backwards += 1;
             } else {
-                latest = line.time;
+                latest = time;
             }
         }
         let len = all.len() - text.len();
-        lines.take_lines(len, count);
-        self.counts.lines += count;
-        self.counts.frames += count;
+        lines.take_lines(len, read_lines);
+        self.counts.lines += read_lines;
+        self.counts.frames += count as u64;
         self.counts.time_backwards += backwards;
         self.latest = Some(latest);
-        count as usize
+        count
     }
 
     fn bad(&mut self, what: impl FnOnce() -> String) -> Result<(), LogError> {
@@ -344,11 +359,11 @@ impl ReadState {
                 continue;
             }
             self.counts.lines += 1;
-            let record = match candump::parse_line(bytes) {
-                Ok(Line::Other) if journal && journal::is_mark(bytes) => {
+            let record = match self.parser.parse(bytes) {
+                Ok(ParsedLine { line: Line::Other, .. }) if journal && journal::is_mark(bytes) => {
                     journal::parse_mark(bytes, |interface| self.bus(interface))
                 }
-                Ok(line) => Ok(self.line_record(&line)),
+                Ok(parsed) => Ok(self.line_record(&parsed.line)),
                 Err(error) => Err(error),
             };
             self.counts.frames +=
@@ -399,7 +414,7 @@ impl ReadState {
         }
         if self.adopt && self.interfaces.len() < MAX_ADOPTED {
             self.interfaces.push(name.into_owned());
-            self.fast_line.know(&self.interfaces);
+            self.parser = LineParser::new(&self.interfaces);
             return u8::try_from(self.interfaces.len() - 1).ok().map(BusIndex);
         }
         let foreign = &mut self.counts.foreign;
@@ -439,10 +454,10 @@ impl ReadState {
             self.shift_ns = 0;
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
-                self.shift_ns = latest.plus_nanos(UNKNOWN_GAP_NS).nanos().saturating_sub(raw.nanos());
+                // Distance between the records so far and a part with an unknown gap before it.
+                self.shift_ns = latest.plus_nanos(1_000_000_000).nanos().saturating_sub(raw.nanos());
                 (gap, self.has_moved_stamps) = (true, true);
             }
-            self.fast_line.shift(self.shift_ns);
         }
         let time = raw.plus_nanos(self.shift_ns);
         if self.latest.is_some_and(|latest| time < latest) {

@@ -10,9 +10,6 @@ use std::path::{Path, PathBuf};
 
 use super::place::with_suffix;
 
-/// Bytes collected before a system call.
-const BUFFER: usize = 256 * 1024;
-
 /// A file being written.
 #[derive(Debug)]
 pub struct ResultFile {
@@ -36,7 +33,8 @@ impl ResultFile {
             let part = with_suffix(path, ".part");
             (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
-        Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(BUFFER, file) })
+        // Bytes collected before a system call.
+        Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
 
     /// Completes the file: everything written, on the disk, under its name.

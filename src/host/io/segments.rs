@@ -14,11 +14,6 @@ use zstd::stream::write::Encoder;
 
 use super::place::with_suffix;
 
-/// Compression level of zstd. The frames of a pack of 96 cells become 8.0 times smaller; with level 3, which takes 2 MB more
-/// memory, 7.2 times. The vehicle's package (`systemd/debian/build`) leaves out the compressors of the other levels.
-const LEVEL: i32 = 1;
-/// Digits of a segment's number, at least.
-const DIGITS: usize = 6;
 /// Least and greatest size of a segment, bytes: below, headers would fill it; above, deleting one loses days.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
 /// Size of a segment where none is set, bytes: six hours of a pack of 96 cells.
@@ -61,14 +56,15 @@ struct Segment {
 
 /// The name of segment `number` of `base`.
 fn path_of(base: &Path, number: u64) -> PathBuf {
-    with_suffix(base, &format!(".{number:0DIGITS$}.zst"))
+    with_suffix(base, &format!(".{number:06}.zst"))
 }
 
 /// Base and number of a path that is named like a segment.
 fn parse(path: &Path) -> Option<(PathBuf, u64)> {
     let text = path.to_str()?.strip_suffix(".zst")?;
     let (base, digits) = text.rsplit_once('.')?;
-    let is_number = digits.len() >= DIGITS && digits.bytes().all(|byte| byte.is_ascii_digit());
+    // Digits of a segment's number, at least.
+    let is_number = digits.len() >= 6 && digits.bytes().all(|byte| byte.is_ascii_digit());
     Some((PathBuf::from(base), digits.parse().ok().filter(|_| is_number)?))
 }
 
@@ -234,7 +230,9 @@ impl SegmentWriter {
 }
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
-    Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, LEVEL)
+    // Compression level of zstd. The frames of a pack of 96 cells become 8.0 times smaller; with level 3, which takes 2 MB more
+    // memory, 7.2 times. The vehicle's package (`systemd/debian/build`) leaves out the compressors of the other levels.
+    Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
 /// Renames the segments of the last run to those of `base.1`, whose own are deleted. Returns them with their sizes.

@@ -68,24 +68,6 @@ impl Ticks {
         asleep
     }
 
-    /// The most frequent record: [`advance`](Self::advance), and as many [`pop`](Self::pop)s as there are, where none of them
-    /// gives a tick and the recorder was awake; `false` and nothing done otherwise.
-    #[inline]
-    pub fn advance_within(&mut self, time: Timestamp, due: Option<Timestamp>) -> bool {
-        let (Some(latest_ns), None) = (self.latest_ns, self.wake_ns) else { return false };
-        let time_ns = time.nanos();
-        let limit_ns = self.limit_ns.max(time_ns);
-        let is_within = (0..=self.sleep_gap_ns).contains(&time_ns.saturating_sub(latest_ns));
-        if !is_within || due.is_some_and(|due| due.nanos() < limit_ns) {
-            return false;
-        }
-        (self.limit_ns, self.latest_ns) = (limit_ns, Some(time_ns));
-        if self.next_ns < limit_ns {
-            self.next_ns = self.at_or_after(limit_ns);
-        }
-        true
-    }
-
     /// The log ends here, or continues after an unknown gap: the ticks left up to the latest record may be popped,
     /// and the next record wakes the recorder whatever its stamp.
     pub fn sleep(&mut self) {
@@ -128,8 +110,6 @@ impl Ticks {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
 
     const EVERY: Option<Timestamp> = Some(Timestamp::from_nanos(i64::MIN));
@@ -208,17 +188,6 @@ mod tests {
     }
 
     #[test]
-    fn records_between_two_ticks_the_core_cares_for_are_taken_within() {
-        let mut ticks = Ticks::new(10, 30.0);
-        ticks.advance(Timestamp::from_nanos(0));
-        while ticks.pop(EVERY).is_some() {}
-        let due = Some(Timestamp::from_nanos(100_000_000));
-        let within = |ms: i64| ticks.advance_within(Timestamp::from_nanos(ms * 1_000_000), due);
-        assert_eq!([1, 9, 10, 11, 99, 100, 101].map(within), [true, true, true, true, true, true, false]);
-        assert_eq!(ticks.pop(due), None, "nothing was taken of the last");
-    }
-
-    #[test]
     fn skipping_leaves_the_grid_where_it_was() {
         let mut ticks = Ticks::new(10, 30.0);
         ticks.advance(Timestamp::from_nanos(3_000_000));
@@ -227,41 +196,5 @@ mod tests {
         assert_eq!(ticks.pop(None), None);
         ticks.advance(Timestamp::from_nanos(45_000_000));
         assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(30_000_000)));
-    }
-
-    proptest! {
-        /// Records some ms apart, backwards and after holes, for a core that cares for a tick every so often.
-        #[test]
-        fn records_taken_within_give_the_ticks_of_records_taken_one_by_one(
-            steps in prop::collection::vec(prop_oneof![12 => 0_i64..7, 1 => -30_i64..200, 1 => -9_000_i64..9_000], 1..200),
-            every_ms in 1_i64..60,
-        ) {
-            let (mut within, mut plain) = (Ticks::new(10, 0.05), Ticks::new(10, 0.05));
-            // The next tick that each core cares for, and its ticks.
-            let (mut dues, mut made) = ([None; 2], [const { Vec::new() }; 2]);
-            let (mut now_ms, mut short) = (100_000, 0);
-            for step in steps {
-                now_ms += step;
-                let now = Timestamp::from_nanos(now_ms * 1_000_000);
-                for (which, ticks) in [&mut within, &mut plain].into_iter().enumerate() {
-                    if which == 0 && ticks.advance_within(now, dues[0]) {
-                        short += 1;
-                        continue;
-                    }
-                    ticks.advance(now);
-                    while ticks.is_pending() {
-                        if let Some(tick) = ticks.pop(dues[which]) {
-                            dues[which] = Some(tick.plus_nanos(every_ms * 1_000_000));
-                            made[which].push(tick);
-                        }
-                    }
-                }
-                // A record may bring the next tick forward, as an alarm does: to what is over, at most.
-                if now_ms % 17 < 2 {
-                    dues = [Some(now.plus_nanos((now_ms % 17 * 33 - 30) * 1_000_000)); 2];
-                }
-            }
-            prop_assert_eq!(&made[0], &made[1], "{} taken within", short);
-        }
     }
 }

@@ -11,13 +11,8 @@ use tokio::time::timeout;
 
 use super::place::first_folder;
 
-/// Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
-const LOOK: Duration = Duration::from_secs(1);
-
 /// The folder of the service, and of a daemon that root starts from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
-/// Others may look into the folder that is made; the sockets' own modes decide who may connect.
-const FOLDER_MODE: u32 = 0o755;
 
 /// Default folder of a daemon's sockets: the one systemd made; else `/run/packwatch` for root, and the user's own folder for others.
 pub fn runtime_folder() -> PathBuf {
@@ -41,7 +36,8 @@ fn own_folder() -> Option<PathBuf> {
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
     if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
-        let _ = std::fs::set_permissions(folder, Permissions::from_mode(FOLDER_MODE));
+        // Others may look into the folder that is made; the sockets' own modes decide who may connect.
+        let _ = std::fs::set_permissions(folder, Permissions::from_mode(0o755));
     }
 }
 
@@ -114,7 +110,8 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
         }
         Ok(_) => {}
     }
-    match timeout(LOOK, UnixStream::connect(path)).await {
+    // Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
+    match timeout(Duration::from_secs(1), UnixStream::connect(path)).await {
         Ok(Err(error)) if error.kind() == ErrorKind::ConnectionRefused => Ok(std::fs::remove_file(path)?),
         Ok(Err(error)) if error.kind() == ErrorKind::NotFound => Ok(()),
         Ok(Err(error)) => Err(error.into()),

@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use super::ReplaySettings;
 use crate::quantity::Timestamp;
 
 /// A time of the log as the user gives it.
@@ -38,8 +37,8 @@ pub(super) enum WindowPosition {
 }
 
 impl TimeWindow {
-    pub(super) fn new(settings: &ReplaySettings) -> Self {
-        Self { from: settings.from, until: settings.until, first: None }
+    pub(super) fn new(from: Option<LogTime>, until: Option<LogTime>) -> Self {
+        Self { from, until, first: None }
     }
 
     pub(super) fn judge(&mut self, time: Timestamp) -> WindowPosition {

@@ -3,7 +3,7 @@
 //! In: rows (A, positive = discharge; V; degrees C) or frames, with their times. Out: the monitor's [`Outputs`], which the caller
 //! empties. Promise: the same inputs give the same outputs as `packwatch replay` of a log with them.
 
-use super::RowFrames;
+use super::reading::RowFrames;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::io::ticks::Ticks;
@@ -69,10 +69,8 @@ impl MonitorDriver {
     }
 
     fn advance(&mut self, time: Timestamp) {
-        if !self.ticks.advance_within(time, self.monitor.next_due()) {
-            self.ticks.advance(time);
-            self.send_ticks();
-        }
+        self.ticks.advance(time);
+        self.send_ticks();
     }
 
     fn send_ticks(&mut self) {

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{CellSummary, ProtectedSummary};
+use super::cells::CellSummary;
+use super::intake::ProtectedSummary;
 use crate::alarm::Change;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};

@@ -17,11 +17,6 @@ use crate::can::signal::{ByteOrder, ValueType};
 /// Name of no node.
 const NO_NODE: &str = "Vector__XXX";
 
-/// Longest cycle time an editor will accept, ms: an hour.
-const MAX_CYCLE_TIME_MS: u32 = 3_600_000;
-/// Most repetitions an editor will accept.
-const MAX_REPETITIONS: u32 = 999_999;
-
 impl Database {
     /// The text of the DBC. A signal's conditions must name multiplexors of its message, as after reading.
     pub fn to_dbc(&self) -> String {
@@ -86,13 +81,15 @@ impl Database {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
         };
-        let cycle_time = format!("INT 0 {MAX_CYCLE_TIME_MS}");
-        let repetitions = format!("INT 0 {MAX_REPETITIONS}");
+        // Longest cycle time an editor will accept, ms: an hour.
+        let cycle_time = "INT 0 3600000";
+        // Most repetitions an editor will accept.
+        let repetitions = "INT 0 999999";
         let word = |number: Option<u32>| number.map(|number| number.to_string());
-        self.attribute(CYCLE_TIME, &cycle_time, "0", |m| word(m.cycle_time_ms), text);
-        self.attribute(REPETITIONS, &repetitions, "0", |m| word(m.repetition.count), text);
-        self.attribute(FAST_CYCLE_TIME, &cycle_time, "0", |m| word(m.repetition.period_ms), text);
-        self.attribute(DELAY_TIME, &cycle_time, "0", |m| word(m.repetition.delay_ms), text);
+        self.attribute(CYCLE_TIME, cycle_time, "0", |m| word(m.cycle_time_ms), text);
+        self.attribute(REPETITIONS, repetitions, "0", |m| word(m.repetition.count), text);
+        self.attribute(FAST_CYCLE_TIME, cycle_time, "0", |m| word(m.repetition.period_ms), text);
+        self.attribute(DELAY_TIME, cycle_time, "0", |m| word(m.repetition.delay_ms), text);
         self.choice(FRAME_FORMAT, &FRAME_FORMATS, format, text);
         self.choice(BIT_RATE_SWITCH, &NO_YES, rate, text);
         self.choice(E2E_PROFILE, &E2E_PROFILES, |m| Some(profile_index(m.e2e?.profile).to_string()), text);

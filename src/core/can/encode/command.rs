@@ -4,7 +4,7 @@
 //! meaning is an error: a command is applied as a whole or not at all.
 
 use super::layout::LayoutMessage;
-use super::output::{PlanFaults, RULES};
+use super::message::{PlanFaults, RULES};
 use crate::can::dbc::{Database, Message};
 use crate::can::e2e::Protection;
 use crate::can::secoc::Authentication;

@@ -5,17 +5,12 @@
 //! alarm frames, or started late, finds with the checksum whether its table of raised alarms is complete.
 
 use super::layout::LayoutMessage;
-use super::message::OutputMessage;
-use super::output::RULES;
+use super::message::{OutputMessage, RULES};
 use crate::can::Frame;
 use crate::can::dbc::Database;
 use crate::can::e2e::crc16;
 use crate::quantity::CellIndex;
 
-/// The code of "the pack as a whole" in a table entry, as in the alarm frame of the shipped DBC.
-const WHOLE_PACK: u16 = 2047;
-/// Signals on page 0. The rules and the threshold are on pages of their own.
-const REQUIRED: [&str; 5] = ["Page", "Raised", "Worst", "TableChecksum", "PassTime"];
 /// Number of alarm rules.
 const RULE_COUNT: usize = RULES.len();
 
@@ -75,7 +70,8 @@ impl TableChecksum {
     /// Adds a raised alarm, as its frame carries it: number of the rule, codes of severity and state, cell (`None` = the
     /// pack), whether it is acknowledged.
     pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
-        let [low, high] = cell.map_or(WHOLE_PACK, |cell| cell.0).to_le_bytes();
+        // The code of "the pack as a whole" in a table entry, as in the alarm frame of the shipped DBC.
+        let [low, high] = cell.map_or(2047, |cell| cell.0).to_le_bytes();
         let entry = [rule, severity, low, high, state | u8::from(is_acknowledged) << 3];
         self.0 = self.0.wrapping_add(crc16(0xFFFF, &entry));
     }
@@ -103,7 +99,8 @@ impl DigestPlan {
         database.message(name)?;
         let rules = RULES.map(|rule| format!("Rule_{rule}"));
         let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
-        let required = [&REQUIRED[..], &rules].concat();
+        // Signals on page 0. The rules and the threshold are on pages of their own.
+        let required = [&["Page", "Raised", "Worst", "TableChecksum", "PassTime"][..], &rules].concat();
         let message = OutputMessage::new(database, name, &required, faults)?.with_places(&rules);
         let factors = RULES.map(|rule| alarm.per_inside_unit(&format!("Threshold_{rule}")));
         Some(Self { pages: message.page_codes(), message, factors })

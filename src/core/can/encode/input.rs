@@ -14,14 +14,11 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use crate::can::decode::{Binding, Channel, InputMap};
-use crate::can::isotp::segment;
+use crate::can::isotp::{FLOW_CONTROL, segment};
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::uds::{Answer, AnswerSignal, Controller, Question};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
-
-/// Flow control that lets everything come at once.
-const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
 /// Makes input frames from values.
 #[derive(Debug, Clone)]

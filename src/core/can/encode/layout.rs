@@ -34,9 +34,6 @@ pub const ALARM_DELAY_MS: u32 = 10;
 /// Mean time between two replies, at least, ms.
 pub const REPLY_DELAY_MS: u32 = 100;
 
-/// Bytes of the built-in command before its first signal, and with the last one, where they are not for end-to-end protection.
-const COMMAND_HEADER_BYTES: u16 = 2;
-const COMMAND_DATA_BYTES: u16 = 4;
 /// Period of the announcements of freshness, ms. With it a command is good for two seconds at most.
 pub const FRESHNESS_PERIOD_MS: u32 = 1000;
 
@@ -327,9 +324,11 @@ fn move_up(message: &mut Message) {
 /// Moves the signals of a command to its beginning: an authenticated command has no header.
 fn move_down(message: &mut Message) {
     for signal in &mut message.signals {
-        signal.layout.start_bit = signal.layout.start_bit.saturating_sub(8 * COMMAND_HEADER_BYTES);
+        // The header of end-to-end protection has two bytes.
+        signal.layout.start_bit = signal.layout.start_bit.saturating_sub(16);
     }
-    message.len_bytes = COMMAND_DATA_BYTES;
+    // Without that header and the bytes that only it covers.
+    message.len_bytes = 4;
     message.comment = Some("What packwatch takes from another ECU, authenticated: see PACKWATCH_Freshness.".to_owned());
 }
 

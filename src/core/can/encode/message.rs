@@ -2,6 +2,7 @@
 //!
 //! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
 
+use super::layout::{DEFAULT_PERIOD_MS, HEADER_SIGNALS};
 use crate::can::dbc::{Database, FrameFormat, Message, Signal};
 use crate::can::e2e::Protection;
 use crate::can::frame::is_frame_length;
@@ -9,7 +10,32 @@ use crate::can::secoc::Authentication;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
-use super::layout::{DEFAULT_PERIOD_MS, HEADER_SIGNALS};
+/// All faults of a DBC for a plan, one line each.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", .0.join("\n"))]
+pub struct PlanFaults(pub Vec<String>);
+
+/// The alarm rules in the order of their numbers, which start at 1: each has its `Value_...` and `Threshold_...`, for
+/// their units differ.
+pub(super) const RULES: [&str; 17] = [
+    "CapacityLow",
+    "UsableCapacityLow",
+    "RechargePeriodLow",
+    "InputMissing",
+    "InputImplausible",
+    "EstimateUntrusted",
+    "ResistanceHigh",
+    "SocLow",
+    "TemperatureHigh",
+    "CellImbalance",
+    "RemainingLifeLow",
+    "BmsDisagrees",
+    "StoreFailed",
+    "BusFault",
+    "CellLeak",
+    "ConnectionResistance",
+    "ChannelFaulty",
+];
 
 /// One message to send.
 #[derive(Debug, Clone, PartialEq)]
@@ -141,9 +167,10 @@ impl OutputMessage {
         }
         let frame = match self.format {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
-            FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, self.len, &payload),
+            FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, false, self.len, &payload),
         };
-        frame.unwrap_or_else(|| empty_frame(self.id))
+        // Always a frame: lengths were checked when the plan was made.
+        frame.unwrap_or(Frame::empty(self.id))
     }
 }
 
@@ -176,11 +203,6 @@ fn check_pages(message: &str, fields: &[OutputField], faults: &mut Vec<String>) 
                 .push(format!("signal {message}.{name} is on a page above {highest}, the highest code of {selector}"));
         }
     }
-}
-
-/// Never sent: lengths were checked when the plan was made.
-fn empty_frame(id: CanId) -> Frame {
-    Frame::classic(id, &[]).expect("a classic frame may be empty")
 }
 
 impl OutputField {

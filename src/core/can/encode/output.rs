@@ -12,18 +12,13 @@ use serde::{Deserialize, Serialize};
 
 use super::digest::{DigestFields, DigestPlan};
 use super::layout::LayoutMessage;
-use super::message::OutputMessage;
+use super::message::{OutputMessage, PlanFaults, RULES};
 use super::reply::{ReplyFields, reply_frame, reply_message};
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::secoc::{Authentication, Profile};
 use crate::can::{CanId, Frame};
 use crate::quantity::{CellIndex, Mode};
-
-/// All faults of a DBC for an [`OutputPlan`], one line each.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{}", .0.join("\n"))]
-pub struct PlanFaults(pub Vec<String>);
 
 /// Signals of a message with their values.
 type SignalTable<T, const N: usize> = [(&'static str, fn(&T) -> Option<f64>); N];
@@ -65,28 +60,6 @@ const HEALTH_REQUIRED: usize = 8;
 
 /// Signals on every page of the alarm frame.
 const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowledged"];
-
-/// The alarm rules in the order of their numbers, which start at 1: each has its `Value_...` and `Threshold_...`, for
-/// their units differ.
-pub(super) const RULES: [&str; 17] = [
-    "CapacityLow",
-    "UsableCapacityLow",
-    "RechargePeriodLow",
-    "InputMissing",
-    "InputImplausible",
-    "EstimateUntrusted",
-    "ResistanceHigh",
-    "SocLow",
-    "TemperatureHigh",
-    "CellImbalance",
-    "RemainingLifeLow",
-    "BmsDisagrees",
-    "StoreFailed",
-    "BusFault",
-    "CellLeak",
-    "ConnectionResistance",
-    "ChannelFaulty",
-];
 
 /// Contents of the status frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

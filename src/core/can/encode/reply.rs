@@ -15,13 +15,6 @@ use crate::can::e2e::Status;
 /// Signals of the reply.
 const REQUIRED: [&str; 9] =
     ["Result", "Reason", "Command", "Rule", "Severity", "Cell", "CounterExpected", "Changed", "Refused"];
-/// Codes of `Result`.
-const ACCEPTED: u8 = 1;
-const REFUSED: u8 = 2;
-/// Codes of `Reason` beyond those of [`CommandRefusal`].
-const NO_REASON: u8 = 0;
-const NOT_HEALTHY: u8 = 6;
-const NOTHING_TO_DO: u8 = 7;
 
 /// Why a command frame was not executed; the number is the code of `Reason` on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -90,15 +83,16 @@ pub struct ReplyFields {
 }
 
 impl ReplyFields {
-    /// Codes of `Result` and `Reason`.
+    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (beyond those of [`CommandRefusal`]: 0 none, 6 not healthy, 7 nothing
+    /// to do).
     fn result(&self) -> (u8, u8) {
         let replaces_pack = self.command.is_some_and(|fields| fields.command == Command::PackReplaced);
         match self.outcome {
-            Err(refusal) => (REFUSED, refusal as u8),
-            Ok((0, 1..)) => (REFUSED, NOT_HEALTHY),
-            Ok((_, 1..)) => (ACCEPTED, NOT_HEALTHY),
-            Ok((0, 0)) if !replaces_pack => (ACCEPTED, NOTHING_TO_DO),
-            Ok(_) => (ACCEPTED, NO_REASON),
+            Err(refusal) => (2, refusal as u8),
+            Ok((0, 1..)) => (2, 6),
+            Ok((_, 1..)) => (1, 6),
+            Ok((0, 0)) if !replaces_pack => (1, 7),
+            Ok(_) => (1, 0),
         }
     }
 

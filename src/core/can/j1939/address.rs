@@ -22,10 +22,6 @@ use crate::quantity::Timestamp;
 /// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, and 50 ms because a frame is on
 /// the wire a little later than its time here (interfaces start, queues empty; 12 ms were measured).
 const CONTENTION_NS: i64 = 300_000_000;
-/// Shortest time between two claims, ns: five in the time the other node waits; a flood of claims causes no flood of answers.
-const CLAIM_SPACING_NS: i64 = 50_000_000;
-/// "Cannot claim" waits 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
-const MAX_LOSER_DELAY_MS: u64 = 153;
 
 /// State of the claim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -151,7 +147,8 @@ impl AddressClaim {
         let before = self.state;
         let (state, answer) = next(before, event);
         self.state = state;
-        let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(CLAIM_SPACING_NS)));
+        // Shortest time between two claims, ns: five in the time the other node waits; a flood of claims causes no flood of answers.
+        let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(50_000_000)));
         match answer {
             ClaimAnswer::Nothing => {}
             ClaimAnswer::Claim => self.send_at = Some(self.send_at.map_or(spaced, |due| due.min(spaced))),
@@ -169,7 +166,8 @@ impl AddressClaim {
     fn loser_delay_ns(&self) -> i64 {
         // Fibonacci hashing: neighbouring serial numbers come out far apart.
         let mixed = self.name.raw().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
-        1_000_000 * i64::try_from(mixed % (MAX_LOSER_DELAY_MS + 1)).unwrap_or(0)
+        // "Cannot claim" waits 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
+        1_000_000 * i64::try_from(mixed % 154).unwrap_or(0)
     }
 
     /// The frame that is due, or the event that the node has the address.

@@ -11,9 +11,6 @@ use serde::{Deserialize, Serialize};
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// Shortest time between two changes of one code on the bus, ns.
-const CHANGE_SPACING_NS: i64 = 1_000_000_000;
-
 /// Most codes followed at a time: more than a configuration has (17 rules of three severities are 51), few enough to search.
 const MAX_FOLLOWED: usize = 64;
 
@@ -98,7 +95,8 @@ impl FollowedCode {
 
 /// Earliest time of the next change.
 fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
-    changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(CHANGE_SPACING_NS))
+    // Shortest time between two changes of one code on the bus, ns.
+    changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(1_000_000_000))
 }
 
 /// All codes.

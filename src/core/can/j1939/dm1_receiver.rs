@@ -11,9 +11,6 @@ use super::transport::{BAM, PACKET_BYTES};
 use super::trouble_code::{TroubleCode, dm_codes};
 use crate::can::{Frame, FrameKind};
 
-/// Bytes of a transfer: more than a frame holds, no more than 255 packets do.
-const TRANSFER_BYTES: std::ops::RangeInclusive<usize> = 9..=255 * PACKET_BYTES;
-
 /// A received DM1.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ReceivedDm1 {
@@ -78,7 +75,8 @@ impl Dm1Receiver {
             return broken;
         }
         let size = usize::from(u16::from_le_bytes([size_low, size_high]));
-        if !TRANSFER_BYTES.contains(&size) || size.div_ceil(PACKET_BYTES) != usize::from(packets) {
+        // Bytes of a transfer: more than a frame holds, no more than 255 packets do.
+        if !(9..=255 * PACKET_BYTES).contains(&size) || size.div_ceil(PACKET_BYTES) != usize::from(packets) {
             return Some(ReceivedDm1::Unreadable);
         }
         self.transfer = Some(IncomingTransfer { size, next_packet: 1, bytes: Vec::with_capacity(size + PACKET_BYTES) });

@@ -26,14 +26,8 @@ use crate::quantity::Timestamp;
 
 /// Time between two cyclic DM1, ns (J1939-73).
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
-/// Shortest time between two answers to requests, ns: a flood of requests brings at most 20 frames a second.
-const ANSWER_SPACING_NS: i64 = 50_000_000;
 /// Most waiting answers: a fifth would come more than 200 ms after its request, when the requester has given up (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
-/// Control byte of a negative acknowledgement.
-const NEGATIVE: u8 = 1;
-/// Earlier than any frame.
-const LONG_AGO: Timestamp = Timestamp::from_nanos(i64::MIN);
 
 /// Identity of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -102,13 +96,13 @@ impl Node {
             claim: AddressClaim::new(config.name, config.address),
             codes: Codes::default(),
             previously_active: Vec::new(),
-            next_dm1: LONG_AGO,
+            next_dm1: Timestamp::LONG_AGO,
             transfer: None,
-            transport_free_at: LONG_AGO,
+            transport_free_at: Timestamp::LONG_AGO,
             last_transferred: PGN_DM2,
             answers: VecDeque::with_capacity(MAX_WAITING_ANSWERS),
-            next_answer_at: LONG_AGO,
-            polled_at: LONG_AGO,
+            next_answer_at: Timestamp::LONG_AGO,
+            polled_at: Timestamp::LONG_AGO,
             codes_left_out: 0,
         }
     }
@@ -125,8 +119,8 @@ impl Node {
         self.fall_silent();
         self.codes.restart();
         self.claim.start(now);
-        self.transport_free_at = LONG_AGO;
-        self.next_answer_at = LONG_AGO;
+        self.transport_free_at = Timestamp::LONG_AGO;
+        self.next_answer_at = Timestamp::LONG_AGO;
         self.poll(now, out);
     }
 
@@ -243,13 +237,15 @@ impl Node {
             PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
-        self.next_answer_at = now.plus_nanos(ANSWER_SPACING_NS);
+        // Shortest time between two answers to requests, ns: a flood of requests brings at most 20 frames a second.
+        self.next_answer_at = now.plus_nanos(50_000_000);
         match answer {
             PendingAnswer::Dm1 => self.send_dm1(now, out),
             PendingAnswer::Dm2 => self.send(now, PGN_DM2, dm_payload(self.codes.lamps(), &self.previously_active), out),
             PendingAnswer::Refusal { pgn, to } => {
                 let [low, middle, high] = pgn_bytes(pgn);
-                let refusal = [NEGATIVE, 0xFF, 0xFF, 0xFF, to, low, middle, high];
+                // Control byte of a negative acknowledgement.
+                let refusal = [1, 0xFF, 0xFF, 0xFF, to, low, middle, high];
                 let id = can_id(PRIORITY, PGN_ACKNOWLEDGEMENT, GLOBAL_ADDRESS, self.address);
                 out.frames.extend(Frame::classic(id, &refusal));
             }
@@ -298,7 +294,7 @@ impl Node {
             Some(transfer) if codes > 1 || transfer.pgn == pgn => None,
             None if codes > 1 && pgn == PGN_DM1 && self.is_turn_of_dm2() => None,
             None if codes > 1 => Some(self.transport_free_at),
-            Some(_) | None => Some(LONG_AGO),
+            Some(_) | None => Some(Timestamp::LONG_AGO),
         }
     }
 

@@ -26,12 +26,6 @@ const MAX_SPN: u32 = (1 << 19) - 1;
 const MAX_FMI: u8 = 31;
 /// Largest occurrence count; one more means "not available", so counting stops here.
 const MAX_OCCURRENCES: u8 = 126;
-/// No lamp flashes.
-const NO_FLASH: u8 = 0xFF;
-/// Conversion method, in the byte of the occurrence count.
-const OLD_CONVERSION: u8 = 0x80;
-/// In place of a code: there is none.
-const NO_CODE: [u8; 4] = [0x00; 4];
 /// In place of a code: not available, or filled up.
 const NOT_AVAILABLE: [u8; 4] = [0xFF; 4];
 
@@ -92,7 +86,8 @@ impl TroubleCode {
 
     /// The reverse; `None` = in an older layout, or about no parameter.
     fn from_bytes([low, middle, high_and_fmi, count]: [u8; 4]) -> Option<Self> {
-        if count & OLD_CONVERSION != 0 {
+        // Conversion method, in the byte of the occurrence count.
+        if count & 0x80 != 0 {
             return None;
         }
         let spn = u32::from_le_bytes([low, middle, high_and_fmi >> 5, 0]);
@@ -196,7 +191,8 @@ impl From<Vec<u8>> for DmPayload {
 pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     let mut bytes = [0xFF; MAX_PAYLOAD];
     bytes[0] = lamps.to_byte();
-    bytes[1] = NO_FLASH;
+    // No lamp flashes.
+    bytes[1] = 0xFF;
     let taken = codes.len().min(MAX_CODES);
     if taken == 0 {
         bytes[2..6].fill(0);
@@ -213,7 +209,8 @@ pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
 /// that is not available (127) reads as 126.
 pub fn dm_codes(payload: &[u8]) -> Option<Vec<TroubleCode>> {
     let (places, _) = payload.get(2..)?.as_chunks::<4>();
-    let codes = places.iter().filter(|place| **place != NO_CODE && **place != NOT_AVAILABLE);
+    // Zeros stand in place of a code: there is none.
+    let codes = places.iter().filter(|place| **place != [0; 4] && **place != NOT_AVAILABLE);
     if places.is_empty() { None } else { codes.map(|place| TroubleCode::from_bytes(*place)).collect() }
 }
 

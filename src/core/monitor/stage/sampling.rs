@@ -112,21 +112,7 @@ impl Sampling {
         self.identity_readings = config.identity_readings;
     }
 
-    /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
-    /// [`handle_reading`](Self::handle_reading) has still to take it.
-    #[inline]
-    pub(crate) fn take_ordinary_voltage(
-        &mut self,
-        now: Timestamp,
-        cell: CellIndex,
-        voltage_v: f64,
-    ) -> Option<CellSample> {
-        let sample = self.sampler.take_ordinary_voltage(now, cell, voltage_v)?;
-        self.has_usable_reading = true;
-        Some(sample)
-    }
-
-    /// Takes any reading of a signal; the sample it completes, if it is a good voltage.
+    /// Takes a reading of a signal; the sample it completes, if it is a good voltage.
     pub(crate) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
         let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
         self.has_usable_reading =

@@ -5,10 +5,6 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
-const PAPER_CURRENT_A: f64 = 1.325;
-/// Charging current of the example, A for 30 Ah (the source states a constant without its size; half the capacity per hour).
-const REFERENCE_CHARGE_A: f64 = 15.0;
 /// Discharge pulses of the example, A for 30 Ah: uniform in this range, 15 A mean.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 /// Length of a pulse, s.
@@ -60,13 +56,15 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        let current_a = PAPER_CURRENT_A * scale;
+        // Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
+        let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
     }
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        Self::new(settings, Load::Pulses(Box::new(load)), REFERENCE_CHARGE_A * scale)
+        // Charging current of the example, A for 30 Ah (the source states a constant without its size; half the capacity per hour).
+        Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }
 
     fn new(settings: &Settings, load: Load, charge_a: f64) -> Self {

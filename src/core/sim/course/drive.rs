@@ -7,30 +7,12 @@ use super::demand::Demand;
 use crate::sim::noise::Noise;
 use crate::sim::truth::Pack;
 
-/// Mass with two people, kg.
-const MASS_KG: f64 = 1900.0;
-/// Rolling resistance, fraction of weight.
-const ROLLING: f64 = 0.010;
-/// Half the air's density times drag coefficient times frontal area, kg/m.
-const DRAG_KG_PER_M: f64 = 0.5 * 1.2 * 0.25 * 2.3;
-/// Battery to wheel.
-const DRIVE_EFFICIENCY: f64 = 0.90;
-/// Wheel to battery.
-const REGEN_EFFICIENCY: f64 = 0.70;
 /// Power of all other consumers, W.
 const AUXILIARY_W: f64 = 600.0;
-/// Energy of the pack these numbers are for, Wh.
-const PACK_WH: f64 = 60_000.0;
-/// Voltage at which that energy is stated, V per cell.
-const NOMINAL_V: f64 = 3.65;
-/// Target speeds, km/h: town, country road, motorway.
-const SPEEDS_KMH: [f64; 8] = [0.0, 30.0, 50.0, 50.0, 70.0, 90.0, 110.0, 120.0];
 /// Strongest acceleration and braking, m/s^2.
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
 /// Limits of the power electronics, capacities per hour: regeneration and traction.
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
-/// A drive ends at this SOC with a charge, before its planned end.
-const RESERVE_SOC: f64 = 0.10;
 /// Fast charging ends here.
 const CHARGE_TO_SOC: f64 = 0.80;
 /// Fast charging current, capacities per hour: up to SOC 0.4, then falling in a line to the second at 0.8.
@@ -49,8 +31,6 @@ enum DayPhase {
     FastCharge,
 }
 
-/// Shortest sleep, s, when drives and charges have used up the time.
-const MIN_SLEEP_S: f64 = 60.0;
 /// Length of a day, s.
 const DAY_S: f64 = 86_400.0;
 
@@ -83,7 +63,8 @@ impl DayCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < RESERVE_SOC {
+        // A drive ends at this SOC with a charge, before its planned end.
+        if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < 0.10 {
             self.phase = DayPhase::FastCharge;
         }
         match self.phase {
@@ -102,7 +83,8 @@ impl DayCourse {
                 Demand::Current(self.charge_a(pack))
             }
             DayPhase::Park { until_s } => {
-                let duration_s = (until_s - self.day_s).max(MIN_SLEEP_S);
+                // Shortest sleep, s, when drives and charges have used up the time.
+                let duration_s = (until_s - self.day_s).max(60.0);
                 self.day_s += duration_s;
                 self.advance_plan(pack);
                 Demand::Asleep { duration_s }
@@ -126,16 +108,19 @@ impl DayCourse {
 
     fn drive_a(&mut self, pack: &Pack, dt_s: f64) -> f64 {
         if self.hold_s <= 0.0 {
-            self.target_m_s = self.noise.choose(&SPEEDS_KMH) / 3.6;
+            // Target speeds, km/h: town, country road, motorway.
+            self.target_m_s = self.noise.choose(&[0.0, 30.0, 50.0, 50.0, 70.0, 90.0, 110.0, 120.0]) / 3.6;
             self.hold_s = self.noise.between(15.0, 120.0);
         }
         self.hold_s -= dt_s;
         let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // 1 s to close the last difference
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
-        let capacities_per_hour = power_w(self.speed_m_s, acceleration) / PACK_WH;
+        // Energy of the pack these numbers are for, Wh.
+        let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        let current_c = capacities_per_hour * NOMINAL_V / (0.5 * (lowest_v + highest_v));
+        // Voltage at which that energy is stated, V per cell.
+        let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {
             return current_a;
@@ -156,7 +141,9 @@ fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
     if speed_m_s == 0.0 {
         return AUXILIARY_W;
     }
-    let force_n = MASS_KG * (acceleration_m_s2 + 9.81 * ROLLING) + DRAG_KG_PER_M * speed_m_s * speed_m_s;
+    // 1900 kg with two people; rolling resistance 1 % of the weight; density of air, drag coefficient and frontal area.
+    let force_n = 1900.0 * (acceleration_m_s2 + 9.81 * 0.010) + (0.5 * 1.2 * 0.25 * 2.3) * speed_m_s * speed_m_s;
     let wheel_w = force_n * speed_m_s;
-    AUXILIARY_W + if wheel_w > 0.0 { wheel_w / DRIVE_EFFICIENCY } else { wheel_w * REGEN_EFFICIENCY }
+    // Efficiency from battery to wheel, and back.
+    AUXILIARY_W + if wheel_w > 0.0 { wheel_w / 0.90 } else { wheel_w * 0.70 }
 }

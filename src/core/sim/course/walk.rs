@@ -7,20 +7,12 @@ use crate::sim::truth::Pack;
 
 /// The loads, A for 2.1 Ah.
 const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
-/// Length of a load that no voltage limit cuts short, s.
-const LOAD_S: f64 = 300.0;
 /// Voltage range of the walk, V (narrowed to the cell's own limits).
 const RANGE_V: (f64, f64) = (3.2, 4.2);
-/// Most draws for a load within the voltage range, then a rest: 12 loads, half of them of either sign.
-const MAX_DRAWS: u32 = 32;
 /// Reference current in both directions, A for 2.1 Ah.
 const REFERENCE_A: f64 = 2.0;
-/// Charging at constant voltage ends at this current, A for 2.1 Ah.
-const TAPER_END_A: f64 = 0.05;
 /// Rest after each half of a reference cycle, s.
 const REST_S: f64 = 1800.0;
-/// Reference cycles after each block of loads.
-const REFERENCE_CYCLES: u32 = 2;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum WalkPhase {
@@ -64,15 +56,18 @@ impl WalkCourse {
                     return Demand::Current(current_a);
                 }
                 if steps_left == 0 {
-                    return self.enter(WalkPhase::Charge { cycles_left: REFERENCE_CYCLES }, pack, dt_s);
+                    // Reference cycles after each block of loads.
+                    return self.enter(WalkPhase::Charge { cycles_left: 2 }, pack, dt_s);
                 }
                 let current_a = self.draw_load(pack, low_v, high_v);
-                self.phase = WalkPhase::Walk { steps_left: steps_left - 1, current_a, left_s: LOAD_S - dt_s };
+                // Length of a load that no voltage limit cuts short, s.
+                self.phase = WalkPhase::Walk { steps_left: steps_left - 1, current_a, left_s: 300.0 - dt_s };
                 Demand::Current(current_a)
             }
             WalkPhase::Charge { cycles_left } => {
                 let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
-                if current_a > -TAPER_END_A * self.scale {
+                // Charging at constant voltage ends at this current, A for 2.1 Ah.
+                if current_a > -0.05 * self.scale {
                     let rest = WalkPhase::Rest { is_full: true, cycles_left, left_s: REST_S };
                     return self.enter(rest, pack, dt_s);
                 }
@@ -113,7 +108,8 @@ impl WalkCourse {
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
-        (0..MAX_DRAWS)
+        // Most draws for a load within the voltage range, then a rest: 12 loads, half of them of either sign.
+        (0..32)
             .map(|_| self.scale * self.noise.choose(&LOADS_A))
             .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)
             .unwrap_or(0.0)

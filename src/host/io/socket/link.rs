@@ -32,10 +32,6 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 const READ_BATCH: usize = 64;
 /// Frames waiting to be sent: the status, health and alarm frames of a second, many times over.
 const SEND_QUEUE: usize = 256;
-/// A frame not sent after this long is out of date and is dropped.
-const SEND_MAX_AGE: Duration = Duration::from_millis(500);
-/// How often losses are reported: a stalled bus must not fill the journal.
-const REPORT_PERIOD: Duration = Duration::from_millis(250);
 
 /// Settings of a link.
 #[derive(Debug, Clone)]
@@ -138,7 +134,8 @@ impl Link {
     pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
-        let mut report = interval(REPORT_PERIOD);
+        // How often losses are reported: a stalled bus must not fill the journal.
+        let mut report = interval(Duration::from_millis(250));
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let health = Arc::<SharedHealth>::default();
         let output = LinkOutput { queue, unsent: Arc::clone(&unsent), health: Arc::clone(&health) };
@@ -326,7 +323,8 @@ impl Link {
     /// Sends what waits, if there is room; `false` = the socket is dead.
     async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
         let Some(outgoing) = open.pending.take() else { return true };
-        let useless = self.state != LinkState::Up || outgoing.since.elapsed() > SEND_MAX_AGE;
+        // A frame not sent after this long is out of date and is dropped.
+        let useless = self.state != LinkState::Up || outgoing.since.elapsed() > Duration::from_millis(500);
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
             Ok(()) => self.health.count(|counts| counts.sent += 1),

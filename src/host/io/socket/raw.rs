@@ -30,10 +30,6 @@ pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 /// buffers costs little when only one arrives.
 pub(super) const CALL_BATCH: usize = 16;
 
-/// Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
-const MEMINFO_NUMBERS: usize = 9;
-const MEMINFO_DROPS: usize = 8;
-
 /// Most filters the kernel takes (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
 
@@ -153,11 +149,12 @@ impl RawSocket {
     /// Frames this socket has lost since it was opened because its receive buffer was full, modulo 2^32; 0 where the kernel cannot
     /// say.
     pub(super) fn dropped_total(&self) -> u32 {
-        let mut bytes = [0; MEMINFO_NUMBERS * size_of::<u32>()];
+        // Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
+        let mut bytes = [0; 9 * size_of::<u32>()];
         let result = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
         let (numbers, _) = bytes.as_chunks();
         // A shorter answer leaves it zero.
-        result.map_or(0, |_| u32::from_ne_bytes(numbers[MEMINFO_DROPS]))
+        result.map_or(0, |_| u32::from_ne_bytes(numbers[8]))
     }
 
     /// Hands one frame to the kernel.

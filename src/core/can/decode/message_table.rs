@@ -1,17 +1,18 @@
-//! The bindings compiled for reading: message, page, and per signal shifts, factors and limits.
+//! The bindings as a decoder uses them: by message, page, and per signal shifts, factors and limits.
 //!
-//! In: frames. Out: the same readings as from [`Binding`], bit for bit, with fewer look-ups and branches. Rare cases take the
-//! binding's own path: floats, signals of 64 bits or over nine bytes, a scale that is 0 or not finite, several codes for
-//! "not available" between the good ones, a selector with too many codes for a table.
+//! In: frames. Out: readings. The codes of a [`Binding`] that give a value are found in advance; every other code, and signals
+//! that are not linear functions of such codes, are judged by the binding itself: floats, signals of 64 bits or over nine bytes,
+//! a scale that is 0 or not finite, several codes for "not available" between the good ones. A selector with too many codes for a
+//! table is read by each binding.
 
 use std::hint::cold_path;
 use std::ops::Range;
 use std::sync::Arc;
 
 use super::{Binding, Channel, MuxTest, Reading};
-use crate::can::Frame;
 use crate::can::id_table::IdTable;
 use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
+use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault};
 
 /// Most codes of a selector with a table: ten bits. Selectors have 4 to 8.
@@ -19,9 +20,9 @@ const MAX_CODES: u64 = 1024;
 /// Most entries of all tables of one message, so that wide ranges on many signals take little memory.
 const MAX_GROUPS: usize = 1 << 16;
 
-/// All messages, ready for reading.
+/// All messages.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct FastDecoder {
+pub(super) struct MessageTable {
     indices: IdTable,
     messages: Vec<MessageGroups>,
 }
@@ -29,6 +30,8 @@ pub(super) struct FastDecoder {
 /// One message.
 #[derive(Debug, Clone, PartialEq)]
 struct MessageGroups {
+    bus: BusIndex,
+    id: CanId,
     /// Every group of signals, in order.
     all: Vec<SignalGroup>,
     pages: Option<PageTable>,
@@ -38,7 +41,7 @@ struct MessageGroups {
 #[derive(Debug, Clone, PartialEq)]
 struct SignalGroup {
     /// The bindings, compiled; pages share the list.
-    signals: Arc<[FastSignal]>,
+    signals: Arc<[LinearSignal]>,
     /// Index of the first among all bindings.
     first: usize,
     /// Payloads of this length carry them all; [`NEVER`] where the binding must decide whether they are present.
@@ -83,7 +86,7 @@ impl BitPosition {
 
 /// One signal: conversion of good codes. Any other code is left to its binding. 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct FastSignal {
+struct LinearSignal {
     channel: Channel,
     position: BitPosition,
     /// The highest bit of a signed signal, 0 for an unsigned one: flipped and subtracted it extends the sign.
@@ -141,15 +144,25 @@ impl<'a> PayloadWords<'a> {
     }
 }
 
-impl FastDecoder {
-    /// Compiles bindings sorted by message and channel, and their runs.
-    pub(super) fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
-        let message = |run: &Range<usize>| (bindings[run.start].bus, bindings[run.start].id);
-        let messages: Vec<_> = runs.chunk_by(|a, b| message(a) == message(b)).collect();
-        Self {
-            indices: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
-            messages: messages.iter().map(|runs| MessageGroups::new(bindings, runs)).collect(),
+impl MessageTable {
+    /// A table of bindings sorted by message and channel.
+    pub(super) fn new(bindings: &[Binding]) -> Self {
+        let mut messages = Vec::new();
+        let mut end = 0;
+        for message in bindings.chunk_by(|a, b| (a.bus, a.id) == (b.bus, b.id)) {
+            let runs = message.chunk_by(|a, b| a.mux == b.mux).map(|run| {
+                end += run.len();
+                end - run.len()..end
+            });
+            let runs: Vec<_> = runs.collect();
+            messages.push(MessageGroups::new(bindings, &runs));
         }
+        Self { indices: IdTable::new(messages.iter().map(|message| (message.bus, message.id))), messages }
+    }
+
+    /// Every message and the number of its groups.
+    pub(super) fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
+        self.messages.iter().map(|message| (message.bus, message.id, message.all.len()))
     }
 
     /// See [`super::InputMap::decode`].
@@ -160,7 +173,7 @@ impl FastDecoder {
         for group in message.groups(&words) {
             if !words.has(group.bytes_needed) {
                 cold_path();
-                decode_plainly(&bindings[group.first..][..group.signals.len()], frame.data(), &mut each);
+                decode_one_by_one(&bindings[group.first..][..group.signals.len()], frame.data(), &mut each);
                 continue;
             }
             for (n, plan) in group.signals.iter().enumerate() {
@@ -169,7 +182,7 @@ impl FastDecoder {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
                     None => {
                         cold_path();
-                        let value = plain_value(&bindings[group.first + n], frame.data());
+                        let value = value_of(&bindings[group.first + n], frame.data());
                         each(Reading { channel: plan.channel, value });
                     }
                 }
@@ -178,29 +191,21 @@ impl FastDecoder {
     }
 }
 
-/// Whether the payload carries bindings that are present together.
-#[cold]
-#[inline(never)]
-fn present(bindings: &[Binding], payload: &[u8]) -> Result<bool, Fault> {
-    bindings.first().map_or(Ok(false), |first| first.holds(payload))
-}
-
 /// The value of a binding that is present.
 #[cold]
 #[inline(never)]
-fn plain_value(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
+fn value_of(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Readings of bindings that are present together, from the bindings themselves.
-#[inline(always)]
-pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
-    let present = present(bindings, payload);
+/// Readings of bindings that are present together, if they are.
+fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
+    let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
     if present == Ok(false) {
         return;
     }
     for binding in bindings {
-        let value = present.and_then(|_| plain_value(binding, payload));
+        let value = present.and_then(|_| value_of(binding, payload));
         each(Reading { channel: binding.channel, value });
     }
 }
@@ -210,7 +215,7 @@ impl SignalGroup {
     fn new(bindings: &[Binding], run: &Range<usize>) -> Self {
         let bindings = &bindings[run.clone()];
         let bytes_needed = bindings.iter().map(|binding| binding.plan.bytes_needed()).max().unwrap_or(0);
-        Self { signals: bindings.iter().map(FastSignal::new).collect(), first: run.start, bytes_needed }
+        Self { signals: bindings.iter().map(LinearSignal::new).collect(), first: run.start, bytes_needed }
     }
 
     /// The same group, whose presence its binding decides.
@@ -226,7 +231,8 @@ impl MessageGroups {
         let tests = |run: &Range<usize>| bindings[run.start].mux.len();
         let all =
             groups.into_iter().zip(runs).map(|(group, run)| if tests(run) > 0 { group.to_be_checked() } else { group });
-        Self { all: all.collect(), pages }
+        let first = &bindings[runs[0].start];
+        Self { bus: first.bus, id: first.id, all: all.collect(), pages }
     }
 
     #[inline]
@@ -287,7 +293,7 @@ fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
     tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }
 
-impl FastSignal {
+impl LinearSignal {
     fn new(binding: &Binding) -> Self {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let nothing = Self {

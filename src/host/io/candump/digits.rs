@@ -1,0 +1,82 @@
+//! Digits of a candump line, converted several bytes at a time: as lanes of a `u64`, the first byte lowest, or by loops that
+//! become vector instructions.
+
+/// Every byte of a word 1, and its highest bit.
+const ONES: u64 = 0x0101_0101_0101_0101;
+const HIGHS: u64 = 0x80 * ONES;
+
+/// Hex digit values; for anything else more than a number with such a digit in any place may be.
+pub(super) static HEX: [u32; 256] = {
+    let mut table = [u16::MAX as u32; 256];
+    let mut digit = 0;
+    while digit < 16 {
+        table[b"0123456789ABCDEF"[digit] as usize] = digit as u32;
+        table[b"0123456789abcdef"[digit] as usize] = digit as u32;
+        digit += 1;
+    }
+    table
+};
+
+/// Eight bytes of the text; zeros beyond its end, which no caller reaches.
+#[inline(always)]
+pub(super) fn word(text: &[u8], at: usize) -> u64 {
+    text.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |bytes| u64::from_le_bytes(*bytes))
+}
+
+/// Six digits and `) `, in nanoseconds.
+#[inline(always)]
+pub(super) fn six_decimals(text: u64) -> Option<i64> {
+    // Two zeros before the six digits make eight.
+    lanes(text ^ u64::from_le_bytes(*b"000000) "), 0x7F7F_7676_7676_7676).map(|digits| number::<1000>(digits << 16))
+}
+
+/// The number of eight digits, the first the highest.
+#[inline(always)]
+pub(super) fn eight_digits(text: u64) -> Option<i64> {
+    lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
+}
+
+/// The lanes, unless adding `wrong` brings one of them to 0x80 or more.
+#[inline(always)]
+fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
+    ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)
+}
+
+/// The number of eight lanes of 0 to 9, the first the highest, times `UNIT`; below 2^32 with it.
+#[inline(always)]
+fn number<const UNIT: u64>(digits: u64) -> i64 {
+    let pairs = (digits.wrapping_mul(10 << 8 | 1) >> 8) & 0x00FF_00FF_00FF_00FF;
+    let fours = (pairs.wrapping_mul(100 << 16 | 1) >> 16) & 0x0000_FFFF_0000_FFFF;
+    (fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32).cast_signed()
+}
+
+/// Eight bytes of two hex digits each, the first byte lowest. Loops over sixteen bytes: the compiler makes one instruction of
+/// each step.
+#[inline(always)]
+pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
+    let (mut values, mut wrong) = ([0; 16], [0; 16]);
+    for ((&byte, value), wrong) in text.iter().zip(&mut values).zip(&mut wrong) {
+        // 0 to 9 for a digit, at least 16 for anything else.
+        let digit = byte.wrapping_add(0xFF - b'9').saturating_sub(6).wrapping_sub(0xF0);
+        // 10 to 15 for a letter, at least 16 for anything else.
+        let letter = (byte & 0xDF).wrapping_sub(b'A').saturating_add(10);
+        *value = digit.min(letter);
+        *wrong = *value & 0xF0;
+    }
+    if u128::from_ne_bytes(wrong) != 0 {
+        return None;
+    }
+    let mut words = [word(&values, 0), word(&values, 8)];
+    // Step by step over both words, as above. Twelve bits up, the upper half of a byte comes to stand above the lower one.
+    for word in &mut words {
+        *word = (word.wrapping_mul(0x1001) >> 8) & 0x00FF_00FF_00FF_00FF;
+    }
+    for word in &mut words {
+        *word = (*word | *word >> 8) & 0x0000_FFFF_0000_FFFF;
+    }
+    for word in &mut words {
+        *word |= *word >> 16;
+    }
+    let [first, second] = words;
+    Some(first & 0xFFFF_FFFF | second << 32)
+}
