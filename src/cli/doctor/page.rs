@@ -7,10 +7,6 @@ use crate::cli::common::output;
 use crate::wiring::{Change, Severity, WiringFinding, WiringReport};
 use packwatch_host::failure::Failure;
 
-/// Width of the text without a terminal.
-const DEFAULT_WIDTH: usize = 100;
-/// Narrowest and widest text.
-const WIDTHS: (usize, usize) = (50, 120);
 /// Where the text of a finding begins.
 const INDENT: usize = 10;
 
@@ -36,12 +32,9 @@ impl Paint {
 pub(super) fn print(report: &WiringReport, config: &Path, source: &str) -> Result<(), Failure> {
     let is_terminal = std::io::stdout().is_terminal();
     let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
-    let width = if is_terminal {
-        ratatui::crossterm::terminal::size().map_or(DEFAULT_WIDTH, |(w, _)| usize::from(w))
-    } else {
-        DEFAULT_WIDTH
-    };
-    output::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
+    let width =
+        if is_terminal { ratatui::crossterm::terminal::size().map_or(100, |(w, _)| usize::from(w)) } else { 100 };
+    output::print(&render(report, config, source, width.clamp(50, 120), paint))
 }
 
 fn render(report: &WiringReport, config: &Path, source: &str, width: usize, paint: Paint) -> String {

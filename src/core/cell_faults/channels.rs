@@ -10,7 +10,6 @@ const FROZEN_V: f64 = 0.03;
 /// Fewest changes of the voltage in a row for a comparison with other channels, and rows in a row that must agree: with steps of
 /// 2.5 mV two of 96 cells agreed in three.
 const LEAST_CHANGES: u32 = 10;
-const DOUBLED_ROWS: u8 = 10;
 
 /// What is known of one channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -40,7 +39,7 @@ impl Channel {
 
     /// The channel whose values it shows.
     pub(super) fn doubled(&self) -> Option<u16> {
-        self.same_as.filter(|(_, rows)| *rows >= DOUBLED_ROWS).map(|(other, _)| other)
+        self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }
 
     /// Checks the numbers of a stored channel of a pack of this many cells.

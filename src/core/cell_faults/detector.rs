@@ -43,12 +43,8 @@ const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
 /// Least sum of squared steps for a resistance, squares of the capacity per hour.
 const LEAST_STEPS: f64 = 0.02;
-/// What a deviating resistance counts against a cell as the middle one, SOC: its voltage drop is not that of the others.
-const OFF_DROP: f64 = 0.1;
 /// Most that the mean cell's SOC may differ from what the charge says between two rows.
 const SOC_JUMP: f64 = 0.02;
-/// SOC at which a BMS bleeds: near the end of a charge.
-const BLED_SOC: f64 = 0.9;
 const DAY_S: f64 = 86_400.0;
 /// Kinds up to the last one that a cell may have.
 const CELL_KINDS: usize = CellFaultKind::TemperatureSensor as usize;
@@ -327,7 +323,8 @@ impl CellFaultDetector {
         let before = self.findings.clone();
         if self.observe(time, seconds, &row) {
             self.observe_temperatures(time, seconds);
-            let slope_v = || model.ocv_slope_v(&model.grid_position(BLED_SOC, row.temperature_c), capacity_ah);
+            // A BMS bleeds near the end of a charge.
+            let slope_v = || model.ocv_slope_v(&model.grid_position(0.9, row.temperature_c), capacity_ah);
             self.judge(time, is_balanced.then(slope_v));
         }
         self.cells.iter_mut().for_each(|cell| cell.sums.begin());
@@ -410,9 +407,7 @@ impl CellFaultDetector {
         let middle = Population::of(of_cells.iter().flatten().copied()).middle;
         let off = |cell: usize, soc: &Option<f64>| {
             let mean = self.cells[cell].difference.mean();
-            soc.map_or(f64::INFINITY, |soc| {
-                (soc - middle).abs() + OFF_DROP * (mean[RESISTANCE].abs() + mean[CONTACT].abs())
-            })
+            soc.map_or(f64::INFINITY, |soc| (soc - middle).abs() + 0.1 * (mean[RESISTANCE].abs() + mean[CONTACT].abs()))
         };
         let nearest = of_cells.iter().enumerate().min_by(|a, b| off(a.0, a.1).total_cmp(&off(b.0, b.1)));
         if let Some((cell, Some(_))) = nearest {

@@ -52,7 +52,6 @@ const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
 /// Usual loss of a cell that a BMS may bleed, standard deviation, fraction of the capacity in a day, and the time without a row from
 /// which on it may have lost much more, days (`open_charge`). With 0.01 a day, exchanged channels and modules drown in it.
 const BLED_PER_DAY: f64 = 0.002;
-const UNSEEN_DAYS: f64 = 0.04;
 /// Innovations, in deviations, beyond which a row counts less (Huber); beyond which it is odd (the mean, the steps); and how many odd ones
 /// in a row are a jump.
 const HUBER: f64 = 3.0;
@@ -184,7 +183,7 @@ impl Difference {
     /// Hours have passed unseen in which more may have been lost than is usual: where the row contradicts what is known, the charge
     /// has changed or the channel: the next drive shows which.
     pub(super) fn open_charge(&mut self, days: f64, observed: &Observation) {
-        if days >= UNSEEN_DAYS && self.deviations(observed).abs() > JUMP {
+        if days >= 0.04 && self.deviations(observed).abs() > JUMP {
             let lost = FIRST_STD[LEAK] * days;
             self.covariance[pair(SOC, SOC)] += lost * lost;
             self.covariance[pair(CHANNEL, CHANNEL)] += ALONE_STD[CHANNEL] * ALONE_STD[CHANNEL];

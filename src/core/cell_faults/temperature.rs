@@ -5,10 +5,6 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Time over which a warming counts as one of the load, s.
-const SLOW_S: f64 = 7200.0;
-/// Time after which what was seen counts half, s.
-const HALF_S: f64 = 5.0 * 86_400.0;
 /// Sum of squared warmings from which on a sensor is judged, K^2.
 const LEAST_K2: f64 = 30.0;
 /// Part of the pack's warming below which a sensor does not follow, and above which it does again.
@@ -30,13 +26,15 @@ impl Following {
     /// Takes the temperature of a row `seconds` after the one before; the warming, K: an offset of the sensor is none.
     pub(super) fn warming_k(&mut self, seconds: f64, here_c: f64) -> f64 {
         let slow_c = self.slow_c.get_or_insert(here_c);
-        *slow_c = here_c + libm::exp(-seconds.max(0.0) / SLOW_S) * (*slow_c - here_c);
+        // Time over which a warming counts as one of the load.
+        *slow_c = here_c + libm::exp(-seconds.max(0.0) / 7200.0) * (*slow_c - here_c);
         here_c - *slow_c
     }
 
     /// Compares the warming of a row with that in the middle of the pack.
     pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
-        let older = libm::exp2(-seconds.max(0.0) / HALF_S);
+        // After five days what was seen counts half.
+        let older = libm::exp2(-seconds.max(0.0) / (5.0 * 86_400.0));
         self.squares_k2 = older * self.squares_k2 + middle_k * middle_k;
         self.products_k2 = older * self.products_k2 + middle_k * here_k;
         if self.squares_k2 >= LEAST_K2 {

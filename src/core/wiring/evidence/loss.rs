@@ -7,9 +7,6 @@
 
 use crate::filter::median;
 
-/// Longest gap that counts as loss, cycles: a longer one is a pause.
-const LONGEST: f64 = 5.0;
-
 /// Counts of a signal.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LossCounter {
@@ -32,7 +29,8 @@ impl LossCounter {
             return;
         };
         let cycles = gap_s / cycle_s;
-        if cycles > LONGEST + 0.5 {
+        // A longer gap is a pause.
+        if cycles > 5.5 {
             return;
         }
         self.gaps = self.gaps.saturating_add(1);
@@ -40,7 +38,7 @@ impl LossCounter {
         let whole = cycles.round();
         if whole >= 1.0 && (cycles - whole).abs() <= 0.4 {
             self.regular = self.regular.saturating_add(1);
-            // At most LONGEST.
+            // At most 5.
             self.missing = self.missing.saturating_add(whole as u32 - 1);
         }
     }

@@ -129,12 +129,11 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
 
 /// Another number of parallel strings with which the resistance is the model's.
 fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
-    /// A cell's resistance differs from its model's by less than this factor.
-    const LIKE: f64 = 1.3;
     let by_string = ohm / f64::from(configured);
     // At most ODD_RATIO x 1024.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
-    let is_like = (fast / LIKE..=slow * LIKE).contains(&(by_string * f64::from(strings)));
+    // A cell's resistance differs from its model's by less than this factor.
+    let is_like = (fast / 1.3..=slow * 1.3).contains(&(by_string * f64::from(strings)));
     (is_like && strings != configured).then_some(strings)
 }
 

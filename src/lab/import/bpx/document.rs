@@ -90,8 +90,6 @@ type Above = (f64, f64);
 
 const POSITIVE: Above = (0.0, f64::MAX);
 const SHARE: Above = (0.0, 1.0);
-/// Activation energies, J/mol; 0 counts as not stated.
-const ENERGY: Above = (-f64::MIN_POSITIVE, 1e6);
 
 /// Reads the JSON.
 ///
@@ -173,7 +171,8 @@ impl<'a> Section<'a> {
 
     /// An activation energy, J/mol; 0 is as good as none.
     fn energy(&self, key: &str, faults: &mut Vec<String>) -> Option<f64> {
-        self.optional_number(key, ENERGY, faults).filter(|energy| *energy > 0.0)
+        // 0 counts as not stated.
+        self.optional_number(key, (-f64::MIN_POSITIVE, 1e6), faults).filter(|energy| *energy > 0.0)
     }
 
     fn optional_function(&self, key: &str, faults: &mut Vec<String>) -> Option<Function> {
