@@ -88,7 +88,7 @@ impl<'a> Samples<'a> {
     fn values(&self, layout: &SignalLayout, page: Option<u8>) -> Series {
         let Ok(plan) = layout.plan() else { return Series::default() };
         let of_page = self.payloads.iter().filter(|(_, data)| page.is_none() || data.first().copied() == page);
-        Series::of(of_page.map(|(time_s, data)| (*time_s, plan.decode(data).ok())))
+        Series::of(of_page.map(|(time_s, data)| (*time_s, plan.decode(data))))
     }
 }
 

@@ -180,7 +180,7 @@ fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
 
 impl LogSignal {
     fn is_mostly_valid(&self) -> bool {
-        let (good, bad) = (self.series.count() as f64, self.series.bad() as f64);
+        let (good, bad) = (self.series.count() as f64, self.series.invalid() as f64);
         good >= 0.8 * (good + bad)
     }
 

@@ -12,7 +12,7 @@ use super::log_signal::{LogSignal, SignalOrigin, longest_run};
 use crate::can::CanId;
 use crate::can::unit::Quantity;
 use crate::import::{DiagnosticSignal, NumberRange};
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Fault};
 use crate::wiring::evidence::Series;
 
 /// Name of a cell, before its number.
@@ -106,7 +106,7 @@ fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> Diagno
 }
 
 fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<LogSignal> {
-    let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, form.value(data)));
+    let readings = answers.payloads.iter().map(|(time_s, data)| (time_s, form.value(data).ok_or(Fault::OutOfRange)));
     let series = Series::of(readings);
     let quantity = match form.unit.as_str() {
         "degC" => Quantity::Temperature,

@@ -8,8 +8,8 @@ use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::import::{DiagnosticSignal, DiagnosticTable};
-use crate::quantity::Channel;
-use crate::wiring::evidence::{Series, SignalLabel};
+use crate::quantity::{Channel, Fault};
+use crate::wiring::evidence::{Series, SignalLabel, recorded_value};
 
 /// Fewest valid values of a signal; fewer are a coincidence.
 const MIN_VALUES: u64 = 2;
@@ -85,7 +85,7 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
             bus: key.0,
             origin: SignalOrigin::Dbc(file),
             label: SignalLabel::new(&message.name, &signal.name, &signal.unit),
-            series: Series::of(present.map(|(time_s, payload)| (time_s, binding.value(payload).ok()))),
+            series: Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, &binding)))),
             is_read_signed: false,
             conversion,
         })
@@ -123,7 +123,10 @@ fn of_definition(
 /// values at both ends of its codes together: a few negative amperes look like thousands.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
-        let value = |data: &[u8]| signal.value(data).map(|value| value * conversion.0 + conversion.1);
+        let value = |data: &[u8]| {
+            let value = signal.value(data).ok_or(Fault::OutOfRange)?;
+            Ok(value * conversion.0 + conversion.1)
+        };
         Series::of(answers.payloads.iter().map(|(time_s, data)| (time_s, value(data))))
     };
     let series = collect(signal);

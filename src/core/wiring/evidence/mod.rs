@@ -22,5 +22,5 @@ mod slope;
 
 pub use label::{PackQuantity, Score, SignalLabel};
 pub use sample::{Extent, ThinnedSample};
-pub use series::{Series, UnusableCounts};
+pub use series::{Series, UnusableCounts, recorded_value};
 pub use slope::Slope;

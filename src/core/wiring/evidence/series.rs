@@ -70,15 +70,16 @@ impl Series {
         Some(value)
     }
 
-    /// The values of a recorded signal; `None` = a reading without a value.
-    pub fn of(readings: impl Iterator<Item = (f64, Option<f64>)>) -> Self {
+    /// The values of a recorded signal with their times, s.
+    pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
         // Enough for a correlation, few enough for thousands of signals.
-        let sample = ThinnedSample::of_at_most(1500);
+        let sample = ThinnedSample::of_at_most(4096);
         let mut series = Self { values: sample.clone(), times_s: sample, ..Self::default() };
         for (time_s, value) in readings {
-            match value.filter(|value| value.is_finite()) {
-                Some(value) => series.push(Timestamp::from_secs(time_s), value, f64::INFINITY),
-                None => series.unusable.not_available += 1,
+            match value {
+                Ok(value) if value.is_finite() => series.push(Timestamp::from_secs(time_s), value, f64::INFINITY),
+                Err(Fault::NotAvailable) => series.unusable.not_available += 1,
+                Ok(_) | Err(_) => series.unusable.short += 1,
             }
         }
         series
@@ -122,9 +123,7 @@ impl Series {
             return Ok(None);
         }
         let raw = binding.plan.raw(payload)?;
-        // All ones outside the range customarily mean "not available", even without an entry in the value table.
-        let is_customary = raw == binding.plan.all_ones() && binding.plan.decode(payload) == Err(Fault::OutOfRange);
-        if binding.not_available.contains(&raw) || is_customary {
+        if binding.not_available.contains(&raw) || is_customary(payload, binding) {
             return Err(Fault::NotAvailable);
         }
         Ok(Some(binding.plan.physical(payload)? * binding.scale + binding.offset))
@@ -165,7 +164,12 @@ impl Series {
 
     /// Readings without a value: outside the range, too short, not available.
     pub fn bad(&self) -> u64 {
-        self.unusable.short + self.unusable.not_available + self.unusable.not_finite
+        self.invalid() + self.unusable.not_available
+    }
+
+    /// Those of them that do not say "not available".
+    pub fn invalid(&self) -> u64 {
+        self.unusable.short + self.unusable.not_finite
     }
 
     /// Whether all values are equal.
@@ -193,4 +197,17 @@ impl Series {
     pub fn largest_step(&self) -> f64 {
         self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)
     }
+}
+
+/// The value of a recorded payload, within the DBC's range.
+///
+/// # Errors
+/// Why there is none.
+pub fn recorded_value(payload: &[u8], binding: &Binding) -> Result<f64, Fault> {
+    if is_customary(payload, binding) { Err(Fault::NotAvailable) } else { binding.value(payload) }
+}
+
+/// All ones outside the range customarily mean "not available", even without an entry in the value table.
+fn is_customary(payload: &[u8], binding: &Binding) -> bool {
+    binding.plan.raw(payload) == Ok(binding.plan.all_ones()) && binding.plan.decode(payload) == Err(Fault::OutOfRange)
 }

@@ -125,9 +125,8 @@ mod tests {
     #[test]
     fn recorded_signals_of_different_rates_give_the_resistance() {
         let current = |time_s: f64| (3.0 * time_s).sin() * 40.0;
-        let fast = Series::of((0..2000).map(|n| f64::from(n) * 0.01).map(|t| (t, Some(current(t)))));
-        let slow =
-            Series::of((0..100).map(|n| f64::from(n) * 0.2).map(|t| (t + 0.001, Some(380.0 - 0.1 * current(t)))));
+        let fast = Series::of((0..2000).map(|n| f64::from(n) * 0.01).map(|t| (t, Ok(current(t)))));
+        let slow = Series::of((0..100).map(|n| f64::from(n) * 0.2).map(|t| (t + 0.001, Ok(380.0 - 0.1 * current(t)))));
         let slope = Slope::between(&slow, &fast).unwrap();
         assert!((slope.ohm - 0.1).abs() < 0.005 && slope.correlation() < -0.99, "{slope:?}");
         let turned = Slope::between(&fast, &slow).unwrap();
