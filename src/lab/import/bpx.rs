@@ -31,6 +31,9 @@ const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 /// Temperatures of the tables, K from the file's reference temperature.
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
+/// Standard deviation of the voltage error at rest and the reference temperature, V: a cell differs from its parameters.
+const ERROR_AT_REST_V: f64 = 0.010;
+
 /// Share of the voltage drop at the nominal capacity in one hour that counts as error: the closed forms hold for small currents.
 const ERROR_OF_DROP: f64 = 0.3;
 
@@ -102,7 +105,7 @@ impl Model {
             return Err(vec![fault]);
         }
         let error_v = |from_reference: f64, of: &Resistances| {
-            let at_rest_v = 0.010 + 0.0003 * from_reference.abs();
+            let at_rest_v = ERROR_AT_REST_V + 0.0003 * from_reference.abs();
             at_rest_v.hypot(ERROR_OF_DROP * of.settled_ohm() * cell.nominal_ah).min(0.5)
         };
         let errors = TEMPERATURES_K.iter().zip(&resistances);
