@@ -3,19 +3,18 @@
 //! | file | content |
 //! | --- | --- |
 //! | `pattern`, `answers`, `signals` | signals looked up in the DBC files and diagnostic answers |
-//! | `cross`, `alarm`, `label`, `modules` | keys that concern each other, and the cell model |
+//! | `cross`, `alarm`, `cells` | keys that concern each other, and the cell models |
 //! | `input_tables`, `plausible` | faulty tables checked as far as they go; what cannot be meant |
 //! | `protect`, `output`, `commands`, `j1939`, `polling` | frames that are checked, sent, asked for |
 //! | `monitor` | the settings of the core |
 
 mod alarm;
 mod answers;
+pub(crate) mod cells;
 pub(crate) mod commands;
 pub(crate) mod cross;
 pub(crate) mod input_tables;
 pub(crate) mod j1939;
-pub(crate) mod label;
-pub(crate) mod modules;
 pub(crate) mod monitor;
 pub(crate) mod output;
 mod pattern;
@@ -26,4 +25,4 @@ pub(crate) mod signals;
 
 pub(crate) use pattern::Pattern;
 pub(crate) use polling::answers;
-pub(crate) use signals::{Checks, Databases, NamedSignal, ResolvedSignal, channel_words, input_map, ranges};
+pub(crate) use signals::{Databases, NamedSignal, ResolvedSignal, channel_words, input_map, ranges};

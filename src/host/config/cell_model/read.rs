@@ -22,16 +22,16 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
 /// # Errors
 /// Every fault found, one line each.
 pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
-    let mut faults = Faults::default();
-    let model = load_with(path, &read_file, &mut faults);
-    model.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+    let faults = Faults::default();
+    let model = load_with(path, &read_file, &faults);
+    model.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
 /// As [`load_sourced`], through `read`; faults are noted with those of other files.
-pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<SourcedModel> {
+pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<SourcedModel> {
     let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
     let document = Document::parse(&sources, faults);
-    let mut reader = SchemaReader::new(&document, SECTIONS, faults);
+    let reader = SchemaReader::new(&document, SECTIONS);
     let head = reader.one::<Head>();
     let measured = reader.optional::<Measured>();
     let tables = reader.one::<Tables>();
@@ -39,32 +39,49 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let electrodes = reader.optional::<ElectrodesKeys>();
     let spread = reader.optional::<SpreadKeys>();
     let thermal = reader.optional::<ThermalKeys>();
-    let written = reader.count(BranchTables::PATH);
-    if let Some(head) = &head {
-        check_head(head, faults);
-    }
-    if let Some(measured) = &measured {
-        check_measured(measured, faults);
-    }
+    head.iter().for_each(check_head);
+    measured.iter().for_each(check_measured);
     let tables = tables?;
-    check_tables(&tables, faults);
-    check_branch_count(&tables.place, written, faults);
-    check_branches(&tables, &branches, faults);
-    if let Some(spread) = &spread {
-        check_spread(spread, &tables, faults);
+    check_tables(&tables);
+    let written = reader.count(BranchTables::PATH);
+    if written == 0 || written > MAX_BRANCHES {
+        let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
+        tables.place.note("branches", what);
     }
+    for branch in &branches {
+        check_shape(&branch.place, "r_ohm", &branch.r_ohm, &tables);
+        check_shape(&branch.place, "c_farad", &branch.c_farad, &tables);
+    }
+    spread.iter().for_each(|spread| check_spread(spread, &tables));
     let head = head?;
-    let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), spread.as_ref(), faults);
+    let mut aged_ocv = ageing(&head, &tables, electrodes.as_ref(), faults);
+    if let Some([a, b]) = spread.as_ref().map(|keys| keys.curve_modes_v.as_slice())
+        && faults.is_empty()
+    {
+        aged_ocv.add_spread(&[a.clone(), b.clone()]);
+    }
     let source = ModelSource {
         state: ModelState::Given,
-        chemistry: head.chemistry.clone(),
+        chemistry: head.chemistry,
         measured: measured.map_or_else(MeasuredRange::default, |keys| keys.range()),
         provenance: provenance(path, read),
         learned: None,
     };
     let model = CellModel {
+        name: head.name,
+        rated_capacity_ah: head.rated_capacity_ah,
+        capacity_ah: head.capacity_ah,
+        voltage_min_v: head.voltage_min_v,
+        voltage_max_v: head.voltage_max_v,
+        soc: tables.soc,
+        temperature_c: tables.temperature_c,
+        aged_ocv,
+        ocv_v: Table { values: tables.ocv_v },
+        r0_ohm: Table { values: tables.r0_ohm },
+        branches: branches.iter().map(BranchTables::config).collect(),
+        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
+        thermal: thermal.map(|keys| keys.config()),
         spread: spread.map(|keys| keys.config()),
-        ..model(head, tables, aged_ocv, &branches, thermal.as_ref())
     };
     Some(SourcedModel { model, source })
 }
@@ -87,24 +104,8 @@ impl Measured {
     }
 }
 
-/// How the open-circuit curve ages, with the modes of its spread; notes what no cell can have. Only sound tables are used.
-fn aged_ocv(
-    head: &Head,
-    tables: &Tables,
-    electrodes: Option<&ElectrodesKeys>,
-    spread: Option<&SpreadKeys>,
-    faults: &mut Faults,
-) -> AgedOcv {
-    let mut aged_ocv = ageing(head, tables, electrodes, faults);
-    if faults.is_empty()
-        && let Some([a, b]) = spread.map(|keys| keys.curve_modes_v.as_slice())
-    {
-        aged_ocv.add_spread(&[a.clone(), b.clone()]);
-    }
-    aged_ocv
-}
-
-fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &mut Faults) -> AgedOcv {
+/// How the open-circuit curve ages; notes what no cell can have. Only sound tables are used.
+fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &Faults) -> AgedOcv {
     if !faults.is_empty() {
         return AgedOcv::default();
     }
@@ -113,125 +114,83 @@ fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, fau
         return AgedOcv::of_shift(head.ocv_ageing_shift.unwrap_or(0.0), soc, head.capacity_ah, rows);
     };
     if head.ocv_ageing_shift.is_some() {
-        head.place.fault(faults, "ocv_ageing_shift", "must not be given together with [electrodes]");
+        head.place.fault("ocv_ageing_shift", "must not be given together with [electrodes]");
     }
     let (positive, negative) = (&keys.positive_content, &keys.negative_content);
     for (key, contents, rises) in [("positive_content", positive, false), ("negative_content", negative, true)] {
         let [empty, full] = ends(contents);
         if contents.len() != 2 || empty == full || (full > empty) != rises {
             let first = if rises { "lower" } else { "higher" };
-            keys.place.fault(faults, key, &format!("must be two numbers, empty and full, the {first} first"));
+            keys.place.fault(key, format!("must be two numbers, empty and full, the {first} first"));
         }
     }
     if !faults.is_empty() {
         return AgedOcv::default();
     }
     AgedOcv::of_electrodes(&keys.config(), soc, head.capacity_ah, rows).unwrap_or_else(|| {
-        keys.place.note(faults, "positive_content", "these electrodes do not say how the cell ages");
+        keys.place.note("positive_content", "these electrodes do not say how the cell ages");
         AgedOcv::default()
     })
 }
 
-fn model(
-    head: Head,
-    tables: Tables,
-    aged_ocv: AgedOcv,
-    branches: &[BranchTables],
-    thermal: Option<&ThermalKeys>,
-) -> CellModel {
-    CellModel {
-        name: head.name,
-        rated_capacity_ah: head.rated_capacity_ah,
-        capacity_ah: head.capacity_ah,
-        voltage_min_v: head.voltage_min_v,
-        voltage_max_v: head.voltage_max_v,
-        soc: tables.soc,
-        temperature_c: tables.temperature_c,
-        aged_ocv,
-        ocv_v: Table { values: tables.ocv_v },
-        r0_ohm: Table { values: tables.r0_ohm },
-        branches: branches.iter().map(BranchTables::config).collect(),
-        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
-        thermal: thermal.map(|keys| keys.config()),
-        spread: None,
-    }
-}
-
-fn check_head(head: &Head, faults: &mut Faults) {
+fn check_head(head: &Head) {
     if head.voltage_max_v <= head.voltage_min_v {
-        let what = format!("must be above voltage_min_v = {}", head.voltage_min_v);
-        head.place.fault(faults, "voltage_max_v", &what);
+        head.place.fault("voltage_max_v", format!("must be above voltage_min_v = {}", head.voltage_min_v));
     }
 }
 
-fn check_measured(measured: &Measured, faults: &mut Faults) {
+fn check_measured(measured: &Measured) {
     let Measured { temperature_c, current_a, soc, place, .. } = measured;
     for (key, range) in [("temperature_c", temperature_c), ("current_a", current_a), ("soc", soc)] {
         if range.as_ref().is_some_and(|range| range.len() != 2 || range[0] > range[1]) {
-            place.fault(faults, key, "must be two numbers, the lower first");
+            place.fault(key, "must be two numbers, the lower first");
         }
     }
 }
 
-fn check_tables(tables: &Tables, faults: &mut Faults) {
+fn check_tables(tables: &Tables) {
     let place = &tables.place;
     if tables.soc.len() < 2 || tables.soc.first() != Some(&0.0) || tables.soc.last() != Some(&1.0) {
-        place.fault(faults, "soc", "must begin with 0 and end with 1");
+        place.fault("soc", "must begin with 0 and end with 1");
     }
     if tables.temperature_c.is_empty() {
-        place.fault(faults, "temperature_c", "must have at least one temperature");
+        place.fault("temperature_c", "must have at least one temperature");
     }
     for (key, values) in [("soc", &tables.soc), ("temperature_c", &tables.temperature_c)] {
         if let Some((a, b)) = first_not_rising(values) {
-            place.note(faults, key, &format!("{b} follows {a}, must rise strictly"));
+            place.note(key, format!("{b} follows {a}, must rise strictly"));
         }
     }
-    check_shape(place, "ocv_v", &tables.ocv_v, tables, faults);
-    check_shape(place, "r0_ohm", &tables.r0_ohm, tables, faults);
+    check_shape(place, "ocv_v", &tables.ocv_v, tables);
+    check_shape(place, "r0_ohm", &tables.r0_ohm, tables);
     if let Some(voltage_error_v) = &tables.voltage_error_v {
-        check_shape(place, "voltage_error_v", voltage_error_v, tables, faults);
+        check_shape(place, "voltage_error_v", voltage_error_v, tables);
     }
     for (row, t) in tables.ocv_v.iter().zip(&tables.temperature_c) {
         if let Some((a, b)) = first_not_rising(row) {
-            place.note(faults, "ocv_v", &format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));
+            place.note("ocv_v", format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));
         }
     }
 }
 
-fn check_branch_count(place: &TablePlace, written: usize, faults: &mut Faults) {
-    if written == 0 || written > MAX_BRANCHES {
-        let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
-        place.note(faults, "branches", &what);
-    }
-}
-
-fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Faults) {
-    for branch in branches {
-        check_shape(&branch.place, "r_ohm", &branch.r_ohm, tables, faults);
-        check_shape(&branch.place, "c_farad", &branch.c_farad, tables, faults);
-    }
-}
-
-fn check_spread(spread: &SpreadKeys, tables: &Tables, faults: &mut Faults) {
+fn check_spread(spread: &SpreadKeys, tables: &Tables) {
     let (modes, socs) = (&spread.curve_modes_v, tables.soc.len());
     if modes.len() != 2 || modes.iter().any(|mode_v| mode_v.len() != socs) {
         let counts: Vec<String> = modes.iter().map(|mode_v| mode_v.len().to_string()).collect();
         let what = format!("rows of {} values, must be two rows of {socs}, one value per soc", counts.join(" and "));
-        spread.place.note(faults, "curve_modes_v", &what);
+        spread.place.note("curve_modes_v", &what);
     }
 }
 
 /// No hole: as many rows as temperatures, as many columns as SOC breakpoints.
-fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables, faults: &mut Faults) {
+fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables) {
     let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
     if rows.len() != temperatures {
-        let what = format!("{} rows, must be {temperatures}, one per temperature_c", rows.len());
-        place.note(faults, key, &what);
+        place.note(key, format!("{} rows, must be {temperatures}, one per temperature_c", rows.len()));
     }
     for (number, row) in (1..).zip(rows) {
         if row.len() != socs {
-            let what = format!("row {number} has {} values, must be {socs}, one per soc", row.len());
-            place.note(faults, key, &what);
+            place.note(key, format!("row {number} has {} values, must be {socs}, one per soc", row.len()));
         }
     }
 }

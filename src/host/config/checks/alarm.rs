@@ -1,6 +1,5 @@
 //! The keys of `[[alarm]]`: what must fit together, and the rules they make.
 
-use crate::config::document::Faults;
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
 use crate::config::schema::{Level, Threshold};
@@ -103,30 +102,28 @@ fn beyond_sign(rule: Rule) -> f64 {
 }
 
 /// Notes keys of the alarms that do not fit together.
-pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>, faults: &mut Faults) {
+pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
         for (key, severity, _) in alarm.thresholds() {
             let same = |other: &&Alarm| other.rule == alarm.rule && other.thresholds().any(|(_, s, _)| s == severity);
             if let Some(twin) = raw.alarms[..index].iter().find(same) {
                 let line = twin.place.at.beside(place.line_of(key));
-                let what = format!("must be one per rule, {} in {line} has one", twin.place.path);
-                place.fault(faults, key, &what);
+                place.fault(key, format!("must be one per rule, {} in {line} has one", twin.place.path));
             }
         }
-        check_needs(alarm, raw, faults);
+        check_needs(alarm, raw);
         if alarm.thresholds().next().is_none() {
-            let text = format!("{} has no threshold, must have info, warning or severe", place.path);
-            faults.add_at(&place.at, text);
+            place.table_fault("has no threshold, must have info, warning or severe");
         }
         if let Some(rated) = rated {
-            check_thresholds(alarm, rated, faults);
+            check_thresholds(alarm, rated);
         }
     }
 }
 
 /// Notes what a rule needs from the rest of the file and is missing.
-fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
+fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
     let missing = match alarm.rule {
@@ -140,7 +137,7 @@ fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
         _ => "",
     };
     if !missing.is_empty() {
-        alarm.place.fault(faults, "rule", missing);
+        alarm.place.fault("rule", missing);
     }
     let is_raw_period = alarm.rule == Rule::RechargePeriodLow
         && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
@@ -150,44 +147,43 @@ fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
         } else {
             "must be \"mean\": the value of this rule has no standard deviation"
         };
-        alarm.place.fault(faults, "when", what);
+        alarm.place.fault("when", what);
     }
 }
 
 /// Each clear threshold on the healthy side, each more severe threshold further out.
-fn check_thresholds(alarm: &Alarm, rated: &RatedCell, faults: &mut Faults) {
+fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };
     let mut milder: Option<(&str, f64)> = None;
     for (key, _, threshold) in alarm.thresholds() {
         let Some(set) = rated.value(alarm.rule, threshold.set) else {
-            place.fault(faults, key, "must be a number: nothing is 100 % for this rule");
+            place.fault(key, "must be a number: nothing is 100 % for this rule");
             continue;
         };
-        check_unit(alarm, key, set, faults);
+        check_unit(alarm, key, set);
         match threshold.clear.map(|clear| rated.value(alarm.rule, clear)) {
-            Some(None) => place.fault(faults, key, "must clear at a number: nothing is 100 % for this rule"),
+            Some(None) => place.fault(key, "must clear at a number: nothing is 100 % for this rule"),
             Some(Some(clear)) if sign * (clear - set) > 0.0 => {
-                let what = format!("must clear at {set} or {side} it, on the healthy side, not at {clear}");
-                place.fault(faults, key, &what);
+                place.fault(key, format!("must clear at {set} or {side} it, on the healthy side, not at {clear}"));
             }
             Some(Some(_)) | None => {}
         }
-        check_reachable(alarm, key, rated, set, &threshold, faults);
+        check_reachable(alarm, key, rated, set, &threshold);
         if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
             let beyond = if sign > 0.0 { "above" } else { "below" };
-            place.fault(faults, key, &format!("must be {beyond} {other} = {value}: it is the graver one"));
+            place.fault(key, format!("must be {beyond} {other} = {value}: it is the graver one"));
         }
         milder = Some((key, set));
     }
 }
 
 /// Notes an alarm that no value can clear: it would stay for ever.
-fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold, faults: &mut Faults) {
+fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if lasts_only_while_there(alarm.rule) {
         if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
-            alarm.place.fault(faults, written, "must not be given: it is cleared at 0, when all is in order again");
+            alarm.place.fault(written, "must not be given: it is cleared at 0, when all is in order again");
         }
         return;
     }
@@ -200,18 +196,14 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     let is_within = (0.0..=high).contains(&set); // otherwise there is a fault already, or it is never raised
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
-        alarm.place.fault(
-            faults,
-            written,
-            &format!("must leave a value that clears {key} within {range}, not {clear}"),
-        );
+        alarm.place.fault(written, format!("must leave a value that clears {key} within {range}, not {clear}"));
     }
 }
 
 /// Notes a percent written without its sign: such a threshold is always or never passed.
-fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
+fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {
-        alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
+        alarm.place.fault(key, "must be 0 to 1, or a text like \"20 %\"");
     }
 }

@@ -8,7 +8,6 @@ use crate::can::dbc::{FrameFormat, Message, Signal};
 use crate::can::isotp::MAX_MESSAGE;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::uds::{Controller, Question, Service};
-use crate::config::document::Faults;
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{AnswerSignalKeys, DiagnosticInput, WireOrder};
 use crate::quantity::BusIndex;
@@ -82,39 +81,39 @@ impl AnswerPlace<'_> {
 }
 
 /// The answers of all tables; those with a fault are noted and left out.
-pub(crate) fn definitions(raw: &RawTables, faults: &mut Faults) -> Vec<AnswerDefinition> {
-    raw.diagnostics.iter().filter_map(|keys| definition(keys, faults)).collect()
+pub(crate) fn definitions(raw: &RawTables) -> Vec<AnswerDefinition> {
+    raw.diagnostics.iter().filter_map(|keys| definition(keys)).collect()
 }
 
-fn definition(keys: &DiagnosticInput, faults: &mut Faults) -> Option<AnswerDefinition> {
-    let before = faults.len();
+fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {
+    let before = keys.place.faults.len();
     let Some(service) = Service::from_code(keys.service) else {
-        keys.place.fault(faults, "service", "must be 0x01, 0x21 or 0x22: services that only read");
+        keys.place.fault("service", "must be 0x01, 0x21 or 0x22: services that only read");
         return None;
     };
     if service.identifier_bytes() == 1 && keys.identifier > 0xFF {
-        keys.place.fault(faults, "identifier", "must be 0 to 0xFF with this service");
+        keys.place.fault("identifier", "must be 0 to 0xFF with this service");
     }
     let (request, response) = (can_id(keys.request), can_id(keys.response));
     if request == response {
-        keys.place.fault(faults, "response", "must not be the identifier of the requests");
+        keys.place.fault("response", "must not be the identifier of the requests");
     }
     let head = 1 + service.identifier_bytes();
     let (mut signals, mut first_bytes) = (Vec::new(), Vec::new());
     for signal in &keys.signals.0 {
-        for (name, bit) in numbered(signal, faults) {
+        for (name, bit) in numbered(signal) {
             let bit = usize::try_from(bit).unwrap_or(usize::MAX);
             if (bit + usize::from(signal.length)).div_ceil(8) + head > MAX_MESSAGE {
-                signal.place.fault(faults, "bit", &format!("must lie within an answer of {MAX_MESSAGE} bytes"));
+                signal.place.fault("bit", format!("must lie within an answer of {MAX_MESSAGE} bytes"));
                 break;
             }
             if signals.iter().any(|other: &Signal| other.name == name) {
-                signal.place.fault(faults, "name", &format!("must be unique in its answer, {name} is there already"));
+                signal.place.fault("name", format!("must be unique in its answer, {name} is there already"));
             }
             signals.push(as_in_a_dbc(signal, name, bit));
             first_bytes.push(bit / 8);
         }
-        check_numbers(signal, faults);
+        check_numbers(signal);
     }
     let message = Message {
         id: response,
@@ -129,7 +128,7 @@ fn definition(keys: &DiagnosticInput, faults: &mut Faults) -> Option<AnswerDefin
         repetition: Default::default(),
         comment: None,
     };
-    (faults.len() == before).then(|| AnswerDefinition {
+    (keys.place.faults.len() == before).then(|| AnswerDefinition {
         table: keys.place.path.clone(),
         request: (request, keys.request_extension),
         response: (response, keys.response_extension),
@@ -150,17 +149,17 @@ fn can_id(raw: u32) -> CanId {
 }
 
 /// Name and first bit of each signal that a line stands for.
-fn numbered(keys: &AnswerSignalKeys, faults: &mut Faults) -> Vec<(String, u64)> {
+fn numbered(keys: &AnswerSignalKeys) -> Vec<(String, u64)> {
     let first = u64::from(keys.bit);
     let has_number = keys.name.contains("{n}");
     let Some(numbers) = keys.numbers.as_ref() else {
         if has_number {
-            keys.place.fault(faults, "name", "has {n}, must have `numbers` that it counts through");
+            keys.place.fault("name", "has {n}, must have `numbers` that it counts through");
         }
         return vec![(keys.name.clone(), first)];
     };
     if !has_number {
-        keys.place.fault(faults, "name", "must have {n} in place of the number");
+        keys.place.fault("name", "must have {n} in place of the number");
         return Vec::new();
     }
     let step = u64::from(keys.step.unwrap_or(keys.length.into()));
@@ -168,24 +167,24 @@ fn numbered(keys: &AnswerSignalKeys, faults: &mut Faults) -> Vec<(String, u64)> 
     numbers.0.clone().zip(0_u64..).map(|(number, index)| (name(number), first + index * step)).collect()
 }
 
-fn check_numbers(keys: &AnswerSignalKeys, faults: &mut Faults) {
+fn check_numbers(keys: &AnswerSignalKeys) {
     let is_whole = keys.bit.is_multiple_of(8)
         && keys.length.is_multiple_of(8)
         && keys.step.is_none_or(|step| step.is_multiple_of(8));
     if keys.byte_order == WireOrder::Little && !is_whole {
-        keys.place.fault(faults, "byte_order", "must be \"big\" for a signal that is not of whole bytes");
+        keys.place.fault("byte_order", "must be \"big\" for a signal that is not of whole bytes");
     }
     if keys.factor == 0.0 {
-        keys.place.fault(faults, "factor", "must not be 0");
+        keys.place.fault("factor", "must not be 0");
     }
     if let (Some(minimum), Some(maximum)) = (keys.minimum, keys.maximum)
         && minimum >= maximum
     {
-        keys.place.fault(faults, "maximum", &format!("must be above minimum = {minimum}"));
+        keys.place.fault("maximum", format!("must be above minimum = {minimum}"));
     }
     let largest = u64::MAX >> (64 - u32::from(keys.length.clamp(1, 64)));
     if keys.not_available.iter().any(|&code| code > largest) {
-        keys.place.fault(faults, "not_available", &format!("must be 0 to {largest:#X}, the signal's codes"));
+        keys.place.fault("not_available", format!("must be 0 to {largest:#X}, the signal's codes"));
     }
 }
 

@@ -1,61 +1,53 @@
 //! Commands from the bus: `[commands]` to the plan that reads them and the guard that checks them.
 
-use super::signals::{Checks, check_no_input};
+use super::signals::{ResolvedSignal, check_no_input};
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::CheckConfig;
 use crate::can::encode::CommandPlan;
 use crate::can::guard::GuardConfig;
-use crate::config::document::Faults;
+use crate::config::schema::RawTables;
 use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
 /// The plan that reads commands, and the guard that checks them where they are not authenticated; `None` = commands are off,
 /// or faults are noted.
 pub(crate) fn commands(
-    checks: &mut Checks<'_>,
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
     output: Option<&(OutputConfig, Database)>,
 ) -> Option<(CommandConfig, Option<GuardConfig>)> {
-    let raw = checks.raw;
     let keys = raw.commands.as_ref().filter(|commands| commands.enabled)?;
     if !raw.is_written::<Output>() || raw.is_output_disabled() {
-        keys.place.fault(
-            checks.faults,
-            "enabled",
-            "must have a table [output] that is enabled: the outcome of a command is sent",
-        );
+        keys.place.fault("enabled", "must have a table [output] that is enabled: the outcome of a command is sent");
     }
-    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place, checks.faults)?;
+    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place)?;
     let (output, database) = output?;
-    let note = |error: &String, faults: &mut Faults| keys.place.fault(faults, "enabled", error);
-    let plan = CommandPlan::new(database).map_err(|all| all.0.iter().for_each(|e| note(e, checks.faults))).ok()?;
+    let note = |error: &String| keys.place.fault("enabled", error);
+    let plan = CommandPlan::new(database).map_err(|all| all.0.iter().for_each(note)).ok()?;
     let secoc = plan.authentication();
     let Some(data_id) = secoc.map(|secoc| secoc.data_id).or(plan.protection().map(|protection| protection.data_id))
     else {
         let what = "must be \"1A\", \"1C\" or \"5\", or have secoc beside it: commands are never taken unprotected";
-        keys.place.fault(checks.faults, "e2e", what);
+        keys.place.fault("e2e", what);
         return None;
     };
     if secoc.is_some() && plan.protection().is_some() {
-        keys.place.fault(
-            checks.faults,
-            "e2e",
-            "must not be given with secoc: the authenticator finds all that a checksum finds",
-        );
+        keys.place.fault("e2e", "must not be given with secoc: the authenticator finds all that a checksum finds");
     }
     if secoc.is_some() && output.plan.freshness().is_none() {
-        keys.place.fault(checks.faults, "secoc", "must have the message PACKWATCH_Freshness in output.dbc");
+        keys.place.fault("secoc", "must have the message PACKWATCH_Freshness in output.dbc");
     }
     let id = plan.id();
     if output.buses.contains(&bus) && output.plan.ids().contains(&id) {
-        keys.place.fault(checks.faults, "id", &format!("must not be that of a frame that is sent, {id}"));
+        keys.place.fault("id", format!("must not be that of a frame that is sent, {id}"));
     }
-    check_no_input(&keys.place, id, &[bus], checks);
+    check_no_input(&keys.place, id, &[bus], found);
     if output.plan.messages().any(|sent| sent.data_id() == Some(data_id)) {
-        keys.place.fault(checks.faults, "data_id", "must differ from those of the frames that are sent");
+        keys.place.fault("data_id", "must differ from those of the frames that are sent");
     }
     let is_fd = database.messages.iter().any(|m| m.id == plan.id() && m.format != FrameFormat::Classic);
     if is_fd {
-        raw.check_fd(&keys.place, &[bus], checks.faults);
+        raw.check_fd(&keys.place, &[bus]);
     }
     let Some(protection) = plan.protection().filter(|_| secoc.is_none()) else {
         return Some((CommandConfig { bus, plan }, None));

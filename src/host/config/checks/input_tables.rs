@@ -6,13 +6,13 @@
 use toml::de::{DeTable, DeValue};
 
 use super::signals::{self, Databases};
-use crate::config::document::{Document, Faults, TablePlace};
+use crate::config::document::{Document, TablePlace};
 use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
 use crate::config::schema::{RawTables, SECTIONS};
 use crate::config::schema::{Section as _, SectionInfo};
 
 /// Notes interfaces that are not there, and missing ones where there are several.
-pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut Faults) {
+pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     if raw.broken {
         return;
     }
@@ -23,10 +23,7 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut 
     };
     if count > 1 && !raw.is_written::<CurrentInput>() {
         let text = format!("{}.interface is missing, {allowed}", CurrentInput::PATH);
-        match raw.input.as_ref() {
-            Some(input) => faults.add_at(&input.place.at, text),
-            None => faults.add(&document.file, 1, text),
-        }
+        raw.note(raw.input.as_ref().map(|input| &input.place), &text);
     }
     for (place, table) in with_key("interface").flat_map(|info| tables(document, info)) {
         let is_fault = match table.get("interface").map(|value| value.get_ref().as_str()) {
@@ -37,13 +34,13 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables, faults: &mut 
             None => count > 1,
         };
         if is_fault {
-            place.fault(faults, "interface", &allowed);
+            place.fault("interface", &allowed);
         }
     }
 }
 
 /// Notes signals that are not in the DBC files, of tables with another fault.
-pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases, faults: &mut Faults) {
+pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases) {
     let read: Vec<&str> = raw.places().map(|place| place.path.as_str()).collect();
     for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {
         let signal = table.get("signal").and_then(|value| value.get_ref().as_str());
@@ -52,7 +49,7 @@ pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Data
         };
         let source =
             SignalSource { place: &place, signal, interface: None, scale: 1.0, offset: 0.0, not_available: &[] };
-        signals::check_name(raw, databases, &source, faults);
+        signals::check_name(raw, databases, &source);
     }
 }
 

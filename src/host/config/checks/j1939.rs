@@ -2,10 +2,10 @@
 //!
 //! Nothing the node sends may be mistaken for an input or for a frame of `[output]`, and no two rules may share a code.
 
-use super::signals::Checks;
+use super::signals::ResolvedSignal;
 use crate::alarm::{Direction, Rule, Severity};
 use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
-use crate::config::document::Faults;
+use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Alarm, J1939};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
 use crate::quantity::BusIndex;
@@ -17,35 +17,38 @@ const FIRST_MAKER_SPN: u32 = 520_192;
 const TEST_FMI: u8 = 31;
 
 /// The node; `None` = there is none (not configured, silenced, or faults noted).
-pub(crate) fn node(checks: &mut Checks<'_>, output: Option<&OutputConfig>) -> Option<J1939Config> {
-    let raw = checks.raw;
+pub(crate) fn node(
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
+    output: Option<&OutputConfig>,
+) -> Option<J1939Config> {
     let Some(keys) = &raw.j1939 else {
         if !raw.broken && !raw.is_written::<J1939>() {
             for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
                 let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
-                alarm.place.fault(checks.faults, key, "must have a table [j1939], without it nothing is sent on J1939");
+                alarm.place.fault(key, "must have a table [j1939], without it nothing is sent on J1939");
             }
         }
         return None;
     };
-    let alarms = codes(&raw.alarms, checks.faults);
-    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place, checks.faults);
-    let node = NodeConfig { name: name(keys, checks.faults)?, address: address(keys, checks.faults)? };
-    check_ids(keys, &node, bus?, output, checks);
+    let alarms = codes(&raw.alarms);
+    let bus = raw.one_bus(keys.interface.as_deref(), &keys.place);
+    let node = NodeConfig { name: name(keys)?, address: address(keys)? };
+    check_ids(keys, &node, bus?, output, found);
     let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
-    let test_code = test_code.map_err(|error| keys.place.fault(checks.faults, "test_spn", &error.to_string())).ok()?;
+    let test_code = test_code.map_err(|error| keys.place.fault("test_spn", error)).ok()?;
     Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
 }
 
-fn address(keys: &J1939, faults: &mut Faults) -> Option<u8> {
-    let address = Some(keys.address).filter(|address| *address <= MAX_ADDRESS);
-    if address.is_none() {
-        keys.place.fault(faults, "address", &format!("must be 0 to {MAX_ADDRESS}"));
+fn address(keys: &J1939) -> Option<u8> {
+    if keys.address > MAX_ADDRESS {
+        keys.place.fault("address", format!("must be 0 to {MAX_ADDRESS}"));
+        return None;
     }
-    address
+    Some(keys.address)
 }
 
-fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
+fn name(keys: &J1939) -> Option<Name> {
     let fields = NameFields {
         arbitrary_address_capable: false,
         industry_group: keys.industry_group,
@@ -57,16 +60,16 @@ fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
         manufacturer_code: keys.manufacturer_code,
         identity_number: keys.identity_number,
     };
-    Name::new(&fields).map_err(|error| keys.place.fault(faults, error.field, &error.to_string())).ok()
+    Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
 /// The code of every threshold; `None` when one is faulty (noted).
-fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
+fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;
     for alarm in alarms {
         for (key, severity, _) in alarm.thresholds() {
-            let Some(own) = code(alarm, severity, faults) else {
+            let Some(own) = code(alarm, severity) else {
                 is_good = false;
                 continue;
             };
@@ -75,7 +78,7 @@ fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
                 let line = twin.place.at.beside(alarm.place.line_of("spn"));
                 let (path, fmi) = (&twin.place.path, own.code.fmi());
                 let what = format!("must not give two rules one code, {path} in {line} has it with FMI {fmi} ({key})");
-                alarm.place.fault(faults, "spn", &what);
+                alarm.place.fault("spn", &what);
                 is_good = false;
             }
             codes.push((alarm, own));
@@ -84,14 +87,14 @@ fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
     is_good.then(|| codes.into_iter().map(|(_, code)| code).collect())
 }
 
-fn code(alarm: &Alarm, severity: Severity, faults: &mut Faults) -> Option<AlarmCode> {
+fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
     // The rule's number as in alarm frames.
     let spn = alarm.spn.unwrap_or(FIRST_MAKER_SPN + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
         Ok(code) => Some(AlarmCode { rule: alarm.rule, severity, code, lamp: lamp(severity) }),
         Err(error) => {
-            alarm.place.fault(faults, "spn", &error.to_string());
+            alarm.place.fault("spn", error);
             None
         }
     }
@@ -136,16 +139,20 @@ fn lamp(severity: Severity) -> Lamp {
 }
 
 /// No identifier of the node is one of an input or of a frame of `[output]` on its interface.
-fn check_ids(keys: &J1939, node: &NodeConfig, bus: BusIndex, output: Option<&OutputConfig>, checks: &mut Checks<'_>) {
-    let Checks { found, faults, .. } = checks;
+fn check_ids(
+    keys: &J1939,
+    node: &NodeConfig,
+    bus: BusIndex,
+    output: Option<&OutputConfig>,
+    found: &[ResolvedSignal<'_>],
+) {
     let sent = node.sent_ids();
     if let Some(input) = found.iter().find(|f| f.bus == bus && sent.contains(&f.message.id)) {
         let (name, id) = (&input.message.name, input.message.id);
-        keys.place.fault(faults, "address", &format!("must not be the address of an input, {name} has {id}"));
+        keys.place.fault("address", format!("must not be the address of an input, {name} has {id}"));
     }
     let output = output.filter(|output| output.buses.contains(&bus));
     if let Some(id) = output.and_then(|output| output.plan.ids().into_iter().find(|id| sent.contains(id))) {
-        let what = format!("must not be the address in the identifier of a frame of [output], {id}");
-        keys.place.fault(faults, "address", &what);
+        keys.place.fault("address", format!("must not be the address in the identifier of a frame of [output], {id}"));
     }
 }

@@ -3,8 +3,8 @@
 use std::num::NonZeroU32;
 
 use super::alarm::RatedCell;
-use super::label;
-use super::modules::{self, Module};
+use super::cells::{self, Module};
+
 use super::signals::DbcRanges;
 use crate::can::CanId;
 use crate::can::decode::InputMap;
@@ -51,7 +51,7 @@ pub(crate) fn monitor(
     let estimator = |model: &CellModel, initial_ah| {
         Some(raw.estimator.as_ref()?.config(initial_ah, model, &capacity, found.voltage_step_v))
     };
-    let ranged = modules::with_voltages_of(&model, &modules);
+    let ranged = cells::with_voltages_of(&model, &modules);
     let modules = modules.into_iter().map(|Module { keys, cells, mut model }| {
         model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
         let estimator = estimator(&model, (keys.initial_capacity_ah, keys.initial_capacity_std_ah))?;
@@ -89,7 +89,7 @@ pub(crate) fn monitor(
         rules,
         model,
         modules,
-        label: label::label(pack).filter(|_| pack.learn_model),
+        label: cells::label(pack).filter(|_| pack.learn_model),
         is_balanced: pack.balancing,
         balancing: raw.balancing.as_ref().map(|keys| BalancingConfig {
             bleed_a: keys.bleed_a / f64::from(pack.strings),

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use super::signals::{Checks, check_no_input, read_dbc};
-use crate::config::document::{Faults, ReadFile, beside};
+use super::signals::{ResolvedSignal, check_no_input, read_dbc};
+use crate::config::document::{ReadFile, beside};
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{E2eKey, FrameKeys, Output};
 
@@ -11,8 +11,8 @@ use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::encode::{
-    DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, SentMessage,
-    layout,
+    DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan,
+    SettingFault, layout,
 };
 use crate::can::secoc::{self, Authentication};
 use crate::cell::CellModel;
@@ -31,12 +31,12 @@ const SENT: [LayoutMessage; 6] = [
 
 /// The sent frames and their layout; `None` = none (not configured, or faults noted).
 pub(crate) fn output(
-    checks: &mut Checks<'_>,
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
     config: &Path,
     model: Option<&CellModel>,
     read: ReadFile<'_>,
 ) -> Option<(OutputConfig, Database)> {
-    let raw = checks.raw;
     let keys = raw.output.as_ref().filter(|keys| keys.enabled)?;
     let command = raw.commands.as_ref().filter(|commands| commands.enabled);
     let frames = [
@@ -47,39 +47,42 @@ pub(crate) fn output(
         raw.output_reply.as_ref()?.config(),
         raw.output_freshness.as_ref()?.config(),
     ];
-    let [status, health, alarm, digest, reply] =
-        [0, 1, 2, 3, 4].map(|place| message_settings(&frames[place], checks.faults));
+    let [status, health, alarm, digest, reply] = [0, 1, 2, 3, 4].map(|place| message_settings(&frames[place]));
     let command_settings = match command {
-        Some(keys) => Some(message_settings(&keys.config(), checks.faults)?),
+        Some(keys) => Some(message_settings(&keys.config())?),
         None => None,
     };
     if frames[4].period_ms.is_some() {
-        frames[4].place.fault(checks.faults, "period_ms", "must not be given: a reply is sent on a command only");
+        frames[4].place.fault("period_ms", "must not be given: a reply is sent on a command only");
     }
-    frames[..5].iter().for_each(|frame| check_sent_secoc(frame, checks.faults));
-    let freshness = freshness_settings(&frames[5], command_settings.as_ref(), checks.faults);
+    frames[..5].iter().for_each(check_sent_secoc);
+    let freshness = freshness_settings(&frames[5], command_settings.as_ref());
     let (status, health, alarm, digest, reply, freshness) = (status?, health?, alarm?, digest?, reply?, freshness?);
     let settings = LayoutSettings { status, health, alarm, command: command_settings, digest, reply, freshness };
     let frames: Vec<_> = SENT.into_iter().zip(frames).collect();
     let laid_out: Vec<_> =
         frames.iter().copied().chain(command.map(|keys| (LayoutMessage::Command, keys.config()))).collect();
     let own = match &keys.dbc {
-        Some(name) => Some(read_dbc(&beside(config, name), read, checks.faults)?),
+        Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
         None => None,
     };
     let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
     // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
     let rated_capacity_ah = rated.unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
-    let database = database(base, &settings, &laid_out, checks.faults)?;
-    let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
-    let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, checks.faults))).ok()?;
+    let refuse = |fault: &SettingFault| {
+        if let Some(frame) = keys_of(&laid_out, fault.message) {
+            frame.place.fault(fault.key, &fault.what);
+        }
+    };
+    let database = layout(base, &settings).map_err(|refused| refused.iter().for_each(refuse)).ok()?;
+    let missing = |error: &String| keys.place.fault("dbc", error);
+    let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(missing)).ok()?;
     let buses = buses(raw, keys);
-    check_ids(&frames, &plan, &buses, checks);
-    check_data_ids(&frames, &plan, checks.faults);
+    check_ids(&frames, &plan, &buses, found);
     for sent in plan.messages().filter(|sent| sent.format != FrameFormat::Classic) {
         if let Some(frame) = keys_of(&frames, sent.message) {
-            raw.check_fd(frame.place, &buses, checks.faults);
+            raw.check_fd(frame.place, &buses);
         }
     }
     let period_s = |wanted| {
@@ -98,32 +101,32 @@ pub(crate) fn output(
 }
 
 /// The settings of a frame's message; `None` = faults noted.
-pub(crate) fn message_settings(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<MessageSettings> {
+pub(crate) fn message_settings(keys: &FrameKeys<'_>) -> Option<MessageSettings> {
     let id = match keys.id {
-        Some(id) => Some(configured_id(keys, id, faults)?),
+        Some(id) => Some(configured_id(keys, id)?),
         None if keys.extended => {
-            keys.place.fault(faults, "extended", "must have an id beside it");
+            keys.place.fault("extended", "must have an id beside it");
             return None;
         }
         None => None,
     };
-    let e2e = protection(keys, faults)?;
-    let secoc = authentication(keys, faults)?;
+    let e2e = protection(keys)?;
+    let secoc = authentication(keys)?;
     Some(MessageSettings { id, fd: keys.fd, brs: keys.brs, period_ms: keys.period_ms, e2e, secoc })
 }
 
-fn configured_id(keys: &FrameKeys<'_>, id: u32, faults: &mut Faults) -> Option<CanId> {
+fn configured_id(keys: &FrameKeys<'_>, id: u32) -> Option<CanId> {
     let can_id = if keys.extended { CanId::extended(id) } else { CanId::standard(id) };
     if can_id.is_none() {
-        keys.place.fault(faults, "id", "must be 0 to 0x7FF, or extended = true");
+        keys.place.fault("id", "must be 0 to 0x7FF, or extended = true");
     }
     can_id
 }
 
-fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
+fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
     let profile = match keys.e2e {
         None if keys.data_id.is_some() && keys.secoc.is_none() => {
-            keys.place.fault(faults, "data_id", "must have e2e or secoc beside it");
+            keys.place.fault("data_id", "must have e2e or secoc beside it");
             return None;
         }
         None => return Some(E2eSetting::AsBase),
@@ -132,39 +135,30 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
     };
     let Some(data_id) = keys.data_id else {
         let what = format!("must be given, 0 to {:#X}, with e2e = \"{}\"", profile.max_data_id(), profile.name());
-        keys.place.fault(faults, "data_id", &what);
+        keys.place.fault("data_id", &what);
         return None;
     };
     Some(E2eSetting::On(Protection { profile, data_id }))
 }
 
 /// The authentication of a frame; `None` = faults noted.
-fn authentication(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<Option<Authentication>> {
+fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     let Some(profile) = keys.secoc else { return Some(None) };
-    let Some(data_id) = keys.data_id else {
-        keys.place.fault(
-            faults,
-            "data_id",
-            &format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()),
-        );
-        return None;
-    };
-    Some(Some(Authentication { profile, data_id }))
+    if keys.data_id.is_none() {
+        keys.place.fault("data_id", format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()));
+    }
+    keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
 
 /// Notes a profile that only commands may have: its few bits of freshness do not reach beyond a restart of the sender.
-fn check_sent_secoc(keys: &FrameKeys<'_>, faults: &mut Faults) {
+fn check_sent_secoc(keys: &FrameKeys<'_>) {
     if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
-        keys.place.fault(faults, "secoc", "must be \"fd\" for a frame that is sent");
+        keys.place.fault("secoc", "must be \"fd\" for a frame that is sent");
     }
 }
 
 /// The settings of the announcement of freshness; `None` = faults noted.
-fn freshness_settings(
-    keys: &FrameKeys<'_>,
-    command: Option<&MessageSettings>,
-    faults: &mut Faults,
-) -> Option<MessageSettings> {
+fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -> Option<MessageSettings> {
     let is_sent = command.is_some_and(|command| command.secoc.is_some());
     let unused = [
         ("e2e", keys.e2e.is_some()),
@@ -180,37 +174,18 @@ fn freshness_settings(
         } else {
             "must not be given: the announcement is authenticated in its own way, once a second"
         };
-        keys.place.fault(faults, key, what);
+        keys.place.fault(key, what);
     }
     let Some(data_id) = keys.data_id.filter(|_| is_sent) else {
         if is_sent {
-            keys.place.fault(faults, "data_id", "must be given, 0 to 0xFFFF, with commands.secoc");
+            keys.place.fault("data_id", "must be given, 0 to 0xFFFF, with commands.secoc");
         }
         return (is_good && !is_sent).then(MessageSettings::default);
     };
-    let id = keys.id.and_then(|id| configured_id(keys, id, faults));
+    let id = keys.id.and_then(|id| configured_id(keys, id));
     let secoc = Some(Authentication { profile: secoc::Profile::Announcement, data_id });
     let settings = MessageSettings { id, fd: keys.fd, brs: keys.brs, secoc, ..MessageSettings::default() };
     is_good.then_some(settings)
-}
-
-/// The layout; a setting that does not fit it is noted at its key.
-fn database(
-    base: LayoutBase<'_>,
-    settings: &LayoutSettings,
-    frames: &[(LayoutMessage, FrameKeys<'_>)],
-    faults: &mut Faults,
-) -> Option<Database> {
-    let refused = match layout(base, settings) {
-        Ok(database) => return Some(database),
-        Err(refused) => refused,
-    };
-    for fault in refused {
-        if let Some(frame) = keys_of(frames, fault.message) {
-            frame.place.fault(faults, fault.key, &fault.what);
-        }
-    }
-    None
 }
 
 /// The keys of a message's table.
@@ -218,35 +193,27 @@ fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: Layout
     frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
 }
 
-/// Notes an identifier that is used twice or that an input has on the same interface.
+/// Notes an identifier or data id that is used twice, for one frame could be accepted as another, and an identifier that an
+/// input has on the same interface.
 fn check_ids(
     frames: &[(LayoutMessage, FrameKeys<'_>)],
     plan: &OutputPlan,
     buses: &[BusIndex],
-    checks: &mut Checks<'_>,
+    found: &[ResolvedSignal<'_>],
 ) {
     let sent: Vec<_> = plan.messages().collect();
     for (index, message) in sent.iter().enumerate() {
         let Some(keys) = keys_of(frames, message.message) else { continue };
-        let id = message.id;
+        let (one, id) = (message.message.name(), message.id);
         if let Some(other) = sent[..index].iter().find(|other| other.id == id) {
-            let (one, other) = (message.message.name(), other.message.name());
-            keys.place.fault(checks.faults, "id", &format!("{one} and {other} frame would both be {id}, must differ"));
+            let other = other.message.name();
+            keys.place.fault("id", format!("{one} and {other} frame would both be {id}, must differ"));
         }
-        check_no_input(keys.place, id, buses, checks);
-    }
-}
-
-/// Notes a data id that is used twice: one frame could be accepted as another.
-fn check_data_ids(frames: &[(LayoutMessage, FrameKeys<'_>)], plan: &OutputPlan, faults: &mut Faults) {
-    let sent: Vec<_> = plan.messages().collect();
-    let data_id = SentMessage::data_id;
-    for (index, message) in sent.iter().enumerate() {
-        let (Some(keys), Some(found)) = (keys_of(frames, message.message), data_id(message)) else { continue };
-        if let Some(other) = sent[..index].iter().find(|other| data_id(other) == Some(found)) {
-            let (one, other) = (message.message.name(), other.message.name());
-            let what = format!("{one} and {other} frame would both have {found:#X}, must differ");
-            keys.place.fault(faults, "data_id", &what);
+        check_no_input(keys.place, id, buses, found);
+        let Some(data_id) = message.data_id() else { continue };
+        if let Some(other) = sent[..index].iter().find(|other| other.data_id() == Some(data_id)) {
+            let other = other.message.name();
+            keys.place.fault("data_id", format!("{one} and {other} frame would both have {data_id:#X}, must differ"));
         }
     }
 }

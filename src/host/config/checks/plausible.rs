@@ -4,13 +4,13 @@
 //! In: the tables, the signals found, the cell model. Out: faults where it is certainly wrong, warnings where it is only
 //! unlikely. A `scale` (or `offset`) that is written overrules the unit of the DBC.
 
-use super::modules::Module;
+use super::cells::Module;
 use super::signals::{self, ResolvedSignal};
 use crate::can::dbc::{MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout};
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::cell::CellModel;
-use crate::config::document::{Faults, TablePlace};
+use crate::config::document::TablePlace;
 use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
@@ -33,18 +33,18 @@ const ANY_CELL_V: (f64, f64) = (1.2, 4.6);
 const TEMPERATURES_C: (f64, f64) = (-40.0, 80.0);
 
 /// Notes what cannot be meant about the signals found.
-pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
+pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
     for (place, signals) in by_table(raw, found) {
-        unreadable(place, &signals, faults);
-        ends(place, &signals, faults);
-        let before = faults.len();
-        units(place, &signals, (model, series), faults);
-        if faults.len() == before {
-            reach(place, &signals, (model, series), faults);
+        unreadable(place, &signals);
+        ends(place, &signals);
+        let before = place.faults.len();
+        units(place, &signals, (model, series));
+        if place.faults.len() == before {
+            reach(place, &signals, (model, series));
         }
     }
-    overlaps(raw, found, faults);
+    overlaps(raw, found);
 }
 
 /// Values of which a channel must be able to report some, in its unit; `None` = any.
@@ -65,7 +65,7 @@ fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
 }
 
 /// Signals whose bits cannot hold a value that the pack has: the first of the table.
-fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16), faults: &mut Faults) {
+fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
         let needed = needed_values(resolved.channel, pack)?;
         let (low, high) = held(resolved, resolved.scale, resolved.offset);
@@ -79,7 +79,7 @@ fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
         digits(from, 3),
         digits(to, 3)
     );
-    place.fault(faults, if place.has("scale") { "scale" } else { "signal" }, &what);
+    place.fault(if place.has("scale") { "scale" } else { "signal" }, &what);
 }
 
 /// The signals of each table, in the order of the file.
@@ -104,7 +104,7 @@ fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
 }
 
 /// Signals with a layout or range that is no layout or range: one fault per table and reason.
-fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     let mut reasons: Vec<(String, &ResolvedSignal<'_>, usize)> = Vec::new();
     for resolved in signals {
         let Err(reason) = resolved.binding() else { continue };
@@ -121,12 +121,12 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut 
             1 => " and 1 other".to_owned(),
             others => format!(" and {others} others"),
         };
-        place.fault(faults, "signal", &format!("{name}{others} in {file} cannot be read: {reason}"));
+        place.fault("signal", format!("{name}{others} in {file} cannot be read: {reason}"));
     }
 }
 
 /// Signals, and the multiplexors they depend on, that reach beyond their message: one fault per table.
-fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     // An answer has no length that is known before it comes.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
     let parts = in_frames.flat_map(|resolved| {
@@ -156,7 +156,7 @@ fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>], faults: &mut Faults
         what +=
             &format!("; with the other byte order ({order}) {} would", if beyond.len() == 1 { "it" } else { "they" });
     }
-    place.fault(faults, "signal", &what);
+    place.fault("signal", &what);
 }
 
 /// The layout with the byte order's character in the DBC exchanged; `None` for a signal within a byte.
@@ -175,7 +175,7 @@ fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r 
 }
 
 /// Inputs of one message that share bits, or have bits of a multiplexor: one fault per pair of tables.
-fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) {
+fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     for (place, signals) in by_table(raw, found) {
         let mut pairs: Vec<(String, String)> = Vec::new();
         for resolved in signals {
@@ -192,8 +192,7 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) 
             1 => " (and 1 other pair)".to_owned(),
             more => format!(" (and {more} other pairs)"),
         };
-        let what = format!("{first} and {second}{more} share bits of one message, must be apart");
-        place.fault(faults, "signal", &what);
+        place.fault("signal", format!("{first} and {second}{more} share bits of one message, must be apart"));
     }
 }
 
@@ -238,7 +237,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
 }
 
 /// Units of the DBC that are not those of the input, each once.
-fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16), faults: &mut Faults) {
+fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let mut seen: Vec<&str> = Vec::new();
     for resolved in signals {
         let text = resolved.signal.unit.as_str();
@@ -258,9 +257,9 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
                 let held = held(resolved, unit.factor, unit.offset);
                 held.0 <= high && held.1 >= low
             });
-            conversion(place, (resolved, unit, is_held), (&name, wanted), faults);
+            conversion(place, (resolved, unit, is_held), (&name, wanted));
         } else {
-            other_quantity(place, unit.quantity, (&name, text, wanted), faults);
+            other_quantity(place, unit.quantity, (&name, text, wanted));
         }
     }
 }
@@ -270,7 +269,7 @@ fn is_converted(place: &TablePlace) -> bool {
     place.has("scale") || place.has("offset")
 }
 
-fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&str, &str, &str), faults: &mut Faults) {
+fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&str, &str, &str)) {
     let found = match found {
         Quantity::Current => "a current",
         Quantity::Voltage => "a voltage",
@@ -279,11 +278,11 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
     };
     if is_converted(place) {
         let key = if place.has("scale") { "scale" } else { "offset" };
-        place.warn(faults, key, &format!("the unit of {name} is {unit:?}, {found}, where {wanted} is expected"));
+        place.warn(key, format!("the unit of {name} is {unit:?}, {found}, where {wanted} is expected"));
     } else {
         let what =
             format!("the unit of {name} is {unit:?}, {found}, must be {wanted} (scale = 1.0 if the DBC is wrong)");
-        place.fault(faults, "signal", &what);
+        place.fault("signal", &what);
     }
 }
 
@@ -292,7 +291,6 @@ fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
     (name, wanted): (&str, &str),
-    faults: &mut Faults,
 ) {
     let (scale, offset) = (resolved.scale.abs(), resolved.offset);
     let is_scale = (scale / unit.factor - 1.0).abs() <= SCALE_TOLERANCE;
@@ -306,16 +304,15 @@ fn conversion(
         if is_scale || unit.offset == 0.0 { String::new() } else { format!(", with offset = {}", toml(unit.offset)) };
     if !is_held && !is_converted(place) {
         let what = format!("the unit of {name} is {text:?}, in which its bits hold no pack's value: taken as {wanted}");
-        place.warn(faults, "signal", &what);
+        place.warn("signal", &what);
     } else if is_converted(place) {
-        let what = format!("would be {needed}{beside} by the unit {text:?} of {name}");
-        place.warn(faults, key, &what);
+        place.warn(key, format!("would be {needed}{beside} by the unit {text:?} of {name}"));
     } else {
         let unscaled = if key == "offset" { "0.0" } else { "1.0" };
         let what = format!(
             "must be {needed}{beside}: the unit of {name} is {text:?} ({unscaled} if the DBC is wrong and it is {wanted})"
         );
-        place.fault(faults, key, &what);
+        place.fault(key, &what);
     }
 }
 
@@ -344,7 +341,7 @@ struct AllowedRange<'a> {
 }
 
 /// Notes ranges of plausible readings that allow none.
-pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>, faults: &mut Faults) {
+pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let Some(pack) = &raw.pack else { return };
     let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
     let dbc = signals::ranges(&readable, pack.cells);
@@ -353,32 +350,26 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
         raw.source(first.channel).map(|source| source.place)
     };
     if let Some(keys) = &raw.current_limits {
-        allowed(
-            &AllowedRange {
-                place: &keys.place,
-                keys: ["max_charge_a", "max_discharge_a"],
-                limits: keys.config(dbc.current_a),
-                dbc: dbc.current_a,
-                origin: "of the DBC",
-                unit: "A",
-                input: input(|channel| channel == Channel::Current),
-            },
-            faults,
-        );
+        allowed(&AllowedRange {
+            place: &keys.place,
+            keys: ["max_charge_a", "max_discharge_a"],
+            limits: keys.config(dbc.current_a),
+            dbc: dbc.current_a,
+            origin: "of the DBC",
+            unit: "A",
+            input: input(|channel| channel == Channel::Current),
+        });
     }
     if let Some(keys) = &raw.temperature_limits {
-        allowed(
-            &AllowedRange {
-                place: &keys.place,
-                keys: ["min_c", "max_c"],
-                limits: keys.config(dbc.temperature_c),
-                dbc: dbc.temperature_c,
-                origin: "of the DBC",
-                unit: "degrees C",
-                input: input(|channel| matches!(channel, Channel::Temperature(_))),
-            },
-            faults,
-        );
+        allowed(&AllowedRange {
+            place: &keys.place,
+            keys: ["min_c", "max_c"],
+            limits: keys.config(dbc.temperature_c),
+            dbc: dbc.temperature_c,
+            origin: "of the DBC",
+            unit: "degrees C",
+            input: input(|channel| matches!(channel, Channel::Temperature(_))),
+        });
     }
     let (Some(keys), Some(model)) = (&raw.voltage_limits, model) else { return };
     let range = AllowedRange {
@@ -390,13 +381,13 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
         unit: "V",
         input: input(|channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage)),
     };
-    if allowed(&range, faults) {
-        voltages_of_model(&range, model, faults);
+    if allowed(&range) {
+        voltages_of_model(&range, model);
     }
 }
 
 /// Whether the range allows anything; a fault if not.
-fn allowed(range: &AllowedRange<'_>, faults: &mut Faults) -> bool {
+fn allowed(range: &AllowedRange<'_>) -> bool {
     let AllowedRange { place, keys: [low_key, high_key], limits, dbc, origin, unit, input } = range;
     let (low, high) = (digits(limits.min, 9), digits(limits.max, 9));
     if low < high {
@@ -407,12 +398,12 @@ fn allowed(range: &AllowedRange<'_>, faults: &mut Faults) -> bool {
         (false, true) => {
             let what =
                 format!("allows nothing: the smallest plausible value is {low} {unit} ({origin}), must be above it");
-            place.fault(faults, high_key, &what);
+            place.fault(high_key, &what);
         }
         (true, false) => {
             let what =
                 format!("allows nothing: the largest plausible value is {high} {unit} ({origin}), must be below it");
-            place.fault(faults, low_key, &what);
+            place.fault(low_key, &what);
         }
         (false, false) => {
             let (from, to) = (digits(dbc.0, 9), digits(dbc.1, 9));
@@ -421,7 +412,7 @@ fn allowed(range: &AllowedRange<'_>, faults: &mut Faults) -> bool {
                 place.path
             );
             if let Some(input) = input {
-                input.fault(faults, "signal", &what);
+                input.fault("signal", &what);
             }
         }
     }
@@ -429,7 +420,7 @@ fn allowed(range: &AllowedRange<'_>, faults: &mut Faults) -> bool {
 }
 
 /// Notes limits without any voltage that the cell model has.
-fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel, faults: &mut Faults) {
+fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     let Limits { min, max, .. } = range.limits;
     let (low, high) = (model.voltage_min_v, model.voltage_max_v);
     if min < high && max > low {
@@ -442,48 +433,47 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel, faults: &mut F
     );
     let key = range.keys[usize::from(max <= low)];
     match range.input.filter(|_| !range.place.has(key)) {
-        Some(input) => input.fault(faults, "signal", &what),
-        None => range.place.fault(faults, key, &what),
+        Some(input) => input.fault("signal", &what),
+        None => range.place.fault(key, &what),
     }
 }
 
 /// Notes an initial capacity that no cell of the model can have.
-pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
-    initial_of(&pack.place, pack.initial_capacity_ah, model, faults);
+    initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
 /// Notes a module's initial capacity that no cell of its model has, a rated one that is not of a cell like it, and cells of
 /// another size than the pack's own, which have `own_ah`.
-pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>, faults: &mut Faults) {
+pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
         let (ratio, own_ah) = (digits(beside, 3), digits(own_ah, 3));
         let what =
             format!("are cells of {ratio} times the {own_ah} Ah of the pack's own, which carry the same current");
-        keys.place.warn(faults, "cells", &what);
+        keys.place.warn("cells", &what);
     }
-    initial_of(&keys.place, keys.initial_capacity_ah, model, faults);
+    initial_of(&keys.place, keys.initial_capacity_ah, model);
     let ratio = model.rated_capacity_ah / model.capacity_ah;
     if ratio.max(1.0 / ratio) >= OTHER_CELL {
         let what =
             format!("must be that of one cell of {:?}, which has {} Ah", model.name, digits(model.capacity_ah, 3));
-        keys.place.fault(faults, "rated_capacity_ah", &what);
+        keys.place.fault("rated_capacity_ah", &what);
     }
 }
 
-fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel, faults: &mut Faults) {
+fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel) {
     let Some(initial_ah) = initial_ah else { return };
     if !bounds::INITIAL_CAPACITY.has(initial_ah / model.capacity_ah) {
         let [low, high] =
             [bounds::INITIAL_CAPACITY.low, bounds::INITIAL_CAPACITY.high].map(|by| digits(by * model.capacity_ah, 3));
-        let what = format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name);
-        place.fault(faults, "initial_capacity_ah", &what);
+        place.fault("initial_capacity_ah", format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name));
     }
 }
 
 /// Notes a rated capacity that is not of a cell like the model's.
-pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
+pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     let Some(rated_ah) = pack.rated_capacity_ah else { return };
     let ratio = rated_ah / model.rated_capacity_ah;
@@ -497,12 +487,12 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>, faults:
     if unlike >= OTHER_CELL {
         let [low, high] = [1.0 / OTHER_CELL, OTHER_CELL].map(|by| digits(model.rated_capacity_ah * by, 3));
         let what = format!("{found}, must be that of one cell of this model, {low} to {high} Ah{hint}");
-        pack.place.fault(faults, "rated_capacity_ah", &what);
+        pack.place.fault("rated_capacity_ah", &what);
     } else {
         let soh = digits(100.0 * pack.initial_capacity_ah.unwrap_or(model.capacity_ah) / rated_ah, 3);
         let what =
             format!("{found}: SOH begins at {soh} %, and resistances are those of a cell of {model_ah} Ah{hint}");
-        pack.place.warn(faults, "rated_capacity_ah", &what);
+        pack.place.warn("rated_capacity_ah", &what);
     }
 }
 

@@ -4,7 +4,6 @@ use super::signals::ResolvedSignal;
 use crate::can::poll::{PollConfig, PollRequest};
 use crate::can::signal::LayoutFault;
 use crate::can::uds::{Answer, AnswerSignal};
-use crate::config::document::Faults;
 use crate::config::schema::RawTables;
 use crate::quantity::Channel;
 
@@ -23,7 +22,7 @@ pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, Layou
 }
 
 /// The requests that are sent; `None` = none. Notes what they need and do not have.
-pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut Faults) -> Option<PollConfig> {
+pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>]) -> Option<PollConfig> {
     let keys = raw.poll.as_ref().filter(|keys| keys.enabled)?;
     let mut requests: Vec<PollRequest> = Vec::new();
     for (resolved, place) in found.iter().filter_map(|resolved| Some((resolved, resolved.answer?))) {
@@ -44,7 +43,7 @@ pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut F
     }
     if requests.is_empty() && !raw.broken {
         let what = "must be false: no answer that is read has drive_every_s, charge_every_s or parked_every_s";
-        keys.place.fault(faults, "enabled", what);
+        keys.place.fault("enabled", what);
     }
     let current = found.iter().find(|resolved| resolved.channel == Channel::Current).and_then(|it| it.answer);
     if let Some(place) = current.filter(|place| place.definition.every_s[2].is_none()) {
@@ -52,7 +51,7 @@ pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>], faults: &mut F
         let what = format!(
             "must be false, or {table} must have parked_every_s: without the current nothing says that the car drives"
         );
-        keys.place.fault(faults, "enabled", &what);
+        keys.place.fault("enabled", &what);
     }
     let watches_supply = raw.supply_voltage.is_some();
     Some(PollConfig { requests, max_requests_per_s: keys.max_requests_per_s, watches_supply })

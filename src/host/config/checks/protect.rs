@@ -1,28 +1,29 @@
-//! End-to-end protection of inputs: `[[input.protected]]` to the guards of the core, and in words.
+//! End-to-end protection of inputs: `[[input.protected]]` to the guards of the core.
 
-use super::signals::{Checks, ResolvedSignal};
+use super::signals::ResolvedSignal;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
-use crate::config::document::Faults;
+use crate::config::schema::RawTables;
 use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub(crate) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardConfig> {
-    let (raw, found) = (checks.raw, checks.found);
+pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
-        check_profile(keys, checks.faults);
+        check_profile(keys);
         let Some(bus) = raw.bus_of(keys.interface.as_deref()) else { continue };
         let inputs = found.iter().filter(|input| input.bus == bus && input.message.name == keys.message);
         let inputs: Vec<_> = inputs.collect();
         let Some(first) = inputs.first() else {
             if inputs_whole {
                 let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
-                not_an_input(keys, there, checks.faults);
+                let hint = did_you_mean(&keys.message, there);
+                let what = "must be the message of a configured input on its interface";
+                keys.place.fault("message", format!("{what}{hint}"));
             }
             continue;
         };
@@ -31,36 +32,35 @@ pub(crate) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardCo
                 "must be one message, is {} in {} and {} in {}",
                 first.message.id, first.file, other.message.id, other.file
             );
-            keys.place.fault(checks.faults, "message", &what);
+            keys.place.fault("message", &what);
         }
-        check_layout(keys, &inputs, checks.faults);
+        check_layout(keys, &inputs);
         let guard = guard(keys, first, bus);
         if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
             let line = twin.place.line_of("message").beside(keys.place.line_of("message"));
-            let what = format!("must be protected once, is also in {line}");
-            keys.place.fault(checks.faults, "message", &what);
+            keys.place.fault("message", format!("must be protected once, is also in {line}"));
         }
         guards.push((guard, keys));
     }
     let guards: Vec<GuardConfig> = guards.into_iter().map(|(guard, _)| guard).collect();
-    check_identity(checks, &guards);
+    check_identity(raw, found, &guards);
     guards
 }
 
 /// A new identity of the pack discards everything learned: its message must be protected, unless the configuration accepts
 /// another.
-fn check_identity(checks: &mut Checks<'_>, guards: &[GuardConfig]) {
-    let Some(keys) = checks.raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
+fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
+    let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =
         |input: &ResolvedSignal<'_>| guards.iter().any(|guard| (guard.bus, guard.id) == (input.bus, input.message.id));
-    let open = checks.found.iter().find(|input| input.channel == Channel::PackIdentity && !is_protected(input));
+    let open = found.iter().find(|input| input.channel == Channel::PackIdentity && !is_protected(input));
     if let Some(input) = open {
         let what = format!(
             "must be a signal of a message in [[input.protected]], or have accept_unprotected = true beside it: forged \
              frames of {} would put aside everything learned",
             input.message.name
         );
-        keys.place.fault(checks.faults, "signal", &what);
+        keys.place.fault("signal", &what);
     }
 }
 
@@ -79,26 +79,20 @@ fn guard(keys: &ProtectedInput, input: &ResolvedSignal<'_>, bus: BusIndex) -> Gu
 }
 
 /// Notes keys that do not fit the profile.
-fn check_profile(keys: &ProtectedInput, faults: &mut Faults) {
+fn check_profile(keys: &ProtectedInput) {
     let profile = keys.profile;
     if keys.data_id > profile.max_data_id() {
         let what = format!("must be 0 to {:#X} with profile \"{}\"", profile.max_data_id(), profile.name());
-        keys.place.fault(faults, "data_id", &what);
+        keys.place.fault("data_id", &what);
     }
     if keys.max_delta_counter > profile.max_counter() {
         let what = format!("must be 0 to {} with profile \"{}\"", profile.max_counter(), profile.name());
-        keys.place.fault(faults, "max_delta_counter", &what);
+        keys.place.fault("max_delta_counter", &what);
     }
 }
 
-fn not_an_input<'n>(keys: &ProtectedInput, there: impl Iterator<Item = &'n str>, faults: &mut Faults) {
-    let what = "must be the message of a configured input on its interface";
-    let hint = did_you_mean(&keys.message, there);
-    keys.place.fault(faults, "message", &format!("{what}{hint}"));
-}
-
 /// The header must fit into the message, and no input, nor what decides whether an input is there, may lie in it.
-fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &mut Faults) {
+fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
     let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());
     let length = usize::from(first.message.len_bytes);
@@ -108,7 +102,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
             profile.name(),
             first.file
         );
-        keys.place.fault(faults, "message", &what);
+        keys.place.fault("message", &what);
     }
     let mut noted: Vec<&str> = Vec::new();
     for input in inputs {
@@ -122,7 +116,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
                     input.message.name,
                     signal.name
                 );
-                keys.place.fault(faults, "profile", &format!("inputs {what}"));
+                keys.place.fault("profile", format!("inputs {what}"));
             }
         }
     }

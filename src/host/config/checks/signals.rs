@@ -95,23 +95,16 @@ pub(crate) struct DbcRanges {
 /// A range that refuses nothing.
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
-/// What later checks look at, and where they note what they find.
-pub(crate) struct Checks<'a> {
-    pub raw: &'a RawTables,
-    pub found: &'a [ResolvedSignal<'a>],
-    pub faults: &'a mut Faults,
-}
-
 impl Databases {
     /// Reads the files and answers; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
-    pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+    pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
             let path = beside(config, name);
-            files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
+            files.push(read_dbc(&path, read, &raw.faults).map(|database| (name.clone(), database)));
         }
         let files = files.into_iter().collect::<Option<Vec<_>>>()?;
-        let answers = answers::definitions(raw, faults);
+        let answers = answers::definitions(raw);
         let are_all_usable = answers.len() == raw.count::<DiagnosticInput>();
         (are_all_usable && !(files.is_empty() && answers.is_empty())).then_some(Self { files, answers })
     }
@@ -137,15 +130,15 @@ impl Databases {
 }
 
 /// Reads one DBC, or notes why not.
-pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Database> {
+pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
     Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()
 }
 
 /// Finds every configured signal.
-pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mut Faults) -> Vec<ResolvedSignal<'d>> {
-    let mut search = Search { raw, databases, faults, found: Vec::new() };
+pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<ResolvedSignal<'d>> {
+    let mut search = Search { raw, databases, found: Vec::new() };
     for (channel, source) in raw.sources() {
         match channel {
             Channel::CellVoltage(_) => {
@@ -164,9 +157,9 @@ pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mu
 }
 
 /// Notes a signal that is in none of the files.
-pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>, faults: &mut Faults) {
+pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>) {
     if !databases.signals().any(|signal| signal.is_named(source.signal)) {
-        Search { raw, databases, faults, found: Vec::new() }.not_found(source);
+        Search { raw, databases, found: Vec::new() }.not_found(source);
     }
 }
 
@@ -181,7 +174,6 @@ fn current_sign(raw: &RawTables) -> f64 {
 struct Search<'s, 'd> {
     raw: &'s RawTables,
     databases: &'d Databases,
-    faults: &'s mut Faults,
     found: Vec<ResolvedSignal<'d>>,
 }
 
@@ -194,8 +186,7 @@ impl<'d> Search<'_, 'd> {
             [] => self.not_found(source),
             [hit] => self.add(channel, source, sign, hit),
             [first, .., last] => {
-                let what = format!("must be in one place, is in {} and {}", first.file, last.file);
-                source.place.fault(self.faults, "signal", &what);
+                source.place.fault("signal", format!("must be in one place, is in {} and {}", first.file, last.file));
             }
         }
     }
@@ -204,7 +195,7 @@ impl<'d> Search<'_, 'd> {
         let what = format!("must be a signal (Message.Signal) of {}", self.databases.file_names());
         let names: Vec<String> = self.databases.signals().map(|signal| signal.full_name()).collect();
         let hint = did_you_mean(source.signal, names.iter().map(String::as_str));
-        source.place.fault(self.faults, "signal", &(what + &hint));
+        source.place.fault("signal", &(what + &hint));
     }
 
     /// The signals of all cells, by their pattern; `first`: the first cell's number in it.
@@ -213,10 +204,10 @@ impl<'d> Search<'_, 'd> {
         let cells = pack.cells;
         let pattern = match Pattern::parse(source.signal) {
             Ok(pattern) => pattern,
-            Err(what) => return source.place.fault(self.faults, "signal", &what),
+            Err(what) => return source.place.fault("signal", &what),
         };
         if !pattern.has_cell() && cells > 1 {
-            return source.place.fault(self.faults, "signal", "must have {n} in place of the cell's number");
+            return source.place.fault("signal", "must have {n} in place of the cell's number");
         }
         let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
@@ -235,13 +226,12 @@ impl<'d> Search<'_, 'd> {
                 Some([a, .., b]) => {
                     let what =
                         format!("must give each cell one signal, {number} is {} and {}", a.full_name(), b.full_name());
-                    source.place.fault(self.faults, "signal", &what);
+                    source.place.fault("signal", &what);
                 }
             }
         }
         if !missing.is_empty() {
-            let what = format!("must give every cell a signal, none for number {}", list(&missing));
-            source.place.fault(self.faults, "signal", &what);
+            source.place.fault("signal", format!("must give every cell a signal, none for number {}", list(&missing)));
         }
     }
 
@@ -257,21 +247,19 @@ impl<'d> Search<'_, 'd> {
                 "message {} has {} bytes, must have fd = true on its interface",
                 message.name, message.len_bytes
             );
-            source.place.fault(self.faults, "signal", &what);
+            source.place.fault("signal", &what);
         }
         if let Some(other) = self.found.iter().find(|f| f.bus == bus && std::ptr::eq(f.signal, signal)) {
-            let what = format!("must not be used twice, is also {}", channel_words(other.channel));
-            source.place.fault(self.faults, "signal", &what);
+            source.place.fault("signal", format!("must not be used twice, is also {}", channel_words(other.channel)));
         }
         if channel == Channel::PackIdentity && signal.layout.length_bits > MAX_IDENTITY_BITS {
             let what =
                 format!("{full_name} has {} bits, must have at most {MAX_IDENTITY_BITS}", signal.layout.length_bits);
-            source.place.fault(self.faults, "signal", &what);
+            source.place.fault("signal", &what);
         }
         let largest = u64::MAX >> (64 - u32::from(signal.layout.length_bits.clamp(1, 64)));
         if source.not_available.iter().any(|&code| code > largest) {
-            let what = format!("must be 0 to {largest:#X}, the codes of {full_name}");
-            source.place.fault(self.faults, "not_available", &what);
+            source.place.fault("not_available", format!("must be 0 to {largest:#X}, the codes of {full_name}"));
         }
         let mut not_available = signal.not_available_codes();
         not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
@@ -301,10 +289,9 @@ pub(crate) fn channel_words(channel: Channel) -> String {
 }
 
 /// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
-pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], checks: &mut Checks<'_>) {
-    if let Some(input) = checks.found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
-        let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
-        place.fault(checks.faults, "id", &what);
+pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], found: &[ResolvedSignal<'_>]) {
+    if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
+        place.fault("id", format!("must not be the identifier of an input, {} has {id}", input.message.name));
     }
 }
 

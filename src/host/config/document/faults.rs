@@ -2,8 +2,10 @@
 //!
 //! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`; nothing here stops at the first one.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::rc::Rc;
 
 /// All faults of a configuration, one line each: `pack.toml:14: pack.cells = 0, must be 1 to 1024`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -15,7 +17,7 @@ pub struct ConfigFaults(pub Vec<String>);
 pub(crate) struct SourceLine {
     /// File as people named it.
     pub file: String,
-    /// Line, from 1.
+    /// Line, from 1; 0 = the file as a whole.
     pub line: usize,
 }
 
@@ -28,75 +30,72 @@ impl SourceLine {
 
 impl fmt::Display for SourceLine {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}:{}", self.file, self.line)
+        match self.line {
+            0 => f.write_str(&self.file),
+            line => write!(f, "{}:{line}", self.file),
+        }
     }
 }
 
-/// Faults and warnings found so far, in files of any kind.
+/// Faults and warnings found so far, in files of any kind; a clone notes into the same list.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Faults(Rc<RefCell<Notes>>);
+
 #[derive(Debug, Default)]
-pub(crate) struct Faults {
-    list: Vec<(String, usize, String)>,
-    warnings: Vec<(String, usize, String)>,
+struct Notes {
+    faults: Vec<(SourceLine, String)>,
+    warnings: Vec<(SourceLine, String)>,
 }
 
 impl Faults {
     /// Notes `text` about line `line` of `file`; line 0 = the file as a whole.
-    pub(crate) fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
-        let fault = (file.to_owned(), line, text.into());
-        if !self.list.contains(&fault) {
-            self.list.push(fault);
-        }
-    }
-
-    /// Notes what is unlikely and may be meant; it does not make the configuration bad.
-    fn warn(&mut self, at: &SourceLine, text: String) {
-        let warning = (at.file.clone(), at.line, text);
-        if !self.warnings.contains(&warning) {
-            self.warnings.push(warning);
-        }
+    pub(crate) fn add(&self, file: &str, line: usize, text: impl fmt::Display) {
+        self.add_at(&SourceLine { file: file.to_owned(), line }, text);
     }
 
     /// Notes `text` about a line.
-    pub(crate) fn add_at(&mut self, at: &SourceLine, text: impl Into<String>) {
-        self.add(&at.file, at.line, text);
+    pub(crate) fn add_at(&self, at: &SourceLine, text: impl fmt::Display) {
+        note(&mut self.0.borrow_mut().faults, at, text);
+    }
+
+    /// Notes what is unlikely and may be meant; it does not make the configuration bad.
+    fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
+        note(&mut self.0.borrow_mut().warnings, at, text);
     }
 
     /// Number of faults.
     pub(crate) fn len(&self) -> usize {
-        self.list.len()
+        self.0.borrow().faults.len()
     }
 
     /// Whether nothing was found.
     pub(crate) fn is_empty(&self) -> bool {
-        self.list.is_empty()
+        self.len() == 0
     }
 
     /// The faults, one line each: the files in the order in which they first failed, each by line.
-    pub(crate) fn into_lines(self) -> Vec<String> {
-        Self::lines(&self.list)
+    pub(crate) fn lines(&self) -> ConfigFaults {
+        ConfigFaults(lines(&self.0.borrow().faults))
     }
 
     /// The warnings, in the same form.
     pub(crate) fn warning_lines(&self) -> Vec<String> {
-        Self::lines(&self.warnings)
+        lines(&self.0.borrow().warnings)
     }
+}
 
-    fn lines(list: &[(String, usize, String)]) -> Vec<String> {
-        let mut files: Vec<&str> = Vec::new();
-        for (file, _, _) in list {
-            if !files.contains(&file.as_str()) {
-                files.push(file);
-            }
-        }
-        let mut sorted: Vec<_> = list.iter().collect();
-        sorted.sort_by_key(|(file, line, _)| (files.iter().position(|f| f == file), *line));
-        let show = |(file, line, text): &&(String, usize, String)| match line {
-            0 => format!("{file}: {text}"),
-            _ => format!("{file}:{line}: {text}"),
-        };
-        // A name in the file may hold a line break; a fault is one line all the same.
-        sorted.iter().map(|fault| show(fault).replace('\n', "\\n")).collect()
+fn note(list: &mut Vec<(SourceLine, String)>, at: &SourceLine, text: impl fmt::Display) {
+    let note = (at.clone(), text.to_string());
+    if !list.contains(&note) {
+        list.push(note);
     }
+}
+
+fn lines(list: &[(SourceLine, String)]) -> Vec<String> {
+    let mut sorted: Vec<_> = list.iter().collect();
+    sorted.sort_by_key(|(at, _)| (list.iter().position(|(first, _)| first.file == at.file), at.line));
+    // A name in the file may hold a line break; a fault is one line all the same.
+    sorted.iter().map(|(at, text)| format!("{at}: {text}").replace('\n', "\\n")).collect()
 }
 
 /// Place of a key and the text of its value.
@@ -107,13 +106,15 @@ pub(crate) struct KeyPlace {
 }
 
 /// Place of a table in its file, with which a later check can name file, line, key and found.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub(crate) struct TablePlace {
     /// File and line of the table's header.
     pub at: SourceLine,
     /// `input.current`, `alarm[2]`; empty for the top of the file.
     pub path: String,
     pub spots: BTreeMap<String, KeyPlace>,
+    /// Where faults are noted.
+    pub faults: Faults,
 }
 
 impl TablePlace {
@@ -138,25 +139,30 @@ impl TablePlace {
     }
 
     /// Notes `KEY = FOUND, WHAT`.
-    pub(crate) fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
-        faults.add_at(self.line_of(key), self.sentence(key, what));
+    pub(crate) fn fault(&self, key: &str, what: impl fmt::Display) {
+        self.faults.add_at(self.line_of(key), self.sentence(key, what));
     }
 
     /// Notes `KEY = FOUND, WHAT` as a warning.
-    pub(crate) fn warn(&self, faults: &mut Faults, key: &str, what: &str) {
-        faults.warn(self.line_of(key), self.sentence(key, what));
+    pub(crate) fn warn(&self, key: &str, what: impl fmt::Display) {
+        self.faults.warn(self.line_of(key), self.sentence(key, what));
     }
 
-    fn sentence(&self, key: &str, what: &str) -> String {
+    fn sentence(&self, key: &str, what: impl fmt::Display) -> String {
         let name = self.key(key);
-        match self.spots.get(key) {
-            Some(spot) => format!("{name} = {}, {what}", spot.found),
+        match self.found(key) {
+            Some(found) => format!("{name} = {found}, {what}"),
             None => format!("{name} is not set, {what}"),
         }
     }
 
     /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.
-    pub(crate) fn note(&self, faults: &mut Faults, key: &str, what: &str) {
-        faults.add_at(self.line_of(key), format!("{}: {what}", self.key(key)));
+    pub(crate) fn note(&self, key: &str, what: impl fmt::Display) {
+        self.faults.add_at(self.line_of(key), format!("{}: {what}", self.key(key)));
+    }
+
+    /// Notes `TABLE WHAT` about the table as a whole.
+    pub(crate) fn table_fault(&self, what: impl fmt::Display) {
+        self.faults.add_at(&self.at, format!("{} {what}", self.path));
     }
 }

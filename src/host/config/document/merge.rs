@@ -20,6 +20,8 @@ pub(crate) struct Document<'t> {
     pub file: String,
     /// Whether the syntax is broken somewhere: a missing key may then stand in the broken part.
     pub broken: bool,
+    /// Where faults are noted.
+    pub faults: Faults,
     sources: &'t Sources,
     root: DeTable<'t>,
 }
@@ -27,7 +29,7 @@ pub(crate) struct Document<'t> {
 impl<'t> Document<'t> {
     /// Parses every file of `sources` and merges them in order. Syntax faults go to `faults`; the readable rest is kept
     /// and checked.
-    pub(crate) fn parse(sources: &'t Sources, faults: &mut Faults) -> Self {
+    pub(crate) fn parse(sources: &'t Sources, faults: &Faults) -> Self {
         let (mut root, mut broken) = (DeTable::new(), false);
         for source in sources.files() {
             let (table, errors) = DeTable::parse_recoverable(source.placed_text());
@@ -35,7 +37,7 @@ impl<'t> Document<'t> {
             broken |= !errors.is_empty();
             merge(&mut root, table.into_inner());
         }
-        Self { file: sources.main_file().to_owned(), broken, sources, root }
+        Self { file: sources.main_file().to_owned(), broken, faults: faults.clone(), sources, root }
     }
 
     /// The whole as a table.
@@ -95,11 +97,11 @@ impl<'t> Document<'t> {
                 KeyPlace { at: self.line(&key.span()), found: self.found(value, &value.span()) },
             )
         };
-        TablePlace { at, path: path.to_owned(), spots: table.iter().map(spot).collect() }
+        TablePlace { at, path: path.to_owned(), spots: table.iter().map(spot).collect(), faults: self.faults.clone() }
     }
 }
 
-fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &mut Faults) {
+fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults) {
     let line = |error: &toml::de::Error| error.span().map_or(0, |span| source.line(&span));
     for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
         faults.add(source.name(), line(error), error.message().trim().replace('\n', ", "));

@@ -108,7 +108,7 @@ pub(crate) struct Sources {
 
 impl Sources {
     /// Reads all files; `None` = one of them cannot be read (noted).
-    pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+    pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &Faults) -> Option<Self> {
         let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
         // Every one is read, so that each fault is noted.
         let texts: Vec<_> = files.all().map(text).collect();
@@ -165,7 +165,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
 }
 
 /// The file as UTF-8 text, or `None` with a fault noted.
-pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<String> {
+pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
     match String::from_utf8(bytes) {

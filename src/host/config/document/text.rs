@@ -24,10 +24,10 @@ pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
 /// # Errors
 /// When a file cannot be read or is no TOML: every such fault.
 pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, ConfigFaults> {
-    let mut faults = Faults::default();
-    let sources = Sources::read(files, read, &mut faults);
-    let text = sources.as_ref().map(|sources| text(&Document::parse(sources, &mut faults)));
-    text.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+    let faults = Faults::default();
+    let sources = Sources::read(files, read, &faults);
+    let text = sources.as_ref().map(|sources| text(&Document::parse(sources, &faults)));
+    text.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
 /// The text, in the order of the files. Reading it gives the same tables.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::config::document::{Faults, beside};
+use crate::config::document::beside;
 use crate::config::schema::RawTables;
 
 /// Where the key of authenticated frames is.
@@ -24,28 +24,22 @@ impl std::fmt::Display for KeySource {
 }
 
 /// Where the key of authenticated frames is; `None` = no frame is authenticated, or faults are noted.
-pub(crate) fn key_source(
-    raw: &RawTables,
-    config: &Path,
-    has_authenticated: bool,
-    faults: &mut Faults,
-) -> Option<KeySource> {
+pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool) -> Option<KeySource> {
     let keys = raw.authentication.as_ref()?;
     match (&keys.credential, &keys.key_file) {
         (Some(_), Some(_)) => {
-            keys.place.fault(faults, "key_file", "must not be given beside credential");
+            keys.place.fault("key_file", "must not be given beside credential");
             None
         }
         (Some(name), None) if !is_file_name(name) => {
-            keys.place.fault(faults, "credential", "must be a name without /");
+            keys.place.fault("credential", "must be a name without /");
             None
         }
         (Some(name), None) => has_authenticated.then(|| KeySource::Credential(name.clone())),
         (None, Some(file)) => has_authenticated.then(|| KeySource::File(beside(config, file))),
         (None, None) => {
             if has_authenticated {
-                let what = "must be given, or key_file: secoc needs a key";
-                keys.place.fault(faults, "credential", what);
+                keys.place.fault("credential", "must be given, or key_file: secoc needs a key");
             }
             None
         }

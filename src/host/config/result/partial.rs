@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use super::config::Config;
-use super::read::{load, read_model};
+use super::read::load;
 use crate::can::guard::GuardConfig;
 use crate::cell::CellModel;
-use crate::config::checks::{Checks, Databases, ResolvedSignal, protect, signals};
+use crate::config::checks::{Databases, ResolvedSignal, cells, protect, signals};
 use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, Sources, read_file};
 use crate::config::schema::RawTables;
 
@@ -36,30 +36,31 @@ impl PartialConfig {
             Err(faults) => (None, faults.0),
         };
         // The second reading finds the same faults again.
-        let again = &mut Faults::default();
-        let sources = Sources::read(&ConfigFiles::find(path)?, &read_file, again);
-        let Some(sources) = sources else { return Err(ConfigFaults(faults)) };
-        let document = Document::parse(&sources, again);
-        let raw = RawTables::read(&document, again);
-        let Some(databases) = Databases::load(path, &raw, &read_file, again) else { return Err(ConfigFaults(faults)) };
-        let model = read_model(path, &document, &raw, &read_file, again);
-        let model = model.map(|sourced| sourced.model);
-        Ok(Self { config, faults, raw, databases, model })
+        let again = Faults::default();
+        let read = || {
+            let sources = Sources::read(&ConfigFiles::find(path).ok()?, &read_file, &again)?;
+            let document = Document::parse(&sources, &again);
+            let raw = RawTables::read(&document);
+            let databases = Databases::load(path, &raw, &read_file)?;
+            let model = cells::own_model(path, document.text("pack.cell_model"), &raw, &read_file);
+            Some((raw, databases, model.map(|sourced| sourced.model)))
+        };
+        match read() {
+            Some((raw, databases, model)) => Ok(Self { config, faults, raw, databases, model }),
+            None => Err(ConfigFaults(faults)),
+        }
     }
 
     /// The configured signals that are found.
     pub(crate) fn signals(&self) -> Vec<ResolvedSignal<'_>> {
-        signals::resolve(&self.raw, &self.databases, &mut Faults::default())
+        signals::resolve(&self.raw, &self.databases)
     }
 
     /// End-to-end protection of the inputs, as far as it can be read.
     pub(crate) fn guards(&self, signals: &[ResolvedSignal<'_>]) -> Vec<GuardConfig> {
         match &self.config {
             Some(config) => config.monitor.guards.clone(),
-            None => {
-                let checks = &mut Checks { raw: &self.raw, found: signals, faults: &mut Faults::default() };
-                protect::guards(checks, false)
-            }
+            None => protect::guards(&self.raw, signals, false),
         }
     }
 }

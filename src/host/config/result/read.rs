@@ -6,12 +6,12 @@ use super::config::{Config, InterfaceConfig, StoreConfig};
 use super::key_source::key_source;
 use super::vehicle::VehicleIdentity;
 use crate::can::CanId;
-use crate::config::cell_model::{self, SourcedModel};
+use crate::config::cell_model::SourcedModel;
 use crate::config::checks::{
-    Checks, Databases, ResolvedSignal, answers, commands, cross, input_map, input_tables, j1939, label, modules,
-    monitor, output, plausible, polling, protect, signals,
+    Databases, ResolvedSignal, answers, cells, commands, cross, input_map, input_tables, j1939, monitor, output,
+    plausible, polling, protect, signals,
 };
-use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, beside, read_file};
+use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, read_file};
 use crate::config::schema::RawTables;
 use crate::quantity::BusIndex;
 
@@ -41,12 +41,12 @@ pub(crate) fn read_and<T>(
     read: ReadFile<'_>,
     then: impl FnOnce(&RawTables, &Config, &[ResolvedSignal<'_>]) -> T,
 ) -> Result<(Config, T), ConfigFaults> {
-    let mut faults = Faults::default();
-    match read_config(files, read, &mut faults, then) {
+    let faults = Faults::default();
+    match read_config(files, read, &faults, then) {
         Some(good) if faults.is_empty() => Ok(good),
         // A part that cannot be made and has no fault is an error of this program, which is reported too.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", files.main.display())])),
-        _ => Err(ConfigFaults(faults.into_lines())),
+        _ => Err(faults.lines()),
     }
 }
 
@@ -65,40 +65,39 @@ fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
 fn read_config<T>(
     files: &ConfigFiles,
     read: ReadFile<'_>,
-    faults: &mut Faults,
+    faults: &Faults,
     then: impl FnOnce(&RawTables, &Config, &[ResolvedSignal<'_>]) -> T,
 ) -> Option<(Config, T)> {
     let path = files.main.as_path();
     let sources = Sources::read(files, read, faults)?;
     let document = Document::parse(&sources, faults);
-    let raw = RawTables::read(&document, faults);
-    let sourced = read_model(path, &document, &raw, read, faults);
+    let raw = RawTables::read(&document);
+    let sourced = cells::own_model(path, document.text("pack.cell_model"), &raw, read);
     let (model, model_source) = sourced.map(|SourcedModel { model, source }| (model, source)).unzip();
-    let modules = modules::read(path, &raw, read, faults);
-    let ranged = model.as_ref().map(|model| modules::with_voltages_of(model, &modules));
-    cross::check(&raw, model.as_ref(), faults);
-    input_tables::interfaces(&document, &raw, faults);
-    plausible::rated_capacity(&raw, model.as_ref(), faults);
-    plausible::initial_capacity(&raw, model.as_ref(), faults);
+    let modules = cells::modules(path, &raw, read);
+    let ranged = model.as_ref().map(|model| cells::with_voltages_of(model, &modules));
+    cross::check(&raw, model.as_ref());
+    input_tables::interfaces(&document, &raw);
+    plausible::rated_capacity(&raw, model.as_ref());
+    plausible::initial_capacity(&raw, model.as_ref());
     let own_ah =
         raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.as_ref().map(|m| m.rated_capacity_ah));
-    modules.iter().for_each(|module| plausible::module(module, own_ah, faults));
-    let databases = Databases::load(path, &raw, read, faults);
+    modules.iter().for_each(|module| plausible::module(module, own_ah));
+    let databases = Databases::load(path, &raw, read);
     let before = faults.len();
-    let found = databases.as_ref().map(|databases| signals::resolve(&raw, databases, faults)).unwrap_or_default();
+    let found = databases.as_ref().map(|databases| signals::resolve(&raw, databases)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
     if let Some(databases) = &databases {
-        input_tables::signals(&document, &raw, databases, faults);
+        input_tables::signals(&document, &raw, databases);
     }
-    plausible::signals(&raw, &found, ranged.as_ref(), faults);
-    plausible::ranges(&raw, &found, ranged.as_ref(), faults);
-    let checks = &mut Checks { raw: &raw, found: &found, faults };
-    let mut guards = protect::guards(checks, inputs_whole);
-    let laid_out = output::output(checks, path, model.as_ref(), read);
-    let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
+    plausible::signals(&raw, &found, ranged.as_ref());
+    plausible::ranges(&raw, &found, ranged.as_ref());
+    let mut guards = protect::guards(&raw, &found, inputs_whole);
+    let laid_out = output::output(&raw, &found, path, model.as_ref(), read);
+    let (commands, guard) = commands::commands(&raw, &found, laid_out.as_ref()).unzip();
     guards.extend(guard.flatten());
-    let poll = polling::poll(&raw, &found, checks.faults);
-    let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
+    let poll = polling::poll(&raw, &found);
+    let j1939 = j1939::node(&raw, &found, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
     let ranges = signals::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
@@ -119,7 +118,7 @@ fn read_config<T>(
     let warnings = faults.warning_lines();
     let vehicle = raw.vehicle.as_ref()?;
     let vehicle = VehicleIdentity { name: vehicle.name.clone(), id: vehicle.id.clone(), pack: vehicle.pack.clone() };
-    let key = key_source(&raw, path, !monitor.authentications().is_empty(), faults);
+    let key = key_source(&raw, path, !monitor.authentications().is_empty());
     let config = Config {
         path: path.to_owned(),
         interfaces,
@@ -131,20 +130,6 @@ fn read_config<T>(
         vehicle,
         key,
     };
-    let then = then(&raw, &config, &found);
-    Some((config, then))
-}
-
-/// The cell model that `pack.cell_model` names, also where another key of `[pack]` is faulty; without it, that of the label.
-pub(crate) fn read_model(
-    path: &Path,
-    document: &Document<'_>,
-    raw: &RawTables,
-    read: ReadFile<'_>,
-    faults: &mut Faults,
-) -> Option<SourcedModel> {
-    match document.text("pack.cell_model") {
-        Some(named) => cell_model::load_with(&beside(path, named), read, faults),
-        None => label::model(raw, faults),
-    }
+    let more = then(&raw, &config, &found);
+    Some((config, more))
 }

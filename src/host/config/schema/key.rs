@@ -6,7 +6,7 @@ use std::ops::Range;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use crate::config::document::{Document, Faults, TablePlace};
+use crate::config::document::{Document, TablePlace};
 use crate::quantity::bounds::Bounds;
 
 /// The range of a key's value; of each element when the value is a list.
@@ -82,7 +82,7 @@ pub(crate) trait Setting: Sized {
     /// Reads and checks a value.
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault>;
     /// Reads and checks a value that is tables with keys of their own; `None` = the type is no such value.
-    fn read_tables(_: &mut TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
+    fn read_tables(_: &TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
         None
     }
     /// Value of a key that is not written and has no default.
@@ -159,12 +159,11 @@ pub(crate) struct TableReader<'a> {
     pub table: Option<&'a DeTable<'a>>,
     /// Place in the file.
     pub place: TablePlace,
-    pub faults: &'a mut Faults,
 }
 
 impl TableReader<'_> {
     /// The value of `key`, its default, or `None` with a fault noted.
-    pub(crate) fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
+    pub(crate) fn setting<T: Setting>(&self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);
         };
@@ -181,13 +180,13 @@ impl TableReader<'_> {
                 let (ValueFault::Type(span) | ValueFault::Range(span)) = wrong;
                 let found = self.document.found(value, &span);
                 let text = format!("{} = {found}, {what}", self.place.key(key.name));
-                self.faults.add_at(&self.document.line(&span), text);
+                self.document.faults.add_at(&self.document.line(&span), text);
                 None
             }
         }
     }
 
-    fn absent<T: Setting>(&mut self, key: &Key) -> Option<T> {
+    fn absent<T: Setting>(&self, key: &Key) -> Option<T> {
         match key.presence {
             Presence::Optional => T::absent(),
             Presence::Default(text) => {
@@ -197,7 +196,7 @@ impl TableReader<'_> {
             Presence::Required if self.broken => None,
             Presence::Required => {
                 let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
-                self.faults.add_at(&self.place.at, text);
+                self.document.faults.add_at(&self.place.at, text);
                 None
             }
         }

@@ -7,7 +7,7 @@ use toml::de::{DeTable, DeValue};
 
 use super::key::TableReader;
 use super::section::{Section, SectionInfo};
-use crate::config::document::{Document, Faults, SourceLine};
+use crate::config::document::{Document, SourceLine};
 
 /// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
@@ -15,19 +15,18 @@ pub(crate) struct SchemaReader<'a> {
     /// Whether syntax or tables are broken somewhere, so that a missing key may still be there: then none is reported as
     /// missing.
     pub broken: bool,
-    faults: &'a mut Faults,
 }
 
 impl<'a> SchemaReader<'a> {
     /// A walk that has checked the document for unknown keys.
-    pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
-        let mut walk = Self { document, broken: document.broken, faults };
+    pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo]) -> Self {
+        let mut walk = Self { document, broken: document.broken };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
 
     /// A table that is always read: without it in the file its required keys are missing.
-    pub(crate) fn one<S: Section>(&mut self) -> Option<S> {
+    pub(crate) fn one<S: Section>(&self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
             return self.read(S::PATH, self.document.first_line(), Some(root));
@@ -42,12 +41,12 @@ impl<'a> SchemaReader<'a> {
     }
 
     /// A table that may be left out.
-    pub(crate) fn optional<S: Section>(&mut self) -> Option<S> {
+    pub(crate) fn optional<S: Section>(&self) -> Option<S> {
         self.document.find(S::PATH).and_then(|_| self.one())
     }
 
     /// A table that may be written any number of times; faulty ones are left out (and noted).
-    pub(crate) fn many<S: Section>(&mut self) -> Vec<S> {
+    pub(crate) fn many<S: Section>(&self) -> Vec<S> {
         let Some(DeValue::Array(items)) = self.document.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
         };
@@ -76,10 +75,10 @@ impl<'a> SchemaReader<'a> {
         above.map_or_else(|| self.document.first_line(), |value| self.document.line(&value.span()))
     }
 
-    fn read<S: Section>(&mut self, path: &str, at: SourceLine, table: Option<&'a DeTable<'a>>) -> Option<S> {
+    fn read<S: Section>(&self, path: &str, at: SourceLine, table: Option<&'a DeTable<'a>>) -> Option<S> {
         let nothing = DeTable::new();
         let place = self.document.place(path, at, table.unwrap_or(&nothing));
-        S::read(&mut TableReader { document: self.document, broken: self.broken, table, place, faults: self.faults })
+        S::read(&TableReader { document: self.document, broken: self.broken, table, place })
     }
 
     /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema,
@@ -98,7 +97,7 @@ impl<'a> SchemaReader<'a> {
                 self.table_below(&join(schema, key), &shown_key, value, known);
             } else if !keys.iter().any(|k| k.name == key) {
                 let hint = did_you_mean(key, keys.iter().map(|k| k.name).chain(tables.iter().copied()));
-                self.faults.add_at(&line, format!("{shown_key} is not a known key{hint}"));
+                self.document.faults.add_at(&line, format!("{shown_key} is not a known key{hint}"));
             }
         }
     }
@@ -126,7 +125,7 @@ impl<'a> SchemaReader<'a> {
                     _ => self.document.quote(&value.span()),
                 };
                 let must_be = if many { format!("tables [[{schema}]]") } else { format!("one table [{schema}]") };
-                self.faults.add_at(&line, format!("{shown} = {found}, must be {must_be}"));
+                self.document.faults.add_at(&line, format!("{shown} = {found}, must be {must_be}"));
             }
         }
     }

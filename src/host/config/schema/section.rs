@@ -18,7 +18,7 @@ pub(crate) trait Section: Sized {
     /// Its keys.
     const KEYS: &'static [Key];
     /// Reads it; `None` when a key is bad (noted in the faults).
-    fn read(table: &mut TableReader<'_>) -> Option<Self>;
+    fn read(table: &TableReader<'_>) -> Option<Self>;
 }
 
 /// A declared table, for the check of unknown keys and for the reference page.
@@ -139,7 +139,7 @@ macro_rules! section {
                 },
             )*];
 
-            fn read(table: &mut $crate::config::schema::TableReader<'_>) -> Option<Self> {
+            fn read(table: &$crate::config::schema::TableReader<'_>) -> Option<Self> {
                 let mut keys = Self::KEYS.iter();
                 $( let $key: Option<$type> = keys.next().and_then(|key| table.setting(key)); )*
                 Some(Self { place: table.place.clone(), $( $key: $key?, )* })
@@ -167,6 +167,8 @@ macro_rules! tables {
         pub(crate) struct $name {
             /// The file, as people named it.
             pub file: String,
+            /// Where faults are noted.
+            pub faults: $crate::config::document::Faults,
             /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
             pub broken: bool,
             /// How often each table is written, faulty or not.
@@ -176,14 +178,12 @@ macro_rules! tables {
 
         impl $name {
             /// Reads every table; faults of single keys and unknown keys are noted.
-            pub(crate) fn read(
-                document: &$crate::config::document::Document<'_>,
-                faults: &mut $crate::config::document::Faults,
-            ) -> Self {
+            pub(crate) fn read(document: &$crate::config::document::Document<'_>) -> Self {
                 use $crate::config::schema::Section as _;
-                let mut reader = $crate::config::schema::SchemaReader::new(document, $sections, faults);
+                let reader = $crate::config::schema::SchemaReader::new(document, $sections);
                 Self {
                     file: document.file.clone(),
+                    faults: document.faults.clone(),
                     broken: reader.broken,
                     written: [$( ($section::PATH, reader.count($section::PATH)) ),+].into_iter().collect(),
                     $( $field: reader.$kind(), )+
@@ -213,27 +213,6 @@ macro_rules! tables {
 }
 pub(crate) use tables;
 
-impl TableReader<'_> {
-    /// The tables below a key; `None` when one of them is faulty (noted).
-    fn sub_tables<S: Section>(&mut self, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Vec<S>> {
-        let DeValue::Array(items) = value.get_ref() else { return None }; // noted by the check for unknown keys
-        if items.is_empty() {
-            self.place.fault(self.faults, key.name, &key.must_be());
-            return None;
-        }
-        let read = |(item, number): (&Spanned<DeValue<'_>>, usize)| {
-            let DeValue::Table(table) = item.get_ref() else { return None };
-            let path = format!("{}[{number}]", self.place.key(key.name));
-            let place = self.document.place(&path, self.document.line(&item.span()), table);
-            let Self { document, broken, ref mut faults, .. } = *self;
-            S::read(&mut TableReader { document, broken, table: Some(table), place, faults })
-        };
-        // Every one is read, so that each fault is noted.
-        let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
-        tables.into_iter().collect()
-    }
-}
-
 /// A key whose value is a list of declared tables, `[{ ... }, ...]` or `[[...]]`.
 #[derive(Debug, Clone)]
 pub(crate) struct SubTables<S>(pub Vec<S>);
@@ -245,7 +224,20 @@ impl<S: Section> Setting for SubTables<S> {
         Err(ValueFault::Type(value.span()))
     }
 
-    fn read_tables(reader: &mut TableReader<'_>, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
-        Some(reader.sub_tables(key, value).map(Self))
+    fn read_tables(reader: &TableReader<'_>, key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
+        let DeValue::Array(items) = value.get_ref() else { return Some(None) }; // noted by the check for unknown keys
+        if items.is_empty() {
+            reader.place.fault(key.name, key.must_be());
+            return Some(None);
+        }
+        let read = |(item, number): (&Spanned<DeValue<'_>>, usize)| {
+            let DeValue::Table(table) = item.get_ref() else { return None };
+            let path = format!("{}[{number}]", reader.place.key(key.name));
+            let place = reader.document.place(&path, reader.document.line(&item.span()), table);
+            S::read(&TableReader { table: Some(table), place, ..*reader })
+        };
+        // Every one is read, so that each fault is noted.
+        let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
+        Some(tables.into_iter().collect::<Option<Vec<S>>>().map(Self))
     }
 }

@@ -8,7 +8,7 @@ use super::keys::{
     SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::section::tables;
-use crate::config::document::{Faults, TablePlace};
+use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 tables! {
@@ -61,6 +61,14 @@ impl RawTables {
         !self.broken && self.interfaces.len() == self.count::<Interface>()
     }
 
+    /// Notes `text` about a table; about the file, where it could not be read.
+    pub(crate) fn note(&self, place: Option<&TablePlace>, text: &str) {
+        match place {
+            Some(place) => self.faults.add_at(&place.at, text),
+            None => self.faults.add(&self.file, 1, text),
+        }
+    }
+
     /// Whether the pack's total voltage is configured, so that the pack is estimated as one cell.
     pub(crate) fn is_pack_total(&self) -> bool {
         self.is_written::<PackVoltageInput>()
@@ -81,11 +89,11 @@ impl RawTables {
     }
 
     /// The interface of a table that belongs to one; `None` = it is not there, or must be named (noted).
-    pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace, faults: &mut Faults) -> Option<BusIndex> {
+    pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.interfaces.len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
         if bus.is_none() && self.has_all_interfaces() && !self.interfaces.is_empty() {
-            place.fault(faults, "interface", &format!("must be {}", self.interface_names()));
+            place.fault("interface", format!("must be {}", self.interface_names()));
         }
         bus
     }
@@ -97,10 +105,10 @@ impl RawTables {
     }
 
     /// Notes an FD frame on interfaces without FD, at the key `fd` of its table.
-    pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex], faults: &mut Faults) {
+    pub(crate) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex]) {
         let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
         for interface in interfaces.filter(|interface| !interface.fd) {
-            place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
+            place.fault("fd", format!("must have fd = true on interface {} too", interface.name));
         }
     }
 

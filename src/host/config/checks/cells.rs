@@ -1,0 +1,141 @@
+//! Which cells the pack has: its own kind, by a model file or a label, and modules of other cells (`[[pack.module]]`).
+//!
+//! In: the tables and the cell model files they name. Out: the models; faults where keys are missing or do not fit together,
+//! and where cells of a module are not there, in two modules, or of no known kind.
+
+use std::path::Path;
+
+use crate::cell::{CellModel, Chemistry, Label};
+use crate::config::cell_model::{self, SourcedModel};
+use crate::config::document::{ReadFile, TablePlace, beside};
+use crate::config::schema::RawTables;
+use crate::config::schema::keys::{Pack, PackModule};
+use crate::quantity::CellIndex;
+
+/// A module's cells and what they are.
+#[derive(Debug)]
+pub(crate) struct Module<'a> {
+    pub keys: &'a PackModule,
+    pub cells: Vec<CellIndex>,
+    pub model: CellModel,
+}
+
+/// What is on the label of the pack's own cells, where no file is named and nothing is missing.
+pub(crate) fn label(pack: &Pack) -> Option<Label> {
+    let (chemistry, rated_ah) = (pack.chemistry.filter(|_| pack.cell_model.is_none())?, pack.rated_capacity_ah?);
+    let usual = Label::usual(chemistry, rated_ah);
+    Some(Label {
+        voltage_min_v: pack.voltage_min_v.unwrap_or(usual.voltage_min_v),
+        voltage_max_v: pack.voltage_max_v.unwrap_or(usual.voltage_max_v),
+        ..usual
+    })
+}
+
+/// The model of the pack's own cells: of the file `named`, else by `chemistry`.
+pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read: ReadFile<'_>) -> Option<SourcedModel> {
+    if let Some(named) = named {
+        return cell_model::load_with(&beside(path, named), read, &raw.faults);
+    }
+    let pack = raw.pack.as_ref()?;
+    check_label(&pack.place, pack.chemistry, pack.rated_capacity_ah)?;
+    let label = label(pack)?;
+    let model = cell_model::of_label(&label);
+    if model.is_none() {
+        let Label { chemistry, voltage_min_v, voltage_max_v, rated_ah, .. } = label;
+        let usual = Label::usual(chemistry, rated_ah);
+        let what = format!(
+            "no cell of {} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {} and {} V",
+            chemistry.name(),
+            usual.voltage_min_v,
+            usual.voltage_max_v
+        );
+        pack.place.fault("chemistry", what);
+    }
+    model
+}
+
+/// Chemistry and rated capacity of a cell without a model file; what is missing is noted.
+fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Option<f64>) -> Option<(Chemistry, f64)> {
+    match (chemistry, rated_ah) {
+        (Some(chemistry), Some(rated_ah)) => return Some((chemistry, rated_ah)),
+        (Some(_), None) => {
+            place.fault("chemistry", "needs rated_capacity_ah, the capacity on the label of one cell");
+        }
+        (None, _) => {
+            place.fault("cell_model", "must be a cell model file; or chemistry and rated_capacity_ah must be given");
+        }
+    }
+    None
+}
+
+/// Notes keys of a label beside a model file, which has them; returns whether there are any.
+fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
+    let of_label = ["chemistry", "voltage_min_v", "voltage_max_v"].into_iter();
+    let given: Vec<&str> = of_label.filter(|key| cell_model.is_some() && place.has(key)).collect();
+    for key in &given {
+        place.fault(key, "must not be given together with cell_model, which states it");
+    }
+    !given.is_empty()
+}
+
+/// Notes keys of the pack's label beside a model file.
+pub(crate) fn check(pack: &Pack) {
+    check_file(&pack.place, pack.cell_model.as_ref());
+}
+
+/// Reads all modules; those with a fault are left out.
+pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -> Vec<Module<'a>> {
+    let Some(pack) = &raw.pack else { return Vec::new() };
+    if raw.is_pack_total() {
+        for keys in &raw.modules {
+            keys.place.fault("cells", "must be without [input.pack_voltage]: the pack is estimated as one cell");
+        }
+        return Vec::new();
+    }
+    for (index, keys) in raw.modules.iter().enumerate() {
+        if numbers(keys).any(|cell| cell > pack.cells) {
+            keys.place.fault("cells", format!("must be within 1 to {} (pack.cells)", pack.cells));
+        }
+        let is_shared = |other: &&PackModule| numbers(keys).any(|cell| numbers(other).any(|it| it == cell));
+        if let Some(other) = raw.modules[..index].iter().find(is_shared) {
+            let line = other.place.at.beside(keys.place.line_of("cells"));
+            keys.place.fault("cells", format!("must not name cells of {} ({line})", other.place.path));
+        }
+    }
+    let is_elsewhere = |cell: u16| raw.modules.iter().any(|keys| numbers(keys).any(|it| it == cell));
+    if let Some(last) = raw.modules.last().filter(|_| (1..=pack.cells).all(is_elsewhere)) {
+        last.place.fault("cells", "must leave cells that are of [pack]'s own kind");
+    }
+    let of_keys = |keys: &'a PackModule| {
+        let mut cells: Vec<u16> = numbers(keys).filter(|cell| (1..=pack.cells).contains(cell)).collect();
+        cells.sort_unstable();
+        cells.dedup();
+        let model = model(path, keys, file)?;
+        Some(Module { keys, cells: cells.into_iter().map(|number| CellIndex(number - 1)).collect(), model })
+    };
+    raw.modules.iter().filter_map(of_keys).collect()
+}
+
+/// Cell numbers, from 1.
+fn numbers(keys: &PackModule) -> impl Iterator<Item = u16> {
+    keys.cells.0.iter().cloned().flatten()
+}
+
+fn model(path: &Path, keys: &PackModule, file: ReadFile<'_>) -> Option<CellModel> {
+    let model = match &keys.cell_model {
+        Some(_) if check_file(&keys.place, keys.cell_model.as_ref()) => return None,
+        Some(named) => cell_model::load_with(&beside(path, named), file, &keys.place.faults)?.model,
+        None => {
+            let (chemistry, rated_ah) = check_label(&keys.place, keys.chemistry, keys.rated_capacity_ah)?;
+            cell_model::of_label(&Label::usual(chemistry, rated_ah))?.model
+        }
+    };
+    Some(CellModel { rated_capacity_ah: keys.rated_capacity_ah.unwrap_or(model.rated_capacity_ah), ..model })
+}
+
+/// The pack's own model with the voltages of all its cells, for limits that hold for every cell.
+pub(crate) fn with_voltages_of(model: &CellModel, modules: &[Module<'_>]) -> CellModel {
+    let lowest = modules.iter().map(|module| module.model.voltage_min_v).fold(model.voltage_min_v, f64::min);
+    let highest = modules.iter().map(|module| module.model.voltage_max_v).fold(model.voltage_max_v, f64::max);
+    CellModel { voltage_min_v: lowest, voltage_max_v: highest, ..model.clone() }
+}
