@@ -15,3 +15,5 @@ pub(crate) mod numbers;
 #[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 pub(crate) mod output;
 pub(crate) mod progress;
+#[cfg(feature = "lab")]
+pub(crate) mod replaying;

@@ -9,19 +9,18 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::common::cell_model::cell_model;
-use super::common::logs::{InputArgs, log_options};
+use super::common::logs::InputArgs;
 use super::common::output::{self, create_folder, failure, print_json, table};
-use super::common::progress::Bar;
+use super::common::replaying;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC};
 use crate::cell_faults::{CellFault, CellFaultDetector, CellFaultKind, UnknownImbalance};
 use crate::config::{self, Config};
 use crate::filter::ScalarGaussian;
-use crate::io::log::LogSource;
 use crate::io::stamp::format_utc;
 use crate::lab::{self, chart, pack_view};
-use crate::monitor::{Monitor, Snapshot};
+use crate::monitor::Snapshot;
 use crate::quantity::CellIndex;
-use crate::replay::{self, ReplaySettings, Sinks};
+use crate::replay::Sinks;
 use crate::store::HistoryReader;
 use pack::PackPage;
 use packwatch_host::failure::Failure;
@@ -131,15 +130,8 @@ fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
 }
 
 fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {
-    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
-    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
-    let settings = ReplaySettings { snapshot: true, ..plain };
-    let bar = Bar::new(&args.logs);
-    let monitor = Monitor::new(config.monitor.clone());
-    let result = replay::run(&mut source, monitor, Sinks::default(), settings, &mut |progress| bar.show(progress));
-    bar.clear();
-    let (_, snapshot) = result.map_err(|error| Failure::new(error.to_string()))?;
-    snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
+    let replayed = replaying::replay(&args.logs, &args.input, config, Sinks::default())?;
+    replayed.snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
 }
 
 fn page(diagnosis: &CellFaultDetector, pack: PackPage) -> Page {

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::common::logs::{CsvSign, column};
 use super::common::numbers::above_0_to;
-use super::common::output::{print_json, unless_closed};
+use super::common::output::{failure, print_json, unless_closed};
 use super::common::progress::{Bar, progress_bar};
 use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
@@ -112,7 +112,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
         bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });
     bar.clear();
-    let (mut report, counts) = result.map_err(|error| Failure::new(error.to_string()))?;
+    let (mut report, counts) = result.map_err(failure)?;
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();
         let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has bad lines");
@@ -130,7 +130,7 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
         bar.set_message(format!("{:.0} of {wanted_s:.0} s, {} frames", progress.seconds, progress.frames));
     });
     bar.finish_and_clear();
-    result.map_err(|error| Failure::new(error.to_string()))
+    result.map_err(failure)
 }
 
 /// The faults of the configuration as one finding; `None` = there is none.

@@ -10,17 +10,15 @@ use serde::Serialize as _;
 use serde_json::{Map, Value};
 
 use super::common::cell_model::cell_model;
-use super::common::logs::{InputArgs, log_options};
+use super::common::logs::InputArgs;
 use super::common::numbers::{NamedValue, above_0, one_of, within};
-use super::common::output::{failure, unless_closed};
-use super::common::progress::Bar;
+use super::common::output::{failure, named, unless_closed};
+use super::common::replaying::{self, Replayed};
 use crate::config::{self, Config, VehicleIdentity};
-use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::passport::{self, Condition, ReadingLimits, Record, Standard, Terms};
-use crate::monitor::Monitor;
-use crate::replay::{self, OutputSink, ReplaySettings, Sinks};
+use crate::replay::{OutputSink, Sinks};
 use crate::store::HistoryReader;
 use packwatch_host::failure::Failure;
 
@@ -97,7 +95,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         cell_model(record.snapshot(), Some(&config))?.map_or_else(|| config.monitor.model.clone(), |it| it.model);
     let condition = Condition::new(&record, &config, &model, &args.terms());
     let condition = condition.map_err(|error| match &args.state {
-        Some(folder) => Failure::new(format!("{}: {error}", folder.display())),
+        Some(folder) => named(folder, error),
         None => Failure::new(error),
     })?;
     let document = passport::passport(args.form, &condition, manufacturer);
@@ -115,7 +113,7 @@ impl Args {
             check_place(out, inputs()).map_err(Failure::new)?;
         }
         if self.details.as_ref() == Some(&self.out) {
-            return Err(Failure::new(format!("{}: named for two results", self.out.display())));
+            return Err(named(&self.out, "named for two results"));
         }
         Ok(())
     }
@@ -130,43 +128,31 @@ impl Args {
 }
 
 fn read_static(path: &Path) -> Result<Value, Failure> {
-    let named = |error: String| Failure::new(format!("{}: {error}", path.display()));
-    let file = File::open(path).map_err(|error| named(error.to_string()))?;
     let mut bytes = Vec::new();
-    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(error.to_string()))?;
+    let file = File::open(path).map_err(|error| named(path, error))?;
+    file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(path, error))?;
     if u64::try_from(bytes.len()).is_ok_and(|length| length > MAX_STATIC_BYTES) {
-        return Err(named(format!("more than {MAX_STATIC_BYTES} bytes")));
+        return Err(named(path, format!("more than {MAX_STATIC_BYTES} bytes")));
     }
-    serde_json::from_slice(&bytes).map_err(|error| named(error.to_string()))
+    serde_json::from_slice(&bytes).map_err(|error| named(path, error))
 }
 
 fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let vehicle = reader.vehicle().map_err(Failure::new)?;
     if vehicle.is_stated() && config.vehicle.is_stated() && vehicle != config.vehicle {
-        return Err(Failure::new(format!(
-            "{}: is of {vehicle}, the configuration is of {}",
-            folder.display(),
-            config.vehicle
-        )));
+        return Err(named(folder, format!("is of {vehicle}, the configuration is of {}", config.vehicle)));
     }
-    let record = Record::of_store(&reader).map_err(|error| Failure::new(format!("{}: {error}", folder.display())))?;
+    let record = Record::of_store(&reader).map_err(|error| named(folder, error))?;
     Ok((record, vehicle))
 }
 
 fn of_replay(args: &Args, config: &Config) -> Result<Record, Failure> {
-    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let record = Rc::new(RefCell::new(Record::of_replay(reading_limits(config))));
     let shared = Rc::clone(&record);
     let take: OutputSink = Box::new(move |out| shared.borrow_mut().take(out));
     let sinks = Sinks { outputs: Some(take), ..Sinks::default() };
-    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
-    let settings = ReplaySettings { snapshot: true, ..plain };
-    let bar = Bar::new(&args.logs);
-    let monitor = Monitor::new(config.monitor.clone());
-    let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
-    bar.clear();
-    let (summary, snapshot) = result.map_err(failure)?;
+    let Replayed { source, summary, snapshot } = replaying::replay(&args.logs, &args.input, config, sinks)?;
     if source.has_moved_stamps() {
         return Err(Failure::new(
             "a log begins before the end of the log before it, so its times are not known: the logs are not in their order, or \

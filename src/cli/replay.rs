@@ -8,7 +8,7 @@ use std::io;
 use std::path::Path;
 
 use super::common::logs::log_options;
-use super::common::output::print_json;
+use super::common::output::{failure, print_json};
 use super::common::progress::Bar;
 use crate::config::{self, Config};
 use crate::io::event_log;
@@ -39,7 +39,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match result {
         // The reader of our output has closed it: no failure.
         Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        result => result.map_err(|error| Failure::new(error.to_string())),
+        result => result.map_err(failure),
     }
 }
 

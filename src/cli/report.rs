@@ -6,18 +6,17 @@ use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use super::common::cell_model::cell_model;
-use super::common::logs::{InputArgs, log_options};
+use super::common::logs::InputArgs;
 use super::common::output::{create_folder, failure, unless_closed};
-use super::common::progress::Bar;
+use super::common::replaying::{self, Replayed};
 use packwatch_host::failure::Failure;
 
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
-use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
-use crate::monitor::{Monitor, Snapshot};
-use crate::replay::{self, OutputWatch, ReplaySettings, ReplaySummary, Sinks};
+use crate::monitor::Snapshot;
+use crate::replay::{OutputWatch, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
 
 /// Arguments of `report`.
@@ -134,7 +133,6 @@ fn of_store(folder: &Path) -> Result<Parts, Failure> {
 }
 
 fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
-    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
     let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
     let watched = Rc::clone(&data);
     let watch: OutputWatch = Box::new(move |_, out| {
@@ -143,13 +141,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
         out.events.iter().for_each(|event| data.take_event(event));
     });
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
-    let bar = Bar::new(&args.logs);
-    let monitor = Monitor::new(config.monitor.clone());
-    let settings =
-        ReplaySettings { snapshot: true, ..ReplaySettings::plain(args.input.sleep_gap, config.interface_names()) };
-    let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
-    bar.clear();
-    let (summary, snapshot) = result.map_err(failure)?;
+    let Replayed { summary, snapshot, .. } = replaying::replay(&args.logs, &args.input, config, sinks)?;
     // The replay has ended and with it the closure that shared the data.
     let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));

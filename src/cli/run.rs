@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::common::numbers::{MAX_SECONDS, away, between, bytes, whole};
+use super::common::output::failure;
 use crate::config;
 use crate::io::can_key::CanKey;
 use crate::io::place::PlaceSetting;
@@ -101,5 +102,5 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         status: PlaceSetting::from_path(args.status.clone()),
         config_file: ConfigFile::of(&args.config),
     };
-    service.run().map_err(|error| Failure::new(error.to_string()))
+    service.run().map_err(failure)
 }

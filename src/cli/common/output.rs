@@ -19,6 +19,11 @@ pub(crate) fn failure(error: impl Display) -> Failure {
     Failure::new(error.to_string())
 }
 
+/// A failure about a file or folder.
+pub(crate) fn named(path: &Path, what: impl Display) -> Failure {
+    Failure::new(format!("{}: {what}", path.display()))
+}
+
 /// Ignores that the output was closed.
 pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     match written {
@@ -62,7 +67,7 @@ pub(crate) fn write_table<H: AsRef<str>>(
 /// Creates a folder for results.
 pub(crate) fn create_folder(folder: &Path) -> Result<(), Failure> {
     let created = std::fs::create_dir_all(folder);
-    created.map_err(|error| Failure::new(format!("{}: cannot be created: {error}", folder.display())))
+    created.map_err(|error| named(folder, format!("cannot be created: {error}")))
 }
 
 /// Rejects a file that is named twice.

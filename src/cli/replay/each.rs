@@ -14,7 +14,7 @@ use super::args::Args;
 use super::report;
 use packwatch_host::failure::Failure;
 
-use crate::cli::common::output::{check_distinct, create_folder};
+use crate::cli::common::output::{check_distinct, create_folder, failure};
 use crate::cli::common::progress::bar;
 use crate::config::Config;
 use crate::io::log::LogSource;
@@ -52,7 +52,7 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     match written {
         // The reader of our output has closed it: no failure.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
-        written => written.map_err(|error| Failure::new(error.to_string()))?,
+        written => written.map_err(failure)?,
     }
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }

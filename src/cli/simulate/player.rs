@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::can::Frame;
+use crate::cli::common::output::failure;
 use crate::io::socket::CanSender;
 use crate::quantity::Timestamp;
 use packwatch_host::failure::Failure;
@@ -18,7 +19,7 @@ pub(super) struct Player {
 impl Player {
     /// Opens `interface`; speed 0 does not wait.
     pub(super) fn open(interface: &str, fd: bool, speed: f64) -> Result<Self, Failure> {
-        let sender = CanSender::open(interface, fd).map_err(|error| Failure::new(error.to_string()))?;
+        let sender = CanSender::open(interface, fd).map_err(failure)?;
         Ok(Self { sender, speed, started: None })
     }
 
@@ -31,6 +32,6 @@ impl Player {
                 std::thread::sleep(wait);
             }
         }
-        self.sender.send(frame).map_err(|error| Failure::new(error.to_string()))
+        self.sender.send(frame).map_err(failure)
     }
 }

@@ -11,15 +11,15 @@
 mod alarm;
 mod answers;
 pub(crate) mod cells;
-pub(crate) mod commands;
+mod commands;
 pub(crate) mod cross;
 pub(crate) mod input_tables;
-pub(crate) mod j1939;
+mod j1939;
 pub(crate) mod monitor;
-pub(crate) mod output;
+mod output;
 mod pattern;
 pub(crate) mod plausible;
-pub(crate) mod polling;
+mod polling;
 pub(crate) mod protect;
 pub(crate) mod signals;
 

@@ -1,48 +1,47 @@
 //! The settings the other modules take, from the tables of a checked file.
 
 use std::num::NonZeroU32;
+use std::path::Path;
 
 use super::alarm::RatedCell;
 use super::cells::{self, Module};
-
-use super::signals::DbcRanges;
+use super::signals::{self, DbcRanges, ResolvedSignal};
+use super::{commands, j1939, output, polling, protect};
 use crate::can::CanId;
-use crate::can::decode::InputMap;
+use crate::can::dbc::Database;
 use crate::can::flood::FloodConfig;
-use crate::can::guard::GuardConfig;
-use crate::can::poll::PollConfig;
-use crate::can::uds::Answer;
 use crate::cell::{CellModel, CellModule};
 use crate::cell_faults::BalancingConfig;
+use crate::config::document::ReadFile;
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Pack, TemperatureInput};
 use crate::health::HealthConfig;
-use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig, SupplyConfig};
+use crate::monitor::{MonitorConfig, SupplyConfig};
 use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
-/// The frames of the buses, received and sent.
-#[derive(Debug)]
-pub(crate) struct Traffic {
-    pub input: InputMap,
-    pub answers: Vec<Answer>,
-    pub poll: Option<PollConfig>,
-    pub guards: Vec<GuardConfig>,
-    pub cycle_times_s: Vec<(BusIndex, CanId, f64)>,
-    pub output: Option<OutputConfig>,
-    pub commands: Option<CommandConfig>,
-    pub j1939: Option<J1939Config>,
-}
-
-/// The settings of the core; `None` when a table is missing or faulty (and noted).
+/// The settings of the core and the layout of the sent frames; `None` when a table is missing or faulty (and noted).
+/// `inputs_whole`: every configured signal was found.
 pub(crate) fn monitor(
     raw: &RawTables,
-    mut model: CellModel,
+    signals: &[ResolvedSignal<'_>],
+    inputs_whole: bool,
+    model: Option<CellModel>,
     modules: Vec<Module<'_>>,
-    found: &DbcRanges,
-    traffic: Traffic,
-) -> Option<MonitorConfig> {
+    path: &Path,
+    read: ReadFile<'_>,
+) -> Option<(MonitorConfig, Option<Database>)> {
+    // Every part is made before one is missed, so that each fault is noted.
+    let mut guards = protect::guards(raw, signals, inputs_whole);
+    let laid_out = output::output(raw, signals, path, model.as_ref(), read);
+    let (commands, guard) = commands::commands(raw, signals, laid_out.as_ref()).unzip();
+    guards.extend(guard.flatten());
+    let poll = polling::poll(raw, signals);
+    let j1939 = j1939::node(raw, signals, laid_out.as_ref().map(|(output, _)| output));
+    let (output, layout) = laid_out.unzip();
     let pack = raw.pack.as_ref()?;
+    let found = &signals::ranges(signals, pack.cells);
+    let mut model = model?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
     let rated = RatedCell::new(rated_ah, raw.recharge.as_ref()?);
@@ -60,23 +59,23 @@ pub(crate) fn monitor(
     let modules = modules.collect::<Option<Vec<_>>>()?;
     let estimator = estimator(&model, (pack.initial_capacity_ah, pack.initial_capacity_std_ah))?;
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
-    Some(MonitorConfig {
+    let monitor = MonitorConfig {
         interfaces: raw.interfaces.len(),
-        input: traffic.input,
-        answers: traffic.answers,
-        poll: traffic.poll,
+        input: signals::input_map(signals)?,
+        answers: polling::answers(signals).ok()?,
+        poll,
         supply: raw
             .supply_voltage
             .as_ref()
             .map(|keys| SupplyConfig { minimum_v: keys.minimum_v, max_age_s: keys.max_age_s }),
-        guards: traffic.guards,
-        cycle_times_s: traffic.cycle_times_s,
+        guards,
+        cycle_times_s: cycle_times_s(signals),
         asleep_after_s: Some(raw.input.as_ref()?.asleep_after_s).filter(|after_s| *after_s > 0.0),
         identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
-        output: traffic.output,
-        commands: traffic.commands,
-        j1939: traffic.j1939,
+        output,
+        commands,
+        j1939,
         sample: SampleConfig { voltage_noise_v: estimator.voltage.noise_v, ..sample(raw, pack, &ranged, found)? },
         estimator,
         health: HealthConfig {
@@ -96,7 +95,20 @@ pub(crate) fn monitor(
             max_age_s: keys.max_age_s,
             is_only_while_sent: keys.only_while_sent,
         }),
-    })
+    };
+    Some((monitor, layout))
+}
+
+/// Cycle times that the DBC files give the input messages, s.
+fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
+    let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
+    let times = in_frames.filter_map(|resolved| {
+        let cycle_ms = resolved.message.cycle_time_ms.filter(|cycle_ms| *cycle_ms > 0)?;
+        Some((resolved.bus, resolved.message.id, f64::from(cycle_ms) / 1000.0))
+    });
+    let mut times: Vec<_> = times.collect();
+    times.dedup_by_key(|(bus, id, _)| (*bus, *id));
+    times
 }
 
 fn sample(raw: &RawTables, pack: &Pack, model: &CellModel, found: &DbcRanges) -> Option<SampleConfig> {

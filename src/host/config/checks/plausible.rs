@@ -333,8 +333,6 @@ struct AllowedRange<'a> {
     limits: Limits,
     /// Limits of the DBC after scale.
     dbc: (f64, f64),
-    /// Where a limit comes from that is not written.
-    origin: &'static str,
     unit: &'static str,
     /// Input whose DBC gives the range.
     input: Option<&'a TablePlace>,
@@ -350,73 +348,62 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
         raw.source(first.channel).map(|source| source.place)
     };
     if let Some(keys) = &raw.current_limits {
-        allowed(&AllowedRange {
-            place: &keys.place,
-            keys: ["max_charge_a", "max_discharge_a"],
-            limits: keys.config(dbc.current_a),
-            dbc: dbc.current_a,
-            origin: "of the DBC",
-            unit: "A",
-            input: input(|channel| channel == Channel::Current),
-        });
+        let (limits, dbc) = (keys.config(dbc.current_a), dbc.current_a);
+        let input = input(|channel| channel == Channel::Current);
+        let keys_of_range = ["max_charge_a", "max_discharge_a"];
+        AllowedRange { place: &keys.place, keys: keys_of_range, limits, dbc, unit: "A", input }.check();
     }
     if let Some(keys) = &raw.temperature_limits {
-        allowed(&AllowedRange {
-            place: &keys.place,
-            keys: ["min_c", "max_c"],
-            limits: keys.config(dbc.temperature_c),
-            dbc: dbc.temperature_c,
-            origin: "of the DBC",
-            unit: "degrees C",
-            input: input(|channel| matches!(channel, Channel::Temperature(_))),
-        });
+        let (limits, dbc) = (keys.config(dbc.temperature_c), dbc.temperature_c);
+        let input = input(|channel| matches!(channel, Channel::Temperature(_)));
+        AllowedRange { place: &keys.place, keys: ["min_c", "max_c"], limits, dbc, unit: "degrees C", input }.check();
     }
-    let (Some(keys), Some(model)) = (&raw.voltage_limits, model) else { return };
-    let range = AllowedRange {
-        place: &keys.place,
-        keys: ["min_v", "max_v"],
-        limits: keys.config(model, dbc.voltage_v),
-        dbc: dbc.voltage_v,
-        origin: "of the DBC or the cell model",
-        unit: "V",
-        input: input(|channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage)),
-    };
-    if allowed(&range) {
-        voltages_of_model(&range, model);
+    if let (Some(keys), Some(model)) = (&raw.voltage_limits, model) {
+        let (limits, dbc) = (keys.config(model, dbc.voltage_v), dbc.voltage_v);
+        let input = input(|channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage));
+        let range = AllowedRange { place: &keys.place, keys: ["min_v", "max_v"], limits, dbc, unit: "V", input };
+        if range.check() {
+            voltages_of_model(&range, model);
+        }
     }
 }
 
-/// Whether the range allows anything; a fault if not.
-fn allowed(range: &AllowedRange<'_>) -> bool {
-    let AllowedRange { place, keys: [low_key, high_key], limits, dbc, origin, unit, input } = range;
-    let (low, high) = (digits(limits.min, 9), digits(limits.max, 9));
-    if low < high {
-        return true;
-    }
-    match (place.has(low_key), place.has(high_key)) {
-        (true, true) => {} // noted where the keys are compared
-        (false, true) => {
-            let what =
-                format!("allows nothing: the smallest plausible value is {low} {unit} ({origin}), must be above it");
-            place.fault(high_key, &what);
+impl AllowedRange<'_> {
+    /// Whether the range allows anything; a fault if not.
+    fn check(&self) -> bool {
+        let AllowedRange { place, keys: [low_key, high_key], limits, dbc, unit, input } = self;
+        let origin = if *unit == "V" { "of the DBC or the cell model" } else { "of the DBC" };
+        let (low, high) = (digits(limits.min, 9), digits(limits.max, 9));
+        if low < high {
+            return true;
         }
-        (true, false) => {
-            let what =
-                format!("allows nothing: the largest plausible value is {high} {unit} ({origin}), must be below it");
-            place.fault(low_key, &what);
-        }
-        (false, false) => {
-            let (from, to) = (digits(dbc.0, 9), digits(dbc.1, 9));
-            let what = format!(
-                "the DBC's range is {from} to {to} {unit} after scale, must have values a pack can have; [{}] overrides it",
-                place.path
-            );
-            if let Some(input) = input {
-                input.fault("signal", &what);
+        match (place.has(low_key), place.has(high_key)) {
+            (true, true) => {} // noted where the keys are compared
+            (false, true) => {
+                let what = format!(
+                    "allows nothing: the smallest plausible value is {low} {unit} ({origin}), must be above it"
+                );
+                place.fault(high_key, &what);
+            }
+            (true, false) => {
+                let what = format!(
+                    "allows nothing: the largest plausible value is {high} {unit} ({origin}), must be below it"
+                );
+                place.fault(low_key, &what);
+            }
+            (false, false) => {
+                let (from, to) = (digits(dbc.0, 9), digits(dbc.1, 9));
+                let what = format!(
+                    "the DBC's range is {from} to {to} {unit} after scale, must have values a pack can have; [{}] overrides it",
+                    place.path
+                );
+                if let Some(input) = input {
+                    input.fault("signal", &what);
+                }
             }
         }
+        false
     }
-    false
 }
 
 /// Notes limits without any voltage that the cell model has.

@@ -14,7 +14,8 @@ use crate::config::document::{ConfigFaults, ConfigFiles, ReadFile, read_file};
 use crate::config::result::{Config, InterfaceConfig, VehicleIdentity, read_and};
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::TemperatureInput;
-use crate::health::{RechargeAlarm, RechargeConfig};
+use crate::health::RechargeAlarm;
+use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
@@ -151,7 +152,7 @@ fn description(files: &ConfigFiles, raw: &RawTables, config: &Config, found: &[R
         limits: limits(config),
         intake: traffic::intake(config, found),
         outputs: traffic::outputs(config),
-        alarms: alarms(config),
+        alarms: config.monitor.rules.iter().map(|rule| alarm(rule, &config.monitor)).collect(),
         polling: traffic::polling(config),
         j1939: traffic::j1939(config),
     }
@@ -241,15 +242,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
         not_available: resolved.not_available.iter().map(|code| format!("{code:X}")).collect(),
         serves: match resolved.channel {
             Channel::Temperature(sensor) => raw.temperatures.get(usize::from(sensor.0)).map(serves),
-            Channel::Current
-            | Channel::PackVoltage
-            | Channel::CellVoltage(_)
-            | Channel::ReportedSoc
-            | Channel::ReportedSoh
-            | Channel::SupplyVoltage
-            | Channel::Balancing(_)
-            | Channel::PackIdentity
-            | Channel::Contactor => None,
+            _ => None,
         },
     }
 }
@@ -316,14 +309,9 @@ fn limits(config: &Config) -> Vec<String> {
     words.collect()
 }
 
-fn alarms(config: &Config) -> Vec<String> {
-    let monitor = &config.monitor;
-    monitor.rules.iter().map(|rule| alarm(rule, monitor.model.rated_capacity_ah, &monitor.health.recharge)).collect()
-}
-
-fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String {
+fn alarm(rule: &RuleConfig, monitor: &MonitorConfig) -> String {
     let row = rule.rule.spec();
-    let what = match (rule.rule, recharge.alarm_on) {
+    let what = match (rule.rule, monitor.health.recharge.alarm_on) {
         (Rule::RechargePeriodLow, RechargeAlarm::Normalised) => "the normalised recharge period",
         _ => row.about,
     };
@@ -333,19 +321,16 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
     };
     let severity = rule.severity.name();
     let of_rated = match row.unit {
-        Unit::AmpereHours => format!(" ({} % of rated)", round(100.0 * rule.threshold / rated_ah)),
+        Unit::AmpereHours => {
+            format!(" ({} % of rated)", round(100.0 * rule.threshold / monitor.model.rated_capacity_ah))
+        }
         _ => String::new(),
     };
     let (set, clear) = (amount(rule.threshold, row.unit), amount(rule.clear, row.unit));
-    let mut words = match rule.when {
-        Comparison::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
-        Comparison::Probability(level) => {
-            format!(
-                "{severity} when {what} is {side} {set}{of_rated} with a probability above {} %",
-                round(100.0 * level)
-            )
-        }
-    };
+    let mut words = format!("{severity} when {what} is {side} {set}{of_rated}");
+    if let Comparison::Probability(level) = rule.when {
+        words.push_str(&format!(" with a probability above {} %", round(100.0 * level)));
+    }
     if rule.debounce_s > 0.0 {
         words.push_str(&format!(" for {} s", rule.debounce_s));
     }

@@ -5,15 +5,10 @@ use std::path::Path;
 use super::config::{Config, InterfaceConfig, StoreConfig};
 use super::key_source::key_source;
 use super::vehicle::VehicleIdentity;
-use crate::can::CanId;
 use crate::config::cell_model::SourcedModel;
-use crate::config::checks::{
-    Databases, ResolvedSignal, answers, cells, commands, cross, input_map, input_tables, j1939, monitor, output,
-    plausible, polling, protect, signals,
-};
+use crate::config::checks::{Databases, ResolvedSignal, cells, cross, input_tables, monitor, plausible, signals};
 use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, read_file};
 use crate::config::schema::RawTables;
-use crate::quantity::BusIndex;
 
 /// Reads and checks a configuration, its drop-ins and everything they name (DBC files, cell model; paths are relative to
 /// the configuration file).
@@ -50,18 +45,6 @@ pub(crate) fn read_and<T>(
     }
 }
 
-/// Cycle times that the DBC files give the input messages, s.
-fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
-    let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
-    let times = in_frames.filter_map(|resolved| {
-        let cycle_ms = resolved.message.cycle_time_ms.filter(|cycle_ms| *cycle_ms > 0)?;
-        Some((resolved.bus, resolved.message.id, f64::from(cycle_ms) / 1000.0))
-    });
-    let mut times: Vec<_> = times.collect();
-    times.dedup_by_key(|(bus, id, _)| (*bus, *id));
-    times
-}
-
 fn read_config<T>(
     files: &ConfigFiles,
     read: ReadFile<'_>,
@@ -92,26 +75,9 @@ fn read_config<T>(
     }
     plausible::signals(&raw, &found, ranged.as_ref());
     plausible::ranges(&raw, &found, ranged.as_ref());
-    let mut guards = protect::guards(&raw, &found, inputs_whole);
-    let laid_out = output::output(&raw, &found, path, model.as_ref(), read);
-    let (commands, guard) = commands::commands(&raw, &found, laid_out.as_ref()).unzip();
-    guards.extend(guard.flatten());
-    let poll = polling::poll(&raw, &found);
-    let j1939 = j1939::node(&raw, &found, laid_out.as_ref().map(|(output, _)| output));
-    let (output, output_layout) = laid_out.unzip();
-    let ranges = signals::ranges(&found, raw.pack.as_ref()?.cells);
+    let monitor = monitor::monitor(&raw, &found, inputs_whole, model, modules, path, read);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let traffic = monitor::Traffic {
-        input: input_map(&found)?,
-        answers: answers(&found).ok()?,
-        poll,
-        guards,
-        cycle_times_s: cycle_times_s(&found),
-        output,
-        commands,
-        j1939,
-    };
-    let monitor = monitor::monitor(&raw, model?, modules, &ranges, traffic)?;
+    let (monitor, output_layout) = monitor?;
     let store = raw.store.as_ref()?;
     let store =
         StoreConfig { checkpoint_s: store.checkpoint_s, max_rows: store.max_rows, keep_years: store.keep_years };

@@ -1,0 +1,34 @@
+//! Logs replayed for a page about them: what was seen, and the state at their end.
+
+use std::path::PathBuf;
+
+use packwatch_host::failure::Failure;
+
+use super::logs::{InputArgs, log_options};
+use super::output::failure;
+use super::progress::Bar;
+use crate::config::Config;
+use crate::io::log::LogSource;
+use crate::monitor::{Monitor, Snapshot};
+use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
+
+/// A record that was replayed.
+pub(crate) struct Replayed {
+    pub(crate) source: LogSource,
+    pub(crate) summary: ReplaySummary,
+    /// The last state; `None` = the logs have no reading.
+    pub(crate) snapshot: Option<Snapshot>,
+}
+
+/// Replays logs as one record, as fast as possible, with progress.
+pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks: Sinks) -> Result<Replayed, Failure> {
+    let mut source = LogSource::new(logs.to_owned(), log_options(input, config));
+    let plain = ReplaySettings::plain(input.sleep_gap, config.interface_names());
+    let settings = ReplaySettings { snapshot: true, ..plain };
+    let bar = Bar::new(logs);
+    let monitor = Monitor::new(config.monitor.clone());
+    let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
+    bar.clear();
+    let (summary, snapshot) = result.map_err(failure)?;
+    Ok(Replayed { source, summary, snapshot })
+}
