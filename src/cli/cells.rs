@@ -12,9 +12,6 @@ use crate::config::cell_model::SourcedModel;
 use crate::config::cell_model::library::{self, LibraryEntry};
 use packwatch_host::failure::Failure;
 
-/// Capacity of the cell for which the error of a chemistry is stated, Ah: it does not depend on it.
-const ANY_AH: f64 = 1.0;
-
 /// Arguments of `cells`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
@@ -103,7 +100,8 @@ fn label_row(chemistry: Chemistry) -> Vec<String> {
 
 /// Expected error of the SOC by a label alone, points.
 fn first_points(chemistry: Chemistry) -> Option<f64> {
-    let model = Label::usual(chemistry, ANY_AH).model()?;
+    // The error does not depend on the capacity.
+    let model = Label::usual(chemistry, 1.0).model()?;
     advise(&ModelBands::new(&model)).map(|(points, _)| points)
 }
 

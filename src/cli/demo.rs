@@ -30,16 +30,12 @@ const FILES: [(&str, &str); 3] = [
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// DBC of the receiving ECU.
-const OUTPUT_DBC: &str = include_str!("../../config/packwatch.dbc");
 /// Loss of capacity per cycle, Ah: both alarms come within some ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
 /// SOC range of the cycling; wider than the recharge window, so that every charge covers it.
 const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
 /// The demo gives up after this many cycles: at 1.2 Ah both alarms are overdue.
 const MAX_CYCLES: u32 = 14;
-/// Cycles shown after the last alarm.
-const CYCLES_AFTER: u32 = 1;
 /// Samples between two updates of the live row.
 const LIVE_SAMPLES: u64 = 400;
 /// Time of the bus when the demo starts: a Unix time, as in any log.
@@ -112,7 +108,7 @@ impl Demo {
             interfaces: config.interfaces.into_iter().map(|i| i.name).collect(),
             monitor: Monitor::new(config.monitor),
             ticks: Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S),
-            consumer: Consumer::new(OUTPUT_DBC)?,
+            consumer: Consumer::new(include_str!("../../config/packwatch.dbc"))?,
             out: Outputs::default(),
             table: Table::new(),
             raised: Vec::new(),
@@ -190,7 +186,8 @@ impl Demo {
 
     fn is_complete(&self) -> bool {
         let last = self.first(Rule::CapacityLow).zip(self.first(Rule::RechargePeriodLow));
-        last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + CYCLES_AFTER)
+        // One cycle is shown after the last alarm.
+        last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + 1)
     }
 
     /// A row of the table: estimate and truth at this moment.

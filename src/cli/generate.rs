@@ -10,9 +10,6 @@ use clap_mangen::Man;
 use super::common::output::print;
 use packwatch_host::failure::Failure;
 
-/// Name of the manual page about configurations.
-const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
-
 /// Text of the main page besides the definition of the command line.
 const MAIN_PAGE: &str = "\
 .SH EXIT STATUS
@@ -88,7 +85,7 @@ fn visible(all: &clap::Command) -> clap::Command {
 /// File name and text of each page.
 fn manual_pages(all: &clap::Command) -> Vec<(String, Vec<u8>)> {
     let command = visible(all);
-    let mut pages = vec![(CONFIGURATION_PAGE.to_owned(), crate::config::manual().into_bytes())];
+    let mut pages = vec![("packwatch.toml.5".to_owned(), crate::config::manual().into_bytes())];
     add_pages(&command, &mut pages);
     pages
 }

@@ -3,9 +3,6 @@
 use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
 
-/// Pause after each redraw, so that a reader can follow.
-const FRAME_TIME: Duration = Duration::from_millis(20);
-
 /// Erases the line.
 const ERASE_LINE: &str = "\r\x1b[K";
 
@@ -40,7 +37,8 @@ impl Table {
         self.head()?;
         write!(io::stdout(), "{ERASE_LINE}{}", row)?;
         io::stdout().flush()?;
-        std::thread::sleep(FRAME_TIME);
+        // So that a reader can follow.
+        std::thread::sleep(Duration::from_millis(20));
         Ok(())
     }
 

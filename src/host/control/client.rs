@@ -12,8 +12,6 @@ use super::standard_path;
 
 /// Longest wait for a list: a daemon answers between two ticks, so one that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Longest wait for the outcome of a command, which waits up to 30 s for a slow disk.
-const COMMAND_PATIENCE: Duration = Duration::from_secs(35);
 /// Longest answer, bytes: a thousand alarms of 400 bytes, ten times over.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
 
@@ -91,5 +89,6 @@ impl ControlClient {
 }
 
 const fn patience(request: Request) -> Duration {
-    if request.changes_something() { COMMAND_PATIENCE } else { PATIENCE }
+    // A command waits up to 30 s for a slow disk.
+    if request.changes_something() { Duration::from_secs(35) } else { PATIENCE }
 }

@@ -1,20 +1,15 @@
 //! Logs which program carries J1939: packwatch itself, frame by frame, so that a replay gives the same frames. The log
 //! line also says whether the kernel's own stack is loaded, for users who look for the node there.
 
-/// The kernel's list of protocols.
-const PROTOCOLS: &str = "/proc/net/protocols";
-/// The kernel's J1939 stack in that list.
-const KERNEL_STACK: &str = "CAN_J1939";
-
 /// Logs one line. A kernel that loads its stack on first use does not list it before.
 pub(super) fn log_kernel_stack() {
-    let kernel_stack = stack_state(std::fs::read_to_string(PROTOCOLS).ok().as_deref());
+    let kernel_stack = stack_state(std::fs::read_to_string("/proc/net/protocols").ok().as_deref());
     tracing::info!(kernel_stack, "J1939 carried by packwatch itself over raw CAN");
 }
 
 /// The state of the stack in the list; `None` = the list could not be read.
 fn stack_state(protocols: Option<&str>) -> &'static str {
-    let is_listed = |list: &str| list.lines().any(|line| line.split_whitespace().next() == Some(KERNEL_STACK));
+    let is_listed = |list: &str| list.lines().any(|line| line.split_whitespace().next() == Some("CAN_J1939"));
     match protocols.map(is_listed) {
         Some(true) => "loaded",
         Some(false) => "not loaded",

@@ -28,10 +28,6 @@ use crate::store::StoreProgress;
 const BATCH: usize = 256;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
-/// Period of the report of lines left out of the log.
-const LEFT_OUT_PERIOD: Duration = Duration::from_secs(60);
-/// Period of flushing files to the operating system: a crash of the daemon loses at most this.
-const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
 /// The service loop.
 #[derive(Debug)]
@@ -73,7 +69,8 @@ impl ServiceLoop {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
                     }
-                    if now.duration_since(flushed) >= FLUSH_PERIOD {
+                    // A crash of the daemon loses at most a second of the files.
+                    if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
                         flushed = now;
                     }
@@ -110,7 +107,7 @@ impl ServiceLoop {
 
     /// Notifies the service manager of readiness and of changes of the status line.
     fn notify_manager(&mut self, now: Instant) {
-        if now.duration_since(self.left_out_reported) >= LEFT_OUT_PERIOD {
+        if now.duration_since(self.left_out_reported) >= Duration::from_secs(60) {
             self.left_out_reported = now;
             let lines = logging::take_left_out();
             if lines > 0 {

@@ -6,10 +6,6 @@ use super::read::load_sourced;
 use super::source::SourcedModel;
 use crate::config::document::ConfigFaults;
 
-/// Folders below the present one and of the computer, in which models are looked for.
-const FOLDERS: [&str; 3] = ["config/cells", "cells", "/etc/packwatch/cells"];
-/// Folder of the shipped models, from the folder of an installed program.
-const SHIPPED: &str = "../share/packwatch/cells";
 /// Most models of a folder.
 const MOST: usize = 1000;
 
@@ -24,10 +20,15 @@ pub struct LibraryEntry {
 
 /// The usual folders that exist; `program` is the program's own file.
 pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
-    let shipped = program.and_then(Path::parent).map(|folder| folder.join(SHIPPED));
+    let shipped = program.and_then(Path::parent).map(|folder| folder.join("../share/packwatch/cells"));
     // Without "..", as people write it.
     let shipped = shipped.and_then(|folder| folder.canonicalize().ok());
-    FOLDERS.iter().map(PathBuf::from).chain(shipped).filter(|folder| folder.is_dir()).collect()
+    ["config/cells", "cells", "/etc/packwatch/cells"]
+        .iter()
+        .map(PathBuf::from)
+        .chain(shipped)
+        .filter(|folder| folder.is_dir())
+        .collect()
 }
 
 /// The models of a folder, `*.toml` by name.

@@ -8,10 +8,6 @@ use crate::monitor::{ModelChange, ModelState};
 
 /// Most that the end of a measured range is rounded.
 const ROUNDED: f64 = 0.01;
-/// Part of the label's deviation that is left where data say as much as the label.
-const LEFT: f64 = 0.7;
-/// SOC at which a temperature's resistances are judged.
-const MIDDLE_SOC: f64 = 0.5;
 
 /// A state of the model in words.
 pub fn state_words(state: ModelState) -> &'static str {
@@ -142,7 +138,7 @@ impl SourcedModel {
 
     /// How the resistances are known at a temperature.
     pub fn resistances_known_by(&self, temperature_c: f64) -> KnownBy {
-        let std = |model: &CellModel| Some(ModelBands::new(model).resistance(MIDDLE_SOC, temperature_c).std());
+        let std = |model: &CellModel| Some(ModelBands::new(model).resistance(0.5, temperature_c).std());
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
@@ -150,7 +146,8 @@ impl SourcedModel {
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);
-        Some(if left <= LEFT * before { KnownBy::Data } else { KnownBy::Prior })
+        // A deviation of 0.7 of the label's is left where data say as much as the label.
+        Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
     /// Error of the model's voltage, V, as root mean square over SOC at the temperature of its curve; `None` = not stated.

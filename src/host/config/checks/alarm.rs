@@ -7,9 +7,6 @@ use crate::config::schema::{Level, Threshold};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 
-/// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.
-const DEFAULT_HYSTERESIS: f64 = 0.02;
-
 /// The values of a new cell that relative thresholds refer to.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RatedCell {
@@ -63,7 +60,7 @@ impl Alarm {
             // A fault that has just begun does not end the one before.
             None if lasts_only_while_there(self.rule) => Some(0.0),
             None => {
-                let hysteresis = self.hysteresis.unwrap_or(DEFAULT_HYSTERESIS * set.abs());
+                let hysteresis = self.hysteresis.unwrap_or(0.02 * set.abs());
                 Some(set - beyond_sign(self.rule) * hysteresis)
             }
         }

@@ -13,8 +13,6 @@ use crate::config::schema::keys::{
 const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
-/// Largest current of a balancing resistor, part of the rated capacity per hour: passive ones take a few hundredths.
-const MAX_BLEED_PER_H: f64 = 0.2;
 /// Longest name of a vehicle or pack, characters: a line of the status shows all three.
 const MAX_VEHICLE_TEXT: usize = 64;
 
@@ -100,7 +98,8 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
         pack.place.fault("balancing", "must be true where there is [input.balancing]");
     }
     let rated_ah = pack.rated_capacity_ah.or(model.map(|model| model.rated_capacity_ah));
-    let most_a = rated_ah.map(|rated_ah| MAX_BLEED_PER_H * rated_ah * f64::from(pack.strings));
+    // Passive resistors take a few hundredths.
+    let most_a = rated_ah.map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
         let what = format!("must be at most {most_a:?} A, a fifth of the pack's rated capacity in an hour");
         keys.place.fault("bleed_a", &what);

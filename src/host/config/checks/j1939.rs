@@ -10,12 +10,6 @@ use crate::config::schema::keys::{Alarm, J1939};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
 use crate::quantity::BusIndex;
 
-/// First suspect parameter number left to makers (unverified: from memory of J1939-73); rules follow it by their numbers.
-const FIRST_MAKER_SPN: u32 = 520_192;
-
-/// Failure mode of a test: condition exists.
-const TEST_FMI: u8 = 31;
-
 /// The node; `None` = there is none (not configured, silenced, or faults noted).
 pub(crate) fn node(
     raw: &RawTables,
@@ -35,7 +29,8 @@ pub(crate) fn node(
     let bus = raw.one_bus(keys.interface.as_deref(), &keys.place);
     let node = NodeConfig { name: name(keys)?, address: address(keys)? };
     check_ids(keys, &node, bus?, output, found);
-    let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
+    // 31: condition exists.
+    let test_code = TroubleCode::new(keys.test_spn, 31, 0);
     let test_code = test_code.map_err(|error| keys.place.fault("test_spn", error)).ok()?;
     Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
 }
@@ -89,7 +84,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
 
 fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
     // The rule's number as in alarm frames.
-    let spn = alarm.spn.unwrap_or(FIRST_MAKER_SPN + u32::from(alarm.rule as u8));
+    // The first number left to makers is unverified: from memory of J1939-73.
+    let spn = alarm.spn.unwrap_or(520_192 + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
         Ok(code) => Some(AlarmCode { rule: alarm.rule, severity, code, lamp: lamp(severity) }),

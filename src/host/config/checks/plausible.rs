@@ -15,22 +15,9 @@ use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
-/// A scale that differs from the unit's by less is a calibration.
-const SCALE_TOLERANCE: f64 = 0.1;
-/// An offset that differs from the unit's by less is a calibration, K.
-const OFFSET_TOLERANCE_C: f64 = 20.0;
 /// The rated capacity over the cell model's, or its reciprocal, from which they are of different cells: the estimator learns a
 /// resistance of at most this many times the model's.
 const OTHER_CELL: f64 = 3.0;
-/// The same from which it is unlikely that they are of one cell.
-const UNLIKE_CELL: f64 = 1.25;
-/// Labels of one cell differ by less than this fraction.
-const LABEL_TOLERANCE: f64 = 0.05;
-
-/// Voltages of a lithium cell whose model cannot be read, V.
-const ANY_CELL_V: (f64, f64) = (1.2, 4.6);
-/// Temperatures of which a sensor must be able to report some, degrees C.
-const TEMPERATURES_C: (f64, f64) = (-40.0, 80.0);
 
 /// Notes what cannot be meant about the signals found.
 pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
@@ -49,11 +36,12 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
 
 /// Values of which a channel must be able to report some, in its unit; `None` = any.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
-    let (low, high) = model.map_or(ANY_CELL_V, |model| (model.voltage_min_v, model.voltage_max_v));
+    // Without a model: the voltages of any lithium cell.
+    let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
     match channel {
         Channel::CellVoltage(_) => Some((low, high)),
         Channel::PackVoltage => Some((low * f64::from(series), high * f64::from(series))),
-        Channel::Temperature(_) => Some(TEMPERATURES_C),
+        Channel::Temperature(_) => Some((-40.0, 80.0)),
         _ => None,
     }
 }
@@ -293,8 +281,9 @@ fn conversion(
     (name, wanted): (&str, &str),
 ) {
     let (scale, offset) = (resolved.scale.abs(), resolved.offset);
-    let is_scale = (scale / unit.factor - 1.0).abs() <= SCALE_TOLERANCE;
-    let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= OFFSET_TOLERANCE_C;
+    // Smaller differences are a calibration.
+    let is_scale = (scale / unit.factor - 1.0).abs() <= 0.1;
+    let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= 20.0;
     if is_scale && is_offset {
         return;
     }
@@ -465,7 +454,7 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let Some(rated_ah) = pack.rated_capacity_ah else { return };
     let ratio = rated_ah / model.rated_capacity_ah;
     let unlike = ratio.max(1.0 / ratio);
-    if unlike < UNLIKE_CELL {
+    if unlike < 1.25 {
         return;
     }
     let model_ah = digits(model.rated_capacity_ah, 3);
@@ -485,7 +474,8 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
 
 /// What may be meant by a capacity of `ratio` cells.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
-    let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= LABEL_TOLERANCE;
+    // Labels of one cell differ by less than 5 %.
+    let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;
     let whole = ratio.round();
     if strings > 1 && is_about(f64::from(strings)) {
         format!("; it is that of all {strings} strings together")

@@ -14,9 +14,6 @@ use crate::filter::ScalarGaussian;
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::quantity::bounds;
 
-/// A month of 365.25 / 12 days.
-const SECONDS_PER_MONTH: f64 = 2_629_800.0;
-
 /// Standard deviation of the capacity that a cell may have lost before its first half-cycle, part of the new cell's: its
 /// open-circuit curve is that of a new one until then.
 const FIRST_LOSS_STD: f64 = 0.03;
@@ -136,7 +133,8 @@ impl Estimator {
             },
             gap: GapSettings {
                 noise_per_sqrt_s: self.gap_noise_per_sqrt_s,
-                self_discharge_per_s: self.self_discharge_per_month / SECONDS_PER_MONTH,
+                // A month of 365.25 / 12 days.
+                self_discharge_per_s: self.self_discharge_per_month / 2_629_800.0,
                 away_use_per_s: self.away_use_per_h / 3600.0,
                 rest_current_a: self.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
                 silence_is_rest: self.silence_is_rest,
