@@ -1,62 +1,47 @@
 //! The simulator's files: a candump log and the truth as CSV, plain or .gz.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::io::{self, Write};
+use std::path::Path;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
 use crate::can::Frame;
+use crate::cli::common::output::failure;
 use crate::io::candump::{self, StampDigits};
+use crate::io::result_file::ResultFile;
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sim::{Moment, Simulation};
 use packwatch_host::failure::Failure;
 
-/// A file being written, and its name for messages.
-struct Target {
-    path: PathBuf,
-    to: Destination,
-}
-
-enum Destination {
-    Stdout(BufWriter<io::Stdout>),
-    Plain(BufWriter<File>),
-    Gz(GzEncoder<BufWriter<File>>),
+/// A file being written, compressed where its name ends in `.gz`.
+enum Target {
+    Plain(ResultFile),
+    Gz(GzEncoder<ResultFile>),
 }
 
 impl Target {
     fn create(path: &Path) -> Result<Self, Failure> {
-        let file = || File::create(path).map(BufWriter::new).map_err(|e| failure(path, &e));
-        let to = match path.extension().and_then(|e| e.to_str()) {
-            _ if path == Path::new("-") => Destination::Stdout(BufWriter::new(io::stdout())),
-            Some("gz") => Destination::Gz(GzEncoder::new(file()?, Compression::fast())),
-            _ => Destination::Plain(file()?),
-        };
-        Ok(Self { path: path.to_owned(), to })
+        let file = ResultFile::create(path).map_err(failure)?;
+        let is_gz = path.extension().is_some_and(|extension| extension == "gz");
+        Ok(if is_gz { Self::Gz(GzEncoder::new(file, Compression::fast())) } else { Self::Plain(file) })
     }
 
     fn write(&mut self, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Failure> {
-        let result = match &mut self.to {
-            Destination::Stdout(out) => write(out),
-            Destination::Plain(out) => write(out),
-            Destination::Gz(out) => write(out),
+        let written = match self {
+            Self::Plain(out) => write(out),
+            Self::Gz(out) => write(out),
         };
-        result.map_err(|e| failure(&self.path, &e))
+        written.map_err(failure)
     }
 
     fn finish(self) -> Result<(), Failure> {
-        let result = match self.to {
-            Destination::Stdout(mut out) => out.flush(),
-            Destination::Plain(mut out) => out.flush(),
-            Destination::Gz(out) => out.finish().and_then(|mut file| file.flush()),
+        let finished = match self {
+            Self::Plain(out) => out.finish(),
+            Self::Gz(out) => out.finish().and_then(ResultFile::finish),
         };
-        result.map_err(|e| failure(&self.path, &e))
+        finished.map_err(failure)
     }
-}
-
-fn failure(path: &Path, error: &io::Error) -> Failure {
-    Failure::new(format!("{}: cannot be written: {error}", path.display()))
 }
 
 /// Frames as candump lines with nanosecond stamps.

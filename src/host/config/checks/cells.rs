@@ -93,14 +93,8 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
         return Vec::new();
     }
     for (index, keys) in raw.modules.iter().enumerate() {
-        if numbers(keys).any(|cell| cell > pack.cells) {
-            keys.place.fault("cells", format!("must be within 1 to {} (pack.cells)", pack.cells));
-        }
-        let is_shared = |other: &&PackModule| numbers(keys).any(|cell| numbers(other).any(|it| it == cell));
-        if let Some(other) = raw.modules[..index].iter().find(is_shared) {
-            let line = other.place.at.beside(keys.place.line_of("cells"));
-            keys.place.fault("cells", format!("must not name cells of {} ({line})", other.place.path));
-        }
+        let earlier = raw.modules[..index].iter().map(|other| (&other.place, numbers(other).collect()));
+        check_cells(&keys.place, &numbers(keys).collect::<Vec<_>>(), earlier, pack.cells);
     }
     let is_elsewhere = |cell: u16| raw.modules.iter().any(|keys| numbers(keys).any(|it| it == cell));
     if let Some(last) = raw.modules.last().filter(|_| (1..=pack.cells).all(is_elsewhere)) {
@@ -114,6 +108,22 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
         Some(Module { keys, cells: cells.into_iter().map(|number| CellIndex(number - 1)).collect(), model })
     };
     raw.modules.iter().filter_map(of_keys).collect()
+}
+
+/// Notes, at the key `cells`, cells that are not there, and cells of an earlier table.
+pub(crate) fn check_cells<'a>(
+    place: &TablePlace,
+    cells: &[u16],
+    mut earlier: impl Iterator<Item = (&'a TablePlace, Vec<u16>)>,
+    count: u16,
+) {
+    if cells.iter().any(|&cell| cell > count) {
+        place.fault("cells", format!("must be within 1 to {count} (pack.cells)"));
+    }
+    if let Some((other, _)) = earlier.find(|(_, others)| cells.iter().any(|cell| others.contains(cell))) {
+        let line = other.at.beside(place.line_of("cells"));
+        place.fault("cells", format!("must not name cells of {} ({line})", other.path));
+    }
 }
 
 /// Cell numbers, from 1.

@@ -29,8 +29,8 @@ pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     }
     limits(raw);
     health(raw, model);
-    let rated_ah = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
-    let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| RatedCell::new(rated_ah, recharge));
+    let rated =
+        raw.rated_ah(model).zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| RatedCell::new(rated_ah, recharge));
     alarm::check(raw, rated.as_ref());
     output(raw);
 }
@@ -97,9 +97,8 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     if !pack.balancing {
         pack.place.fault("balancing", "must be true where there is [input.balancing]");
     }
-    let rated_ah = pack.rated_capacity_ah.or(model.map(|model| model.rated_capacity_ah));
     // Passive resistors take a few hundredths.
-    let most_a = rated_ah.map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
+    let most_a = raw.rated_ah(model).map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
         let what = format!("must be at most {most_a:?} A, a fifth of the pack's rated capacity in an hour");
         keys.place.fault("bleed_a", &what);
@@ -126,18 +125,8 @@ fn temperatures(pack: &Pack, raw: &RawTables) {
         return;
     }
     for (index, sensor) in raw.temperatures.iter().enumerate() {
-        let cells = cells_of(sensor, pack.cells);
-        if cells.iter().any(|&cell| cell > pack.cells) {
-            sensor.place.fault("cells", format!("must be within 1 to {} (pack.cells)", pack.cells));
-        }
-        let shared = |other: &&TemperatureInput| {
-            let others = cells_of(other, pack.cells);
-            cells.iter().any(|cell| others.contains(cell))
-        };
-        if let Some(other) = raw.temperatures[..index].iter().find(shared) {
-            let line = other.place.at.beside(sensor.place.line_of("cells"));
-            sensor.place.fault("cells", format!("must not name cells of {} ({line})", other.place.path));
-        }
+        let earlier = raw.temperatures[..index].iter().map(|other| (&other.place, cells_of(other, pack.cells)));
+        cells::check_cells(&sensor.place, &cells_of(sensor, pack.cells), earlier, pack.cells);
     }
 }
 

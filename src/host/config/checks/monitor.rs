@@ -46,9 +46,9 @@ pub(crate) fn monitor(
     let rated_ah = model.rated_capacity_ah;
     let rated = RatedCell::new(rated_ah, raw.recharge.as_ref()?);
     model.aged_ocv.set_shift_std(raw.capacity.as_ref()?.shift_std());
-    let capacity = raw.capacity.as_ref()?.config(rated_ah);
+    let health = health(raw, pack, rated_ah)?;
     let estimator = |model: &CellModel, initial_ah| {
-        Some(raw.estimator.as_ref()?.config(initial_ah, model, &capacity, found.voltage_step_v))
+        Some(raw.estimator.as_ref()?.config(initial_ah, model, &health.capacity, found.voltage_step_v))
     };
     let ranged = cells::with_voltages_of(&model, &modules);
     let modules = modules.into_iter().map(|Module { keys, cells, mut model }| {
@@ -78,13 +78,7 @@ pub(crate) fn monitor(
         j1939,
         sample: SampleConfig { voltage_noise_v: estimator.voltage.noise_v, ..sample(raw, pack, &ranged, found)? },
         estimator,
-        health: HealthConfig {
-            transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
-            capacity,
-            recharge: raw.recharge.as_ref()?.config(rated_ah),
-            end_of_life_ah: raw.capacity.as_ref()?.end_of_life * rated_ah,
-            usable: raw.usable.as_ref().map(|keys| keys.config(rated_ah)),
-        },
+        health,
         rules,
         model,
         modules,
@@ -97,6 +91,17 @@ pub(crate) fn monitor(
         }),
     };
     Some((monitor, layout))
+}
+
+fn health(raw: &RawTables, pack: &Pack, rated_ah: f64) -> Option<HealthConfig> {
+    let capacity = raw.capacity.as_ref()?;
+    Some(HealthConfig {
+        transition: raw.transition.as_ref()?.config(rated_ah * f64::from(pack.strings)),
+        capacity: capacity.config(rated_ah),
+        recharge: raw.recharge.as_ref()?.config(rated_ah),
+        end_of_life_ah: capacity.end_of_life * rated_ah,
+        usable: raw.usable.as_ref().map(|keys| keys.config(rated_ah)),
+    })
 }
 
 /// Cycle times that the DBC files give the input messages, s.

@@ -66,9 +66,8 @@ pub(crate) fn output(
         Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
         None => None,
     };
-    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
     // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
-    let rated_capacity_ah = rated.unwrap_or(1.0);
+    let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let refuse = |fault: &SettingFault| {
         if let Some(frame) = keys_of(&laid_out, fault.message) {

@@ -212,10 +212,9 @@ fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> Int
 fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> SignalUse {
     let layout = &resolved.signal.layout;
     let range = resolved.range();
-    let interface = config.interfaces.get(resolved.bus.index()).map(|i| i.name.clone()).unwrap_or_default();
     SignalUse {
         channel: channel_words(resolved.channel),
-        interface,
+        interface: config.interface_name(resolved.bus).to_owned(),
         id: resolved.message.id.to_string(),
         dbc: resolved.file.to_owned(),
         message: resolved.message.name.clone(),

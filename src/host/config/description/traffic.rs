@@ -39,8 +39,7 @@ fn authentication_words(Authentication { profile, data_id }: Authentication) -> 
 /// Describes the sent frames.
 pub(crate) fn outputs(config: &Config) -> Vec<OutputUse> {
     let Some(output) = &config.monitor.output else { return Vec::new() };
-    let names = output.buses.iter().filter_map(|bus| config.interfaces.get(bus.index()));
-    let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();
+    let names: Vec<String> = output.buses.iter().map(|bus| config.interface_name(*bus).to_owned()).collect();
     let used = output.plan.messages().map(|sent| OutputUse {
         frame: sent.message.name(),
         id: sent.id.to_string(),
@@ -84,7 +83,7 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
     for guard in &monitor.guards {
         let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));
         let name = input.map_or("unauthenticated commands", |input| input.message.name.as_str());
-        let interface = config.interfaces.get(guard.bus.index()).map_or("", |interface| interface.name.as_str());
+        let interface = config.interface_name(guard.bus);
         let Protection { profile, data_id } = guard.check.protection;
         let missed = match guard.cycle_time_s {
             Some(period_s) => format!("one missing is counted each {} ms", period_s * 1000.0),
@@ -122,7 +121,7 @@ pub(crate) fn polling(config: &Config) -> Vec<String> {
 /// `can0: asks 7E4 for 22 01 01 every 1 s while driving, every 5 s while charging`.
 fn request_words(config: &Config, request: &PollRequest) -> String {
     let Controller { bus, request: id, .. } = request.question.controller;
-    let interface = config.interfaces.get(bus.index()).map_or("?", |interface| interface.name.as_str());
+    let interface = config.interface_name(bus);
     let bytes: Vec<String> = request.question.request().iter().map(|byte| format!("{byte:02X}")).collect();
     let states = ["while driving", "while charging", "while parked and awake"];
     let period = |(every_s, state): (&Option<f64>, _)| every_s.map(|every_s| format!("every {every_s} s {state}"));
@@ -133,7 +132,7 @@ fn request_words(config: &Config, request: &PollRequest) -> String {
 /// Describes the node and its codes.
 pub(crate) fn j1939(config: &Config) -> Vec<String> {
     let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
-    let interface = config.interfaces.get(j1939.bus.index()).map_or("", |interface| interface.name.as_str());
+    let interface = config.interface_name(j1939.bus);
     let [dm1, dm2, ..] = j1939.node.sent_ids();
     let node = format!(
         "address {} ({0:02X}) on {interface}, NAME {}; DM1 {dm1} every second and on change, DM2 {dm2} on request",

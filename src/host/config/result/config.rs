@@ -7,6 +7,7 @@ use super::vehicle::VehicleIdentity;
 use crate::can::dbc::Database;
 use crate::config::cell_model::ModelSource;
 use crate::monitor::MonitorConfig;
+use crate::quantity::BusIndex;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -32,6 +33,11 @@ pub struct Config {
 }
 
 impl Config {
+    /// Name of an interface.
+    pub fn interface_name(&self, bus: BusIndex) -> &str {
+        self.interfaces.get(bus.index()).map_or("?", |interface| &interface.name)
+    }
+
     /// Names of the interfaces, in the order in which they are numbered.
     pub fn interface_names(&self) -> Vec<String> {
         self.interfaces.iter().map(|interface| interface.name.clone()).collect()

@@ -63,8 +63,7 @@ fn read_config<T>(
     input_tables::interfaces(&document, &raw);
     plausible::rated_capacity(&raw, model.as_ref());
     plausible::initial_capacity(&raw, model.as_ref());
-    let own_ah =
-        raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.as_ref().map(|m| m.rated_capacity_ah));
+    let own_ah = raw.rated_ah(model.as_ref());
     modules.iter().for_each(|module| plausible::module(module, own_ah));
     let databases = Databases::load(path, &raw, read);
     let before = faults.len();

@@ -8,6 +8,7 @@ use super::keys::{
     SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::section::tables;
+use crate::cell::CellModel;
 use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
@@ -67,6 +68,12 @@ impl RawTables {
             Some(place) => self.faults.add_at(&place.at, text),
             None => self.faults.add(&self.file, 1, text),
         }
+    }
+
+    /// Capacity on the label of one of the pack's own cells, Ah: configured, else that of the cell model.
+    pub(crate) fn rated_ah(&self, model: Option<&CellModel>) -> Option<f64> {
+        let configured = self.pack.as_ref().and_then(|pack| pack.rated_capacity_ah);
+        configured.or(model.map(|model| model.rated_capacity_ah))
     }
 
     /// Whether the pack's total voltage is configured, so that the pack is estimated as one cell.
