@@ -19,6 +19,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::rule::{Direction, Rule, Severity};
+use crate::filter::probability_below;
 
 /// How a value is compared with a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -133,7 +134,7 @@ impl LimitCheck {
 /// Probability that a normal value, on the good side by `good_by` in the mean, is on the bad side.
 fn probability_beyond(good_by: f64, std: f64) -> f64 {
     if std > 0.0 {
-        0.5 * libm::erfc(good_by / (std * std::f64::consts::SQRT_2))
+        probability_below(-good_by, std)
     } else if good_by < 0.0 {
         1.0
     } else {

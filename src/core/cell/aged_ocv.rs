@@ -10,6 +10,7 @@
 //! [`MATERIAL_SHARE_STD`] would change.
 
 use super::electrodes::{Electrodes, LostMaterial};
+use crate::filter::locate;
 
 /// What says how the curve ages.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,9 +44,6 @@ const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0
 
 /// Capacity down to which the electrodes must say how the cell ages, part of the new cell's: a usual end of life.
 const LEAST_KNOWN: f64 = 0.7;
-
-/// Least slope that an aged curve keeps anywhere, part of the new curve's.
-const LEAST_RISE: f64 = 0.1;
 
 /// Offsets of the open-circuit voltage over capacity and SOC; without capacities it never changes.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -141,7 +139,6 @@ impl AgedOcv {
         }
         let first = table.lithium.last().map(|row| row.iter().map(|lost| -lost).collect());
         table.lithium.extend([Some(vec![0.0; 1 + MIXES]), first].into_iter().flatten());
-        table.mixes_v.iter_mut().for_each(|table| table.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]));
         table.finish(new_capacity_ah, rows);
         Some(table)
     }
@@ -150,7 +147,11 @@ impl AgedOcv {
     /// temperature. 1 = the top keeps its ampere-hours, 0 = the curve shrinks evenly.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
-        let ocv_v = |at: f64| interpolate(soc, &rows[rows.len() / 2], at);
+        let middle_v = &rows[rows.len() / 2];
+        let ocv_v = |at: f64| {
+            let (k, _) = locate(soc, at);
+            middle_v[k] + (middle_v[k + 1] - middle_v[k]) * (at - soc[k]) / (soc[k + 1] - soc[k])
+        };
         for part in LOST_CAPACITIES {
             let shifted = |shift: f64, z: f64| ocv_v(z + shift * (1.0 - part) * z * (1.0 - z));
             let offset_v = soc.iter().map(|&z| shifted(shift, z) - ocv_v(z)).collect();
@@ -159,7 +160,6 @@ impl AgedOcv {
             table.mixes_v[0].push(soc.iter().map(|&z| more(z)).collect());
             table.mixes_v[1].push(vec![0.0; soc.len()]);
         }
-        table.mixes_v.iter_mut().for_each(|table| table.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]));
         table.is_shift = true;
         table.finish(new_capacity_ah, rows);
         table
@@ -169,6 +169,7 @@ impl AgedOcv {
     /// curve changes smoothly.
     fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
         let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
+        self.mixes_v.iter_mut().for_each(|table| table.extend(vec![vec![0.0; aged_v.len()]; 2]));
         self.push(new_capacity_ah, vec![0.0; aged_v.len()], rows);
         self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
     }
@@ -180,7 +181,8 @@ impl AgedOcv {
             1.0_f64,
             |factor, (new, offset)| {
                 let (rise_v, change_v) = (new[1] - new[0], offset[1] - offset[0]);
-                if change_v < 0.0 { factor.min((1.0 - LEAST_RISE) * rise_v / -change_v) } else { factor }
+                // An aged curve keeps a tenth of the new curve's slope everywhere.
+                if change_v < 0.0 { factor.min(0.9 * rise_v / -change_v) } else { factor }
             },
         );
         offset_v.iter_mut().for_each(|offset_v| *offset_v *= factor);
@@ -262,12 +264,6 @@ impl AgedOcv {
             (rows[above - 1][s] + (capacity_ah - low_ah) * per_ah, per_ah)
         }))
     }
-}
-
-/// Linear between the points, which rise in `x`; the outer lines continue.
-fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
-    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
-    y[k] + (y[k + 1] - y[k]) * (at - x[k]) / (x[k + 1] - x[k])
 }
 
 #[cfg(test)]

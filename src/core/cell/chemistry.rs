@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::aged_ocv::{AgedOcv, MIXES};
 use super::electrodes::{Electrodes, NegativeMaterial as Negative, PositiveMaterial as Positive};
 use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
-use crate::filter::ScalarGaussian;
+use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
 /// Materials of both electrodes, by what is on the label or in a data sheet.
@@ -87,9 +87,6 @@ impl Chemistry {
     }
 }
 
-/// Negative electrodes that cells are made of; those of the library whose plateaus are those of graphite against lithium.
-const NEGATIVES: [Negative; 3] = [Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged];
-
 /// What is on the label of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -114,9 +111,6 @@ pub struct LabelPrior {
     /// Its open-circuit curve with the covariance between cells.
     pub curve: CurvePrior,
 }
-
-/// Distance of a highest voltage from the usual one of a chemistry within which it is one of that chemistry, V.
-const USUAL_WITHIN_V: f64 = 0.2;
 
 /// SOC breakpoints of a model from a label.
 pub(super) const SOC: [f64; 21] =
@@ -161,7 +155,7 @@ pub struct ResistanceFactors {
 impl ResistanceFactors {
     /// Ratio of resistance `j` to that of the label.
     fn ratio(&self, j: usize, soc: f64, arrhenius: f64) -> f64 {
-        libm::exp(curve::interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
+        libm::exp(interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
     }
 }
 
@@ -188,34 +182,18 @@ const RESISTANCE: [UsualResistance; RESISTANCES] = [
     UsualResistance { ohm_ah: 0.030, tau_s: 1000.0, shape: [3.0, 2.2, 1.6, 1.1, 1.0] },
 ];
 
-/// Deviation of ln(resistance) between cells, found on the same five. The temperature's law adds to it away from 25 degrees C.
-const LOG_RESISTANCE_STD: f64 = 0.45;
-
-/// Deviation of the slowest branch relative to the other resistances, found on the same five.
-const SLOW_BRANCH_STD: f64 = 0.5;
-
-/// Deviation of the voltage drop from that of the scaled resistances, over one second: 40 % that repeats itself over 100 s. How
-/// resistance is spread over time, SOC and temperature differs between cells. Chosen on LG HG2 from 0 to -10 degrees C.
-const DROP_SQRT_S: f64 = 4.0;
-
-/// How far the curve under load is lower at 0 degrees C than at 25, mean and standard deviation, V: the resistance of charge transfer
-/// is larger at small currents than at large ones (Butler-Volmer), and in the cold much larger; beside the resistances, which are those
-/// of large currents, this is nearly a constant. By the errors of the label's SOC at 10, 0 and -10 degrees C: LG HG2 0.03 V,
-/// Panasonic 0.03 V with 0.01 of ageing in it, Leaf cell -0.01 V (10 degrees C alone), LG M50 simulated 0.
-const COLD_SAG_V: (f64, f64) = (0.015, 0.015);
-
 /// The curve's sag at a temperature, in parts of that at 0 degrees C.
 pub(super) fn cold_share(temperature_c: f64) -> f64 {
     ((25.0 - temperature_c) / 25.0).max(0.0)
 }
 
-/// What is known of the sag by the label.
+/// How far the curve under load is lower at 0 degrees C than at 25, mean and standard deviation, V: the resistance of charge transfer
+/// is larger at small currents than at large ones (Butler-Volmer), and in the cold much larger; beside the resistances, which are those
+/// of large currents, this is nearly a constant. By the errors of the label's SOC at 10, 0 and -10 degrees C: LG HG2 0.03 V,
+/// Panasonic 0.03 V with 0.01 of ageing in it, Leaf cell -0.01 V (10 degrees C alone), LG M50 simulated 0.
 pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
-    ScalarGaussian::from_std(COLD_SAG_V.0, COLD_SAG_V.1)
+    ScalarGaussian::from_std(0.015, 0.015)
 }
-
-/// Deviation of the capacity from the label, fraction: tolerance, age of the cell.
-const CAPACITY_STD: f64 = 0.1;
 
 impl Label {
     /// The label with the chemistry's usual cut-off voltages.
@@ -227,7 +205,8 @@ impl Label {
     /// The label with another chemistry: between the same voltages where these are usual of it, else between its usual ones.
     pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
         let (low_v, high_v) = chemistry.usual_voltages_v();
-        let is_usual = (self.voltage_max_v - high_v).abs() <= USUAL_WITHIN_V;
+        // A highest voltage within 0.2 V of a chemistry's usual one is one of that chemistry.
+        let is_usual = (self.voltage_max_v - high_v).abs() <= 0.2;
         let (voltage_min_v, voltage_max_v) =
             if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
         Self { chemistry, voltage_min_v, voltage_max_v, ..*self }
@@ -238,7 +217,8 @@ impl Label {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
         let cell_type = CellType {
             positives: &self.chemistry.positives(),
-            negatives: &NEGATIVES,
+            // Those of the library whose plateaus are those of graphite against lithium.
+            negatives: &[Negative::GraphiteSiox, Negative::Graphite, Negative::GraphiteStaged],
             empty_v: self.voltage_min_v,
             full_v: &full_v,
             hysteresis_v: self.chemistry.hysteresis_v(),
@@ -256,11 +236,16 @@ impl Label {
         let curve = self.curve()?;
         let (modes_v, rest_v) = curve.modes_v();
         let spread = ModelSpread {
-            curve_v: curve::median(&rest_v),
-            log_resistance: LOG_RESISTANCE_STD,
-            slow_branch: SLOW_BRANCH_STD,
-            capacity: CAPACITY_STD,
-            drop_sqrt_s: DROP_SQRT_S,
+            curve_v: median(rest_v.iter().copied()).unwrap_or_default(),
+            // Between the five fitted cells; the temperature's law adds to it away from 25 degrees C.
+            log_resistance: 0.45,
+            // Between the same five.
+            slow_branch: 0.5,
+            // Tolerance, and age of the cell.
+            capacity: 0.1,
+            // 40 % that repeats itself over 100 s: how resistance is spread over time, SOC and temperature differs between cells.
+            // Chosen on LG HG2 from 0 to -10 degrees C.
+            drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
         let of_cells = CurveOfCells { mean_v, modes_v, rest_v, cold_sag_v: usual_cold_sag_v(), electrodes };
@@ -284,14 +269,15 @@ impl Label {
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
-            .unwrap_or_else(|| AgedOcv::of_shift(AGEING_SHIFT, &SOC, capacity_ah, &rows));
+            // The shift of a cell whose electrodes are not in the library.
+            .unwrap_or_else(|| AgedOcv::of_shift(0.5, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {
             let UsualResistance { ohm_ah, shape, .. } = &RESISTANCE[j];
             let row = |&t: &f64| {
                 let by_temperature = arrhenius(t);
                 let at = |&soc: &f64| {
-                    let ohm = ohm_ah / self.rated_ah * curve::interpolate(&SHAPE_SOC, shape, soc);
+                    let ohm = ohm_ah / self.rated_ah * interpolate(&SHAPE_SOC, shape, soc);
                     ohm * by_temperature * factors.ratio(j, soc, by_temperature)
                 };
                 SOC.iter().map(at).collect()
@@ -335,9 +321,6 @@ impl Label {
 
 /// Load at which an error of the resistances counts as one of the model, per rated capacity: C/2.
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
-
-/// Shift of the curve of an ageing cell whose electrodes are not in the library.
-const AGEING_SHIFT: f64 = 0.5;
 
 #[cfg(test)]
 mod tests;

@@ -49,12 +49,6 @@ impl Coverage {
         self.soc.iter().filter(|count| **count > 0).count() as f64 / PARTS as f64
     }
 
-    /// Whether the part of the SOC around this one was seen.
-    pub fn has_soc(&self, soc: f64) -> bool {
-        let part = (soc * PARTS as f64).max(0.0) as usize;
-        self.soc[part.min(PARTS - 1)] > 0
-    }
-
     /// Ranges of the SOC that were seen, fractions.
     pub fn soc_ranges(&self) -> Vec<[f64; 2]> {
         let parts = (0..PARTS).filter(|part| self.soc[*part] > 0);
@@ -95,6 +89,5 @@ mod tests {
         assert_eq!(coverage.soc_ranges(), [[0.0, 0.1], [0.3, 0.5], [0.9, 1.0]]);
         assert_eq!(coverage.temperature_ranges_c(), [[-10.0, 20.0], [40.0, 50.0]]);
         assert_eq!(coverage.soc_share(), 0.4);
-        assert!(coverage.has_soc(0.45) && !coverage.has_soc(0.6) && coverage.has_soc(1.2));
     }
 }

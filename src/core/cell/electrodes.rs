@@ -12,19 +12,10 @@
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
 //! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve. An ageing cell never gains lithium.
 
-use crate::filter::bisect;
+use crate::filter::crossing;
 
 /// Smallest distance of a lithium content from 0 and 1, where the half-cell functions diverge.
 const EDGE: f64 = 1e-4;
-
-/// Least cyclable lithium in the search for a capacity, relative to the new cell's.
-const LEAST_LITHIUM: f64 = 0.05;
-
-/// Lithium, relative to the new cell's, with which a cell without an excess of it has less capacity.
-const LITHIUM_PROBE: f64 = 0.995;
-
-/// Largest error of an aged cell's end voltages, V.
-const END_TOLERANCE_V: f64 = 0.001;
 
 /// Half-cell potential of a positive electrode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -284,21 +275,16 @@ impl Electrodes {
             cell
         };
         let new = |lithium: f64| cell(LostMaterial::default(), lithium).capacity();
-        if new(LITHIUM_PROBE * new_lithium) >= new(new_lithium) {
+        // With a little less lithium, a cell without an excess of it has less capacity.
+        if new(0.995 * new_lithium) >= new(new_lithium) {
             return None;
         }
         let is_below = |lithium: f64| cell(lost, lithium).capacity() < capacity;
-        let found = cell(lost, crossing((LEAST_LITHIUM * new_lithium, new_lithium), is_below));
-        let reaches = |(soc, end_v): (f64, f64)| (found.voltage_v(soc) - end_v).abs() < END_TOLERANCE_V;
+        let found = cell(lost, crossing((0.05 * new_lithium, new_lithium), is_below));
+        let reaches = |(soc, end_v): (f64, f64)| (found.voltage_v(soc) - end_v).abs() < 0.001;
         let is_whole = [0.0, 1.0].into_iter().zip(ends_v).all(reaches);
         (is_whole && (found.capacity() - capacity).abs() < 1e-6).then_some(found)
     }
-}
-
-/// Where `is_below` turns false, to 2^-40 of the interval.
-fn crossing(ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> f64 {
-    let (low, high) = bisect(ends, 40, is_below);
-    0.5 * (low + high)
 }
 
 impl AgedElectrodes {

@@ -13,7 +13,7 @@
 
 use super::aged_ocv::{AgedOcv, AgeingLaw, MIXES, OffsetLine};
 use super::loss_modes::LossModes;
-use crate::filter::{ScalarGaussian, bisect};
+use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
 
 /// Most RC branches a model may have.
 pub const MAX_BRANCHES: usize = 3;
@@ -22,19 +22,11 @@ pub const MAX_BRANCHES: usize = 3;
 /// cells of this kind).
 pub const ACTIVATION_ENERGY_J_PER_MOL: f64 = 25_000.0;
 
-/// Gas constant, J/(mol K) (CODATA 2018).
-const GAS_CONSTANT_J_PER_MOL_K: f64 = 8.314_462_618;
-
-/// 0 degrees C in K.
-const ZERO_CELSIUS_K: f64 = 273.15;
-
-/// Temperature at which [`arrhenius`] is 1, degrees C.
-const REFERENCE_C: f64 = 25.0;
-
 /// Resistance at a temperature, relative to that at 25 degrees C.
 pub fn arrhenius(temperature_c: f64) -> f64 {
-    let per_kelvin = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
-    libm::exp(ACTIVATION_ENERGY_J_PER_MOL / GAS_CONSTANT_J_PER_MOL_K * per_kelvin)
+    let per_kelvin = 1.0 / (temperature_c + 273.15) - 1.0 / (25.0 + 273.15);
+    // Over the gas constant, J/(mol K) (CODATA 2018).
+    libm::exp(ACTIVATION_ENERGY_J_PER_MOL / 8.314_462_618 * per_kelvin)
 }
 
 /// One table over SOC (columns) x temperature (rows).
@@ -155,19 +147,8 @@ impl TemperaturePosition {
 
 impl Table {
     fn at(&self, position: &GridPosition, along_s: f64, along_t: f64) -> f64 {
-        position.temperature.between(along_t, |t| interpolate(&self.values[t], position.s, along_s))
+        position.temperature.between(along_t, |t| interpolation::between(&self.values[t], position.s, along_s))
     }
-}
-
-fn interpolate(row: &[f64], s: usize, along: f64) -> f64 {
-    row[s] + along * (row[s + 1] - row[s])
-}
-
-/// Interval of `x` in rising `breakpoints`, and how far along it `x` is (below 0 or above 1 outside).
-fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
-    let last = breakpoints.len() - 2;
-    let i = breakpoints[1..=last].iter().take_while(|&&b| x >= b).count();
-    (i, (x - breakpoints[i]) / (breakpoints[i + 1] - breakpoints[i]))
 }
 
 impl CellModel {
@@ -295,8 +276,7 @@ impl CellModel {
     /// SOC at which a cell that has aged to a capacity has an open-circuit voltage, see [`Self::soc_of_ocv`].
     pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
         let is_below = |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), capacity_ah);
-        let (low, high) = bisect((-0.5, 1.5), 40, is_below);
-        0.5 * (low + high)
+        crossing((-0.5, 1.5), is_below)
     }
 }
 

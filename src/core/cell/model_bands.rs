@@ -15,15 +15,13 @@ pub use advice::{Advice, Measurement, advise};
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::{CellModel, ERROR_WINDOW_S, GridPosition, ModelSpread};
+use crate::filter::square;
 
 /// Temperature at which a curve is shown, degrees C; a table without it has the nearest.
 pub const CURVE_C: f64 = 25.0;
 
 /// Variance of an SOC of which nothing is known: evenly distributed between 0 and 1.
 const EVEN_VARIANCE: f64 = 1.0 / 12.0;
-
-/// Distance to either side over which the slope of a curve is taken, SOC: a filter sees no finer.
-const SLOPE_SOC: f64 = 0.025;
 
 /// Standard deviation of ln(resistance).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,9 +56,9 @@ impl<'a> ModelBands<'a> {
         self.model.ocv_v(&self.at(soc))
     }
 
-    /// Slope of the open-circuit voltage there, V per unit of SOC, over a distance that a filter resolves.
+    /// Slope of the open-circuit voltage there, V per unit of SOC, over 5 % of SOC: a filter sees no finer.
     pub fn slope_v(&self, soc: f64) -> f64 {
-        let (low, high) = ((soc - SLOPE_SOC).max(0.0), (soc + SLOPE_SOC).min(1.0));
+        let (low, high) = ((soc - 0.025).max(0.0), (soc + 0.025).min(1.0));
         (self.ocv_v(high) - self.ocv_v(low)) / (high - low)
     }
 
@@ -132,10 +130,6 @@ impl<'a> ModelBands<'a> {
 /// variance `before`.
 fn soc_variance(voltage_variance: f64, slope_v: f64, before: f64) -> f64 {
     1.0 / (slope_v * slope_v / voltage_variance + 1.0 / before)
-}
-
-fn square(x: f64) -> f64 {
-    x * x
 }
 
 #[cfg(test)]

@@ -19,23 +19,11 @@
 use serde::{Deserialize, Serialize};
 
 use crate::cell::CellModel;
-use crate::filter::Update;
+use crate::filter::{Update, square};
 use crate::quantity::InvalidState;
 
 /// Time of use that is judged, s. Half of it shows another cell on drives from -10 to 40 degrees C; later, ageing counts as well.
 const WINDOW_S: f64 = 3600.0;
-
-/// Time of use before a judgement, s: in the first minutes the filter still settles, and one wrong reading weighs much.
-const SETTLING_S: f64 = 600.0;
-
-/// Time between two pieces of evidence, s: short against the 100 s over which a model states its error.
-const PERIOD_S: f64 = 10.0;
-
-/// Longest time that one reading stands for, s.
-const MAX_PERIOD_S: f64 = 90.0;
-
-/// Least mean current that is use, per rated capacity: C/50. Below it the resistance shows nothing.
-const LEAST_USE_PER_H: f64 = 0.02;
 
 /// Standard deviations of what another cell's curve adds to the voltage: a constant, V, and a slope, V per unit of SOC.
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
@@ -45,10 +33,6 @@ const CORROBORATED: f64 = 4.0;
 
 /// Sum of the witnesses that is a mismatch: three deviations (constant, slope, resistance) of 1.4 standard deviations each.
 const LIMIT: f64 = 6.0;
-
-fn square(x: f64) -> f64 {
-    x * x
-}
 
 /// Evidence about one cell's model.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -195,13 +179,15 @@ impl ModelCheck {
     /// Whether evidence is due.
     #[inline]
     pub fn is_due(&self) -> bool {
-        self.since_s >= PERIOD_S && self.is_open()
+        // Every 10 s: short against the 100 s over which a model states its error.
+        self.since_s >= 10.0 && self.is_open()
     }
 
     /// Takes due evidence of a cell of rated capacity `rated_ah`, Ah; `None` when the filter has none.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
-        let (elapsed_s, charge_as) = (self.since_s.min(MAX_PERIOD_S), self.since_as);
-        let is_used = charge_as.abs() >= LEAST_USE_PER_H * rated_ah * self.since_s;
+        // One reading stands for at most 90 s. Below C/50 the resistance shows nothing.
+        let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
+        let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);
         let Some(ModelEvidence { update, soc, log_resistance, log_resistance_std }) = evidence else { return };
         // A reading's variance is that of the step before it.
@@ -216,7 +202,8 @@ impl ModelCheck {
             // Sums that cannot be stored are evidence of nothing.
             *self = Self::new(self.model);
         }
-        if self.use_s < SETTLING_S {
+        // In the first minutes the filter still settles, and one wrong reading weighs much.
+        if self.use_s < 600.0 {
             return;
         }
         let resistance = if log_resistance_std > 0.0 { square(log_resistance / log_resistance_std) } else { 0.0 };

@@ -11,10 +11,6 @@ use super::model_bands::CURVE_C;
 const CURVE_STEPS: u32 = 100;
 /// Steps of SOC in which a voltage under load is looked up: a multiple of the others.
 const READ_STEPS: u32 = 400;
-/// SOC of compared resistances, steps of 10 %.
-const RESISTANCE_STEPS: std::ops::RangeInclusive<u32> = 1..=9;
-/// Temperatures of compared resistances, degrees C, as far as both models have them.
-const TEMPERATURES_C: [f64; 7] = [-20.0, -10.0, 0.0, 10.0, 25.0, 40.0, 50.0];
 /// SOC between which an error of the SOC counts: beyond, curves are so steep that any model is good.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
@@ -83,7 +79,8 @@ impl ModelComparison {
             .map(|k| f64::from(k) / f64::from(CURVE_STEPS))
             .map(|soc| AtSoc { soc, value: ocv_v(second, soc) - ocv_v(first, soc) })
             .collect();
-        let shared = TEMPERATURES_C.into_iter().filter(|&t| [first, second].iter().all(|model| has(model, t)));
+        let shared = [-20.0, -10.0, 0.0, 10.0, 25.0, 40.0, 50.0].into_iter();
+        let shared = shared.filter(|&t| [first, second].iter().all(|model| has(model, t)));
         Self {
             curve: Difference::of(&curve_v),
             rest_soc: soc_difference(first, second, CURVE_C, 0.0),
@@ -114,7 +111,7 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
             let [first, second] = [first, second].map(|model| model.rated_capacity_ah * ohm(model, soc, temperature_c));
             AtSoc { soc, value: second / first - 1.0 }
         };
-        Difference::of(&RESISTANCE_STEPS.map(at).collect::<Vec<_>>())
+        Difference::of(&(1..=9).map(at).collect::<Vec<_>>())
     };
     AtTemperature {
         temperature_c,

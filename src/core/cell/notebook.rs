@@ -16,28 +16,11 @@ use crate::quantity::InvalidState;
 
 /// Most rows: with 64 bytes each below 8 kB.
 pub const MAX_ROWS: usize = 120;
-/// Most stretches: each has an SOC of its own to be found.
-const MAX_STRETCHES: usize = 16;
-/// A row ends when the SOC has moved by this, after this time, s, or when the temperature has changed by this, K. A row of rest is
-/// at least as long as this part of the rest so far: a night is a few rows.
-const ROW_SOC: f64 = 0.02;
-const ROW_S: f64 = 300.0;
-const ROW_K: f64 = 4.0;
-const REST_PART: f64 = 0.5;
 /// Below this SOC, where curves are steep and resistances rise, a row is shorter by a factor.
 const LOW_SOC: f64 = 0.15;
 const LOW_SOC_PART: f64 = 0.25;
-/// Shortest row at the end of a stretch, s.
-const LEAST_ROW_S: f64 = 20.0;
-/// Shortest time between two readings of the mean cell, s.
-const INTERVAL_S: f64 = 1.0;
-/// Longest time between two readings whose difference counts as a step of the current, s.
-const STEP_S: f64 = 3.0;
-/// Time without a measured current that ends a stretch, s.
-const HOLE_S: f64 = 10.0;
 /// Classes of SOC and temperature.
 const CLASS_SOC: f64 = 0.1;
-const CLASS_K: f64 = 10.0;
 /// Currents below this part of the rated capacity per hour are rest.
 const REST_PER_H: f64 = 0.02;
 
@@ -246,7 +229,8 @@ impl Notebook {
             readings.temperatures += 1;
             readings.temperature_c += temperature_c;
         }
-        let is_due = readings.count >= config.cells && readings.measured_s >= INTERVAL_S * f64::from(config.cells);
+        // The mean cell has at most one reading a second.
+        let is_due = readings.count >= config.cells && readings.measured_s >= f64::from(config.cells);
         // The first reading of a stretch has no time before it.
         let begins = self.present.is_none() && readings.count >= config.cells;
         (is_due || begins) && self.close_readings(config, step.ambient_c)
@@ -259,7 +243,8 @@ impl Notebook {
         let (cells, count) = (f64::from(config.cells), f64::from(count));
         let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
         let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
-        if unmeasured_s > HOLE_S * cells {
+        // A longer time without a measured current ends a stretch.
+        if unmeasured_s > 10.0 * cells {
             self.end_stretch(config);
         }
         let last = self.rows.last().filter(|row| row.stretch == self.number);
@@ -296,7 +281,8 @@ impl Notebook {
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
-        if dt_s <= STEP_S {
+        // Over a longer time a difference is not a step of the current.
+        if dt_s <= 3.0 {
             let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
             let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
             row.steps.iter_mut().zip(products).for_each(|(sum, product)| *sum += product);
@@ -311,9 +297,10 @@ impl Notebook {
         row.filtered_a.iter_mut().zip(filtered_a).for_each(|(sum, filtered_a)| *sum += dt_s * filtered_a);
         let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
         let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
-        (charge_ah - first_ah).abs() >= part * ROW_SOC * config.rated_ah
-            || row.seconds >= ROW_S.max(REST_PART * stretch.rest_s)
-            || (temperature_c - first_c).abs() >= ROW_K
+        (charge_ah - first_ah).abs() >= part * 0.02 * config.rated_ah
+            // In rest a row is at least half as long as the rest so far: a night is a few rows.
+            || row.seconds >= f64::max(300.0, 0.5 * stretch.rest_s)
+            || (temperature_c - first_c).abs() >= 4.0
     }
 
     /// Ends the present row, at an estimated SOC.
@@ -346,7 +333,7 @@ impl Notebook {
     pub fn finish_row(&mut self, config: &NotebookConfig) {
         let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
         if let (Some(stretch), Some(before)) = (&self.present, before)
-            && stretch.row.seconds >= LEAST_ROW_S
+            && stretch.row.seconds >= 20.0
         {
             let moved_ah = stretch.charge_ah - f64::from(before.charge_ah);
             self.close_row(config, f64::from(before.soc) - moved_ah / config.rated_ah);
@@ -362,7 +349,8 @@ impl Notebook {
     /// Drops rows beyond the bounds.
     fn make_room(&mut self, config: &NotebookConfig) {
         let class_of = |row: &Row| row.class(config.rated_ah);
-        if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > MAX_STRETCHES
+        // Each stretch has an SOC of its own to be found.
+        if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > 16
             && let Some(dropped) = self.least_missed(config)
         {
             let unread_from = self.rows.len() - self.new_rows().len();
@@ -446,6 +434,6 @@ impl Row {
         let direction = if current_a > rest_a { 1 } else { -i32::from(current_a < -rest_a) };
         let step = |value: f32, width: f64| (f64::from(value) / width).floor().clamp(-100.0, 100.0) as i32;
         let soc_width = if f64::from(self.soc) < LOW_SOC { LOW_SOC_PART * CLASS_SOC } else { CLASS_SOC };
-        (step(self.soc, soc_width), step(self.temperature_c, CLASS_K), direction)
+        (step(self.soc, soc_width), step(self.temperature_c, 10.0), direction)
     }
 }

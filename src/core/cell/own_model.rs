@@ -12,17 +12,11 @@ use super::chemistry::{CurveOfCells, FACTOR_SOC, Label, LabelPrior, ResistanceFa
 use super::config::EstimatorConfig;
 use super::model::{CellModel, ModelSpread};
 use super::notebook::Row;
-use crate::filter::ScalarGaussian;
+use crate::filter::{ScalarGaussian, median};
 use crate::quantity::InvalidState;
 
 /// SOC breakpoints of such a model.
 pub const SOC_NODES: usize = 21;
-
-/// Spread of a cell from the pack's model, beside what the fit leaves: cells of one pack are of one kind.
-const CELL_LOG_RESISTANCE: f64 = 0.1;
-const CELL_SLOW_BRANCH: f64 = 0.2;
-/// Error of the voltage drop that no table of resistances removes, over one second: 10 % that repeats itself over 100 s.
-const DROP_SQRT_S: f64 = 1.0;
 
 /// A fitted model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -56,14 +50,14 @@ impl OwnModel {
             cold_sag_v: self.cold_sag_v,
             electrodes: label.curve()?.electrodes,
         };
-        let mut sorted = self.rest_v;
-        sorted.sort_by(f64::total_cmp);
         let spread = ModelSpread {
-            curve_v: sorted[SOC_NODES / 2],
-            log_resistance: CELL_LOG_RESISTANCE,
-            slow_branch: CELL_SLOW_BRANCH,
+            curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
+            // Cells of one pack are of one kind.
+            log_resistance: 0.1,
+            slow_branch: 0.2,
             capacity: self.capacity.std() / self.capacity.mean,
-            drop_sqrt_s: DROP_SQRT_S,
+            // 10 % that repeats itself over 100 s, which no table of resistances removes.
+            drop_sqrt_s: 1.0,
         };
         let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
         model.name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);

@@ -9,19 +9,12 @@
 //! model that states none, the considered offset of the voltage stands for its curve as well.
 
 use super::CapacityConfig;
-use super::learner::HalfCycle;
+use super::half_cycle::HalfCycle;
 use crate::cell::CellModel;
 use crate::quantity::Mode;
 
 /// Number of errors: nodes of the SOC, evenly from empty to full. Curves of real cells err differently a quarter of it apart.
 pub(super) const END_ERRORS: usize = 5;
-
-/// Smallest swing that a half-cycle counts with: below it the measurement has no use.
-const MIN_WEIGHED_SWING: f64 = 0.02;
-
-/// Part of the model's own error that is the curve's and lasts: the rest, of the currents' history, differs from one half-cycle to
-/// the next.
-const LASTING: f64 = 0.5;
 
 /// Effect of one standard deviation of each error on the capacity by a half-cycle, Ah; zero when its ends are not known.
 pub(super) fn effects_ah(
@@ -33,13 +26,15 @@ pub(super) fn effects_ah(
     let mut effects = [0.0; END_ERRORS];
     let Some(ends) = &half_cycle.ends else { return effects };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
-    let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
+    // Below a swing of 2 % the measurement has no use.
+    let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // From a discharge's first end, the fuller one, to its last; a charge the other way round.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position(*soc, temperature_c);
         let per_volt = -fuller * capacity_ah / (swing * model.ocv_slope_v(&position, capacity_ah));
-        let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| LASTING * error_v);
+        // Half of the model's own error is the curve's and lasts; the rest, of the currents' history, differs between half-cycles.
+        let own_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let error_v = config.end_error_v.unwrap_or_else(own_v);
         let along = soc.clamp(0.0, 1.0) * (END_ERRORS - 1) as f64;
         let node = (0..END_ERRORS - 2).take_while(|&k| along >= (k + 1) as f64).count();

@@ -53,21 +53,11 @@ const KNEE_DRIFT: f64 = 9.0;
 const KNEE_WALK: f64 = 1.5;
 /// Standard deviation of the recovery while the cell is used, part of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
-/// Use over which the recovery decays by an e-fold, equivalent full cycles.
-const RECOVERY_CYCLES: f64 = 10.0;
 /// Standard deviation of the recovery gained by rest, part of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
 /// Time constant of the recovery in rest, days; also of its decay on the axis of days.
 const RECOVERY_DAYS: f64 = 1.0;
-/// Assumed duration of an unknown rest, days: the recovery is complete.
-const LONG_REST_DAYS: f64 = 30.0;
 const DAY_S: f64 = 86_400.0;
-/// Standard deviation of a reading's own noise beyond its stated variance, part of the reference.
-const READING_NOISE: f64 = 0.003;
-/// Standard deviation of the level before the first reading, part of the reference: as good as unknown.
-const LEVEL_PRIOR: f64 = 1.0;
-/// Standard deviation of the rate before the first reading, part of the reference per unit of use: 2 % a cycle.
-const RATE_PRIOR: f64 = 0.02;
 
 /// Fewest readings of a forecast: two make a rate, the third can contradict it.
 pub const MIN_READINGS: u32 = 3;
@@ -77,11 +67,6 @@ pub const MIN_FADE_DEVIATIONS: f64 = 1.0;
 pub const MAX_SPREAD: f64 = 10.0;
 /// Time constant of the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
-
-/// A cell is at its end when its level is below the threshold by this many deviations: with 95 % probability.
-const PASSED_DEVIATIONS: f64 = 1.645;
-/// Largest innovation of a reading, in deviations; the noise of an outlier is raised until it meets this bound.
-const MAX_MISS_DEVIATIONS: f64 = 5.0;
 
 /// Quantiles of the interval: 5, 50 and 95 %.
 const QUANTILES: [f64; 3] = [0.05, 0.5, 0.95];
@@ -222,7 +207,8 @@ impl Usage {
             cycles: charge_ah / (2.0 * rated_capacity_ah),
             // An unknown rest does not change the recent rate of use.
             days: used_days + known.unwrap_or(0.0),
-            rest_days: known.unwrap_or(LONG_REST_DAYS),
+            // After a long rest the recovery is complete.
+            rest_days: known.unwrap_or(30.0),
         }
     }
 }
@@ -232,8 +218,9 @@ impl Forecast {
     /// and 20 % below it.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
-        p[LEVEL][LEVEL] = LEVEL_PRIOR * LEVEL_PRIOR;
-        p[RATE][RATE] = RATE_PRIOR * RATE_PRIOR;
+        // The level is as good as unknown, the rate within 2 % a cycle.
+        p[LEVEL][LEVEL] = 1.0;
+        p[RATE][RATE] = 0.02 * 0.02;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
         p[RECOVERY][RECOVERY] = RECOVERY_IN_USE * RECOVERY_IN_USE + rest * rest;
         // Before the first reading both levels are the same.
@@ -323,7 +310,8 @@ impl Forecast {
     pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, InsufficientData> {
         self.check_readings()?;
         let threshold = threshold_ah / self.reference_ah;
-        let has_passed = self.x[LEVEL] + PASSED_DEVIATIONS * self.level_variance().sqrt() < threshold;
+        // With 95 % probability.
+        let has_passed = self.x[LEVEL] + 1.645 * self.level_variance().sqrt() < threshold;
         let remaining = if has_passed { Remaining::default() } else { self.time_to(threshold)? };
         let [cycles, days] = self.recent;
         Ok(match self.axis {
@@ -365,7 +353,8 @@ impl Forecast {
     /// Predicts: the recovery relaxes, the level falls by the rate, rate and recovery become less certain.
     fn advance(&mut self, passed: &Usage) {
         let (used, rest_days, relaxation) = match self.axis {
-            Axis::Cycles => (passed.cycles, passed.rest_days, RECOVERY_CYCLES),
+            // In use the recovery decays by an e-fold in ten cycles.
+            Axis::Cycles => (passed.cycles, passed.rest_days, 10.0),
             Axis::Days => (passed.days, passed.days, RECOVERY_DAYS),
         };
         let kept = libm::exp(-used / relaxation);
@@ -406,9 +395,11 @@ impl Forecast {
     fn observe(&mut self, reading: &CapacityReading) {
         let scale = self.reference_ah * self.reference_ah;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
-        let noise = READING_NOISE * READING_NOISE + reading.variance_ah2 / scale;
+        // A reading errs by 0.3 % beyond its stated variance.
+        let noise = 0.003 * 0.003 + reading.variance_ah2 / scale;
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
-        let miss = innovation / MAX_MISS_DEVIATIONS;
+        // The noise of an outlier is raised until it meets five deviations.
+        let miss = innovation / 5.0;
         let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
         update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
         self.shared_variance = reading.shared_variance_ah2 / scale;

@@ -16,37 +16,13 @@ use serde::{Deserialize, Serialize};
 
 use super::drift::DriftFilter;
 use super::end_errors::effects_ah;
+use super::half_cycle::HalfCycle;
 use super::offset::CurrentOffset;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
-
-/// Largest part of a half-cycle's capacity that may come from the capacity of the curve itself.
-const MAX_BY_CURVE: f64 = 0.8;
-
-/// One completed half-cycle of one cell.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HalfCycle {
-    /// Charge or discharge.
-    pub mode: Mode,
-    /// Charge moved, Ah, positive.
-    pub charge_ah: f64,
-    /// SOC swing, fraction, positive when it agrees with the charge, and its variance (errors of both ends counted as
-    /// independent); `None` when its beginning was not estimated.
-    pub swing: Option<ScalarGaussian>,
-    /// SOC at its end, fraction.
-    pub end_soc: Option<f64>,
-    /// SOC at both ends, fractions; `None` when it was not estimated.
-    pub ends: Option<[f64; 2]>,
-    /// Duration, s.
-    pub duration_s: f64,
-    /// Mean current, A, positive = discharge.
-    pub mean_current_a: f64,
-    /// Mean temperature, degrees C; `None` when there was none.
-    pub mean_temperature_c: Option<f64>,
-}
 
 /// Outcome of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -353,7 +329,8 @@ impl Learner {
         let measurement = evidence.map(|z| {
             // With the curve of the capacity that comes out: z = C + s (C_curve - C).
             let weight = 1.0 - after.variance / self.prior[cell].variance;
-            let by_curve = (estimator.capacity_by_curve() / weight).clamp(-MAX_BY_CURVE, MAX_BY_CURVE);
+            // At most that part of the capacity may come from the capacity of the curve itself.
+            let by_curve = (estimator.capacity_by_curve() / weight).clamp(-0.8, 0.8);
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
         });

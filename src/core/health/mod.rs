@@ -8,6 +8,7 @@ pub mod config;
 pub mod drift;
 mod end_errors;
 pub mod forecast;
+mod half_cycle;
 pub mod learner;
 pub mod offset;
 pub mod pack;
@@ -19,7 +20,8 @@ pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
 pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
-pub use learner::{CapacityUpdate, HalfCycle, Learner};
+pub use half_cycle::HalfCycle;
+pub use learner::{CapacityUpdate, Learner};
 pub use pack::{CellShare, PackState};
 pub use recharge::{ChargeRecord, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

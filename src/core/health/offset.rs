@@ -14,15 +14,6 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
-/// Drift of the offset in a day, part of its first standard deviation: sensors drift with temperature.
-const DRIFT_PER_DAY: f64 = 0.1;
-
-/// Largest correction at a time, standard deviations: evidence beyond it is not that of an offset.
-const MAX_DEVIATIONS: f64 = 3.0;
-
-/// Largest mean, in first standard deviations.
-const MAX_FIRST_DEVIATIONS: f64 = 5.0;
-
 /// A learned offset.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -61,8 +52,9 @@ impl CurrentOffset {
         if !(information > 0.0 && score.is_finite() && std_a > 0.0) {
             return 0.0;
         }
-        let most_a = MAX_FIRST_DEVIATIONS * configured_a;
-        let deviations = (score / (1.0 + information)).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS);
+        let most_a = 5.0 * configured_a;
+        // Evidence beyond three standard deviations is not that of an offset.
+        let deviations = (score / (1.0 + information)).clamp(-3.0, 3.0);
         let mean_a = (self.mean_a + deviations * std_a).clamp(-most_a, most_a);
         let corrected = (mean_a - self.mean_a) / std_a;
         self.mean_a = mean_a;
@@ -70,10 +62,10 @@ impl CurrentOffset {
         corrected
     }
 
-    /// Lets the offset drift for a time, s.
+    /// Lets the offset drift for a time, s: by a tenth of its first standard deviation in a day, as sensors do with temperature.
     pub fn drift(&mut self, seconds: f64) {
         if let Some(part) = &mut self.part {
-            *part = (*part * *part + DRIFT_PER_DAY * DRIFT_PER_DAY * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
+            *part = (*part * *part + 0.1 * 0.1 * seconds.max(0.0) / 86_400.0).sqrt().min(1.0);
         }
     }
 

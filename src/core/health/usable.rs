@@ -13,9 +13,6 @@ use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
 use crate::cell::{CellEstimator, CellModel, Discretisation, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 
-/// Steps over a full capacity.
-const STEPS: f64 = 400.0;
-
 /// Largest number of steps of a discharge.
 const MAX_STEPS: u32 = 2000;
 
@@ -31,7 +28,7 @@ pub fn usable_ah(
     capacity_ah: f64,
     (resistance_ratio, slow_ratio): (f64, f64),
 ) -> f64 {
-    let step_ah = capacity_ah / STEPS;
+    let step_ah = capacity_ah / 400.0;
     let step_s = 3600.0 * step_ah / config.current_a;
     let mut branch_v = [0.0; MAX_BRANCHES];
     let mut soc = full_soc;

@@ -4,37 +4,18 @@
 //!
 //! A cell is a pair of materials, the lithium content of its full negative and of its empty positive electrode; the other two
 //! contents follow from the cut-off voltages. Every pair and every content of a grid is equally likely. What no pair of the
-//! library has is a smooth deviation of [`MATERIAL_V`] and half of the hysteresis.
+//! library has is a smooth deviation of 10 mV and half of the hysteresis.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
 use crate::cell::aged_ocv::MIXES;
 use crate::cell::electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
-use crate::filter::bisect;
+use crate::filter::{bell, crossing};
 
-/// Contents of the full negative electrode: designs between fast charging and high energy.
-const FULL_NEGATIVE: [f64; 4] = [0.78, 0.84, 0.90, 0.95];
-/// Contents of the empty positive electrode: lithium lost in the first cycles.
-const EMPTY_POSITIVE: [f64; 4] = [0.84, 0.88, 0.92, 0.97];
-/// Largest content of the empty negative electrode.
-const MAX_EMPTY_NEGATIVE: f64 = 0.15;
-/// Smooth deviation of a cell's own materials from those of one name, V, and the same below [`LOW_SOC`], where curves fall
-/// steeply (the deviations that the fit of electrodes allows, `ident::electrodes`).
-const MATERIAL_V: f64 = 0.010;
-const LOW_SOC_V: f64 = 0.030;
-const LOW_SOC: f64 = 0.05;
-/// Distance over which that deviation changes, SOC.
-const MATERIAL_SOC: f64 = 0.15;
-/// Least error of a curve, V.
-const LEAST_V: f64 = 0.004;
-/// Largest distance of an end of a curve from its cut-off voltage, V.
-const END_TOLERANCE_V: f64 = 0.002;
 /// Points of a blend's table.
 const BLEND_POINTS: u32 = 400;
 /// Voltages of a blend's table, V.
 const BLEND_V: (f64, f64) = (2.5, 4.8);
-/// Slope below which a curve's error is not restated as SOC, V per unit of SOC: there, any voltage is of every SOC.
-const LEAST_SLOPE_V: f64 = 0.1;
 
 /// A positive electrode of one material or of two.
 #[derive(Debug, Clone)]
@@ -56,8 +37,7 @@ impl PositiveElectrode {
     pub fn blend(a: PositiveMaterial, share: f64, b: PositiveMaterial) -> Self {
         let content = |material: PositiveMaterial, potential_v: f64| {
             let ends = (material.least_content(), 1.0);
-            let (low, high) = bisect(ends, 40, |y| material.potential_v(y) > potential_v);
-            0.5 * (low + high)
+            crossing(ends, |y| material.potential_v(y) > potential_v)
         };
         let (low_v, high_v) = BLEND_V;
         let at = |k: u32| low_v + (high_v - low_v) * f64::from(k) / f64::from(BLEND_POINTS);
@@ -125,7 +105,10 @@ impl CurvePrior {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
-            let contents = FULL_NEGATIVE.iter().flat_map(|&x| EMPTY_POSITIVE.iter().map(move |&y| (x, y)));
+            // Contents of the full negative electrode: designs between fast charging and high energy; of the empty positive one: lithium
+            // lost in the first cycles.
+            let contents =
+                [0.78, 0.84, 0.90, 0.95].iter().flat_map(|&x| [0.84, 0.88, 0.92, 0.97].iter().map(move |&y| (x, y)));
             let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));
             ends.filter_map(move |(contents, full_v)| {
                 Some(((p, n), possible_cell((p, n), contents, (empty_v, full_v), soc)?))
@@ -139,11 +122,13 @@ impl CurvePrior {
         let mean_v: Vec<f64> =
             (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
         let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
-        let material_v = |s: usize| if soc[s] < LOW_SOC { LOW_SOC_V } else { MATERIAL_V };
+        // Smooth deviation of a cell's own materials from those of one name, larger where curves fall steeply (the deviations that
+        // the fit of electrodes allows, `ident::electrodes`).
+        let material_v = |s: usize| if soc[s] < 0.05 { 0.030 } else { 0.010 };
         let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
             let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
-            let distance = (soc[a] - soc[b]) / MATERIAL_SOC;
-            let material = material_v(a) * material_v(b) * libm::exp(-0.5 * distance * distance);
+            // The deviation changes over 15 % of SOC.
+            let material = material_v(a) * material_v(b) * bell((soc[a] - soc[b]) / 0.15);
             between + material + hysteresis_v * hysteresis_v
         });
         let distance = |cell: &PossibleCell| (0..soc.len()).map(|s| off_v(cell, s) * off_v(cell, s)).sum::<f64>();
@@ -166,7 +151,8 @@ impl CurvePrior {
         let n = self.soc.len();
         let slope_v = |s: usize| {
             let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
-            ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(LEAST_SLOPE_V)
+            // On a flatter curve any voltage is of every SOC.
+            ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(0.1)
         };
         let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
         let weight: Vec<f64> = (0..n).map(|s| width(s).sqrt() / slope_v(s)).collect();
@@ -183,7 +169,8 @@ impl CurvePrior {
         let modes_v: [Vec<f64>; MIXES] = std::array::from_fn(mode);
         let rest = |s: usize| {
             let explained: f64 = modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
-            (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(LEAST_V)
+            // Least error of a curve, V.
+            (self.covariance[(s, s)] - explained).max(0.0).sqrt().max(0.004)
         };
         let rest_v = (0..n).map(rest).collect();
         (modes_v, rest_v)
@@ -197,13 +184,12 @@ fn possible_cell(
     (low_v, high_v): (f64, f64),
     soc: &[f64],
 ) -> Option<PossibleCell> {
-    let middle = |(a, b): (f64, f64)| 0.5 * (a + b);
     let full_v = |y: f64| positive.potential_v(y) - negative.potential_v(negative_full);
     let empty_v = |x: f64| positive.potential_v(positive_empty) - negative.potential_v(x);
-    let positive_full = middle(bisect((positive.least_content(), positive_empty), 40, |y| full_v(y) > high_v));
-    let negative_empty = middle(bisect((0.0, MAX_EMPTY_NEGATIVE), 40, |x| empty_v(x) < low_v));
-    let reaches = (full_v(positive_full) - high_v).abs() < END_TOLERANCE_V
-        && (empty_v(negative_empty) - low_v).abs() < END_TOLERANCE_V;
+    let positive_full = crossing((positive.least_content(), positive_empty), |y| full_v(y) > high_v);
+    let negative_empty = crossing((0.0, 0.15), |x| empty_v(x) < low_v);
+    let reaches =
+        [full_v(positive_full) - high_v, empty_v(negative_empty) - low_v].iter().all(|off_v| off_v.abs() < 0.002);
     let at = |soc: f64, empty: f64, full: f64| empty + soc * (full - empty);
     let voltage_v = |soc: f64| {
         positive.potential_v(at(soc, positive_empty, positive_full))
@@ -213,18 +199,4 @@ fn possible_cell(
     let rises = curve_v.windows(2).all(|pair| pair[0] < pair[1]);
     let contents = [negative_empty, negative_full, positive_empty, positive_full];
     (reaches && rises).then_some(PossibleCell { contents, curve_v })
-}
-
-/// Linear between the points, which rise in `x`; constant outside.
-pub(super) fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
-    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
-    let along = ((at - x[k]) / (x[k + 1] - x[k])).clamp(0.0, 1.0);
-    y[k] + along * (y[k + 1] - y[k])
-}
-
-/// The middle value.
-pub(super) fn median(values: &[f64]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted[sorted.len() / 2]
 }

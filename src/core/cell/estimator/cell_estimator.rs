@@ -20,11 +20,6 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::{CONSTANT_ERRORS, FilterError, ScalarGaussian, Update};
 use crate::quantity::bounds;
 
-/// Usual load before a start under load, per rated capacity: C/2.
-const USUAL_LOAD_PER_H: f64 = 0.5;
-/// Least and largest SOC at a start by the voltage.
-const FIRST_SOC: (f64, f64) = (-0.05, 1.05);
-
 /// State in which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdoptedState {
@@ -39,12 +34,6 @@ pub struct AdoptedState {
     /// Current through first-order filters with the time constants of the branches, A; `None` = the branches have relaxed.
     pub filtered_a: Option<[f64; MAX_BRANCHES]>,
 }
-
-/// Temperature of a cell whose own was never known, degrees C.
-const ADOPTED_C: f64 = 25.0;
-
-/// Largest correlation of an adopted SOC with the capacity.
-const ADOPTED_CORRELATION: f64 = 0.99;
 
 /// The estimator of one cell.
 #[derive(Debug, Clone)]
@@ -99,7 +88,7 @@ impl CellEstimator {
         let information_s = self.memory.information_s.clamp(1e-3, config.voltage.max_information_s);
         let load_a = self.memory.load_a;
         let temperature = model.temperature_position(temperature_c);
-        let curve = self.memory.curve();
+        let curve = self.memory.curve;
         let slow_branch = self.memory.slow_branch;
         let (slow_ratio, slow_std) = (slow_branch.ratio, slow_branch.std(config.sensor.slow_branch));
         let reading = VoltageReading {
@@ -141,9 +130,7 @@ impl CellEstimator {
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
             // On a flat curve a voltage just beyond its end would be of any SOC.
-            model
-                .soc_of_aged_ocv(&temperature, self.memory.curve().mean, step.voltage_v + load_v)
-                .clamp(FIRST_SOC.0, FIRST_SOC.1)
+            model.soc_of_aged_ocv(&temperature, self.memory.curve.mean, step.voltage_v + load_v).clamp(-0.05, 1.05)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = self.first_branch_variance(model, config, step, soc.mean);
@@ -170,7 +157,7 @@ impl CellEstimator {
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
-        self.memory.set_curve(state.capacity);
+        self.memory.curve = state.capacity;
         self.memory.log_resistance = ScalarGaussian::from_std(state.log_resistance, config.initial.log_resistance_std);
         (self.memory.slow_branch, self.memory.rejected, self.memory.rejected_s) = (SlowBranch::default(), 0, 0.0);
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
@@ -184,7 +171,8 @@ impl CellEstimator {
             covariance: 0.0,
             by_constant: SMatrix::zeros(),
         };
-        let position = model.grid_position(soc.mean, temperature_c.unwrap_or(ADOPTED_C));
+        // A cell whose temperature was never known counts as at 25 degrees C.
+        let position = model.grid_position(soc.mean, temperature_c.unwrap_or(25.0));
         let ratio = libm::exp(state.log_resistance);
         let filtered_a = state.filtered_a.unwrap_or_default();
         let branch_v = |i: usize| model.branch_r_ohm(i, &position) * ratio * filtered_a[i];
@@ -200,7 +188,7 @@ impl CellEstimator {
         };
         each!(&mut filter, x => {
             // Rounding must not make them more than fully correlated.
-            let most = ADOPTED_CORRELATION * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
+            let most = 0.99 * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
             let covariance = state.soc_by_capacity.clamp(-most, most);
             (x.covariance[(0, CAPACITY)], x.covariance[(CAPACITY, 0)]) = (covariance, covariance);
             for i in 0..model.branches.len() {
@@ -221,7 +209,8 @@ impl CellEstimator {
         let position = model.grid_position(soc, self.memory.temperature_c.unwrap_or(step.ambient_c));
         let ratio = libm::exp(self.memory.log_resistance.mean);
         let is_loaded = step.current_a.is_some_and(|current_a| current_a.abs() > config.gap.rest_current_a);
-        let load_a = if is_loaded { USUAL_LOAD_PER_H * model.rated_capacity_ah } else { 0.0 };
+        // Usual load before a start under load: C/2.
+        let load_a = if is_loaded { 0.5 * model.rated_capacity_ah } else { 0.0 };
         let mut variance = [square(config.initial.branch_std_v).max(KNOWN_VARIANCE); MAX_BRANCHES];
         for (i, variance) in variance.iter_mut().enumerate().take(model.branches.len()) {
             *variance += square(model.branch_r_ohm(i, &position) * ratio * load_a);
@@ -360,12 +349,12 @@ impl CellEstimator {
 
     /// Capacity of the open-circuit curve, Ah.
     pub fn curve(&self) -> ScalarGaussian {
-        self.memory.curve()
+        self.memory.curve
     }
 
     /// Change of the capacity estimate with the capacity of the open-circuit curve since the last restatement.
     pub fn capacity_by_curve(&self) -> f64 {
-        let std_ah = self.memory.curve().std();
+        let std_ah = self.memory.curve.std();
         let by_curve = |x: f64| if std_ah > 0.0 { -x / std_ah } else { 0.0 };
         self.filter
             .as_ref()
@@ -378,8 +367,8 @@ impl CellEstimator {
     /// The filter's variance never falls by that: the evidence since the last call may have counted for too much.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
         self.memory.capacity = capacity;
-        let before = self.memory.curve();
-        self.memory.set_curve(capacity);
+        let before = self.memory.curve;
+        self.memory.curve = capacity;
         if let Some(filter) = &mut self.filter {
             each!(filter, x => {
                 let column = x.by_constant.column(CURVE_CAPACITY).into_owned();
@@ -405,7 +394,7 @@ impl CellEstimator {
     /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
-        self.memory.set_curve(ScalarGaussian { mean: capacity_ah, variance: 0.0 });
+        self.memory.curve = ScalarGaussian { mean: capacity_ah, variance: 0.0 };
         if let Some(filter) = &mut self.filter {
             each!(filter, x => x.mean[CAPACITY] = capacity_ah);
         }

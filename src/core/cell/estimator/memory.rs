@@ -19,29 +19,15 @@ pub(super) const REST_REPEATS_S: f64 = 1000.0;
 /// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
-/// A step of a cell with more unmeasured time than this had no current since the cell's voltage before: the bus counts as
-/// silent, s.
-const SILENCE_S: f64 = 5.0;
-
-/// Consecutive readings beyond the gate before the filter may restart: one or two can be glitches.
-const MIN_REJECTED: u32 = 3;
-
-/// Consecutive readings beyond the gate before a restart when the first one follows a gap: the record is incomplete.
-const MIN_REJECTED_AFTER_GAP: u32 = 2;
-
 /// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
 /// The same in a gap with a load next to it: it continued or ended, neither is more likely.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// The same in a gap of half a day and more with rest on both sides, in proportion before: a charger may come without the bus,
-/// but a bus in use wakes its listeners.
+/// The same in a gap of half a day and more with rest on both sides: a charger may come without the bus, but a bus in use wakes
+/// its listeners.
 const CHARGER_PRIOR: f64 = 0.05;
-const CHARGER_PRIOR_AFTER_S: f64 = 43_200.0;
-
-/// Shortest gap in which a charger may have come, s: in a shorter one slow relaxation would be taken for it.
-const LEAST_CHARGER_S: f64 = 3600.0;
 
 /// Deviation of the SOC below which downtime is ignored, fraction.
 const NEGLIGIBLE_STD: f64 = 0.002;
@@ -52,8 +38,8 @@ const NEGLIGIBLE_STD: f64 = 0.002;
 pub(super) struct Memory {
     /// Capacity, Ah, before the first voltage and across a restart.
     pub(super) capacity: ScalarGaussian,
-    /// Capacity of the open-circuit curve, Ah; `None` in a state stored before it was kept: then that of the cell.
-    pub(super) curve: Option<ScalarGaussian>,
+    /// Capacity of the open-circuit curve, Ah.
+    pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
@@ -72,7 +58,6 @@ pub(super) struct Memory {
     pub(super) offset_score: f64,
     pub(super) slow_branch: SlowBranch,
     /// Standard deviation of the SOC change during downtime, until a voltage has been used.
-    #[serde(rename = "away_std")]
     pub(super) downtime_std: f64,
     /// Part of the coming unmeasured time that has been noted as downtime, s.
     pub(super) noted_s: f64,
@@ -96,7 +81,7 @@ impl Memory {
         let (capacity, log_resistance) = configured(config);
         Self {
             capacity,
-            curve: Some(config.initial.curve),
+            curve: config.initial.curve,
             log_resistance,
             temperature_c: None,
             last_current_a: 0.0,
@@ -116,17 +101,6 @@ impl Memory {
             rejected_s: 0.0,
             rejected_after_gap: false,
         }
-    }
-
-    /// Capacity of the open-circuit curve, Ah.
-    #[inline]
-    pub(super) fn curve(&self) -> ScalarGaussian {
-        self.curve.unwrap_or(self.capacity)
-    }
-
-    /// Sets the capacity of the open-circuit curve, Ah.
-    pub(super) fn set_curve(&mut self, curve: ScalarGaussian) {
-        self.curve = Some(curve);
     }
 
     /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
@@ -160,7 +134,8 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        let charger_per_s = if unnoted_s < LEAST_CHARGER_S { 0.0 } else { away_per_s };
+        // In less than an hour slow relaxation would be taken for a charger.
+        let charger_per_s = if unnoted_s < 3600.0 { 0.0 } else { away_per_s };
         let most = load_per_s.max(charger_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
             return 0.0;
@@ -169,7 +144,7 @@ impl Memory {
         if std <= NEGLIGIBLE_STD {
             return std;
         }
-        let used_at_rest = CHARGER_PRIOR * (unnoted_s / CHARGER_PRIOR_AFTER_S).min(1.0);
+        let used_at_rest = CHARGER_PRIOR * (unnoted_s / 43_200.0).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
         self.note_downtime(most, if noted_s > 0.0 { 0.0 } else { used });
         0.0
@@ -248,8 +223,10 @@ impl Memory {
     /// Whether the filter must restart: too many consecutive readings were beyond the gate.
     #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
-        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.gate.lost_after_s;
-        long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
+        // One or two readings can be glitches.
+        let long_enough = self.rejected >= 3 && self.rejected_s >= config.gate.lost_after_s;
+        // After a gap the record is incomplete: two readings suffice.
+        long_enough || (self.rejected_after_gap && self.rejected >= 2)
     }
 
     /// Resets an unusable capacity or resistance to its configured value: the filter would otherwise restart at every
@@ -271,8 +248,8 @@ impl Memory {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
         check_log_resistance(self.log_resistance.mean)?;
-        InvalidState::unless_capacity("the capacity of a cell's open-circuit curve", self.curve().mean)?;
-        InvalidState::unless_natural("its variance", self.curve().variance)?;
+        InvalidState::unless_capacity("the capacity of a cell's open-circuit curve", self.curve.mean)?;
+        InvalidState::unless_natural("its variance", self.curve.variance)?;
         for variance in [self.capacity.variance, self.log_resistance.variance] {
             InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
         }
@@ -303,7 +280,8 @@ impl Memory {
 
 /// Whether the configuration says that the cells rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
-    config.gap.silence_is_rest && step.unmeasured_s > SILENCE_S
+    // After 5 s without a current the bus counts as silent.
+    config.gap.silence_is_rest && step.unmeasured_s > 5.0
 }
 
 /// Checks a stored ln of a resistance ratio.

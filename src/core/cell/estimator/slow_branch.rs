@@ -21,9 +21,6 @@ const LEAST_PART: f64 = 0.5;
 /// them are the same from voltage to voltage, so that many voltages are hardly more than one.
 const MAX_INFORMATION: f64 = 0.3;
 
-/// Largest disagreement that counts, in standard deviations of what is to be expected: beyond it something else is wrong.
-const MAX_DISAGREEMENT: f64 = 2.0;
-
 /// Least and largest ratio.
 const RANGE: (f64, f64) = (0.05, 3.0);
 
@@ -80,7 +77,8 @@ impl SlowBranch {
         if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        let most = MAX_DISAGREEMENT * (information * (1.0 + information)).sqrt();
+        // Beyond two standard deviations of what is to be expected something else is wrong.
+        let most = 2.0 * (information * (1.0 + information)).sqrt();
         let counted = information.min(MAX_INFORMATION) / information;
         let (information, score) = (counted * information, counted * score.clamp(-most, most));
         let deviations = score / (1.0 + information);

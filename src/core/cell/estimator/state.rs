@@ -94,18 +94,17 @@ fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
 }
 
 fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
-    if state.mean.len() != N || state.covariance.len() != N * N {
+    if state.covariance.len() != N * N || state.by_constant.len() != N * CONSTANT_ERRORS {
         return None;
     }
     let mut mean = SVector::<f64, N>::zeros();
     let mut covariance = SMatrix::<f64, N, N>::zeros();
     let mut by_constant = SMatrix::<f64, N, CONSTANT_ERRORS>::zeros();
-    // A state stored before constant errors were considered has none.
-    for (i, stored) in state.by_constant.chunks_exact(CONSTANT_ERRORS).take(N).enumerate() {
-        stored.iter().enumerate().for_each(|(k, &error)| by_constant[(place_of(i, N), k)] = error);
-    }
     for i in 0..N {
         mean[place_of(i, N)] = state.mean[i];
+        for k in 0..CONSTANT_ERRORS {
+            by_constant[(place_of(i, N), k)] = state.by_constant[i * CONSTANT_ERRORS + k];
+        }
         for j in 0..N {
             covariance[(place_of(i, N), place_of(j, N))] = state.covariance[i * N + j];
         }

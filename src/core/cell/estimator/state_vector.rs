@@ -3,6 +3,7 @@
 //! In and out: means and variances in the units of the states. Inputs are not checked.
 
 use crate::filter::ScalarGaussian;
+pub(super) use crate::filter::square;
 use crate::quantity::bounds;
 
 /// Variance of a known value: small against any noise, large against rounding.
@@ -17,11 +18,6 @@ pub(super) const LOG_RESISTANCE: usize = 1;
 pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
-
-#[inline]
-pub(super) fn square(x: f64) -> f64 {
-    x * x
-}
 
 /// A sum that stays storable: evidence that is not a number adds nothing.
 #[inline]

@@ -10,13 +10,11 @@
 
 use std::fmt;
 
-use super::{ModelBands, ResistanceBand, soc_variance, square};
+use super::{ModelBands, ResistanceBand, soc_variance};
+use crate::filter::{bell, square};
 
 /// Most measurements named.
 const MOST: usize = 3;
-/// Least gain, points of SOC, and as a part of the error.
-const LEAST_POINTS: f64 = 0.1;
-const LEAST_PART: f64 = 0.05;
 
 /// Temperatures of use, degrees C, with their weights: a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
@@ -24,25 +22,6 @@ const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
 /// SOC of possible rests.
 const REST_SOC: [f64; 9] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
-
-/// Distances over which the deviations of a curve, SOC, and of resistances, K, change.
-const CURVE_SOC: f64 = 0.15;
-const RESISTANCE_K: f64 = 20.0;
-/// Error of the voltage after a rest of an hour, V, and of the SOC counted from another rest.
-const REST_V: f64 = 0.005;
-const COUNTED_SOC: f64 = 0.02;
-/// Standard deviation of ln(resistance) that a drive leaves.
-const DRIVE_LOG_STD: f64 = 0.1;
-/// Standard deviation of the capacity that a charge from below 20 % to full leaves, fraction.
-const CHARGE_CAPACITY_STD: f64 = 0.02;
-/// Part of the capacity moved since the last sure voltage, and the error of the SOC counted from there by a right capacity: that of
-/// its beginning and of the current sensor.
-const MOVED: f64 = 0.5;
-const COUNT_STD: f64 = 0.06;
-
-/// Temperature below which a drive is a cold one, and by how much it may be warmer than the grid's, K.
-const COLD_C: f64 = 10.0;
-const COLD_ROOM_K: f64 = 2.0;
 
 /// A measurement that the vehicle makes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,9 +38,9 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
-            // A cold drive may be colder.
-            Self::Drive(temperature_c) if *temperature_c < COLD_C => {
-                write!(f, "a drive below {:.0} \u{b0}C", temperature_c + COLD_ROOM_K)
+            // A cold drive may be colder, or warmer by 2 K.
+            Self::Drive(temperature_c) if *temperature_c < 10.0 => {
+                write!(f, "a drive below {:.0} \u{b0}C", temperature_c + 2.0)
             }
             Self::Drive(temperature_c) => write!(f, "a drive near {temperature_c:.0} \u{b0}C"),
             Self::Charge => f.write_str("one charge from below 20 % to full"),
@@ -92,7 +71,8 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
         let tried = candidates.iter().map(|measurement| (*measurement, belief.after(measurement)));
         let best = tried.map(|(measurement, after)| (after.points(), measurement, after));
         let Some((left_points, measurement, after)) = best.min_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-        if points - left_points < LEAST_POINTS.max(LEAST_PART * first_points) {
+        // Gains below 0.1 points and below 5 % of the error are not worth a measurement.
+        if points - left_points < f64::max(0.1, 0.05 * first_points) {
             break;
         }
         advice.push(Advice { measurement, left_points });
@@ -124,14 +104,15 @@ impl Belief {
         let modes_v: Vec<[f64; 2]> = places.iter().map(|&soc| bands.modes_v(soc)).collect();
         let covariance = |i: usize, k: usize| {
             let modes: f64 = modes_v[i].iter().zip(modes_v[k]).map(|(a, b)| a * b).sum();
-            modes + rest_v[i] * rest_v[k] * near((places[i] - places[k]) / CURVE_SOC)
+            // Deviations of a curve change over 15 % of SOC, those of resistances over 20 K.
+            modes + rest_v[i] * rest_v[k] * bell((places[i] - places[k]) / 0.15)
         };
         let all = 0..places.len();
         let temperatures = || USE_C.iter().map(|(temperature_c, _)| *temperature_c);
         let of_soc = |&soc: &f64| -> Vec<Vec<f64>> {
             let of: Vec<(f64, ResistanceBand)> = temperatures().map(|t| (t, bands.resistance(soc, t))).collect();
             let covariance = |(t, a): &(f64, ResistanceBand), (u, b): &(f64, ResistanceBand)| {
-                a.common * b.common + a.local * b.local * near((t - u) / RESISTANCE_K)
+                a.common * b.common + a.local * b.local * bell((t - u) / 20.0)
             };
             of.iter().map(|a| of.iter().map(|b| covariance(a, b)).collect()).collect()
         };
@@ -148,7 +129,9 @@ impl Belief {
 
     /// Expected error of the SOC, points.
     fn points(&self) -> f64 {
-        let counted = square(COUNT_STD) + square(MOVED * self.capacity_std);
+        // Half of the capacity was moved since the last sure voltage. By a right capacity the counted SOC errs by 6 %: its beginning and
+        // the current sensor.
+        let counted = square(0.06) + square(0.5 * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
             soc_variance((self.curve[s][s] + of_drop).max(f64::MIN_POSITIVE), self.slope_v[s], counted)
@@ -164,22 +147,19 @@ impl Belief {
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                let noise_v = REST_V.hypot(COUNTED_SOC * self.rest_slope_v[place]);
+                // Errors of the voltage after a rest of an hour, and of the SOC counted from another rest.
+                let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }
             Measurement::Drive(temperature_c) => {
                 let place = USE_C.iter().position(|(known, _)| known == temperature_c).unwrap_or(0);
-                after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(DRIVE_LOG_STD)));
+                // A drive leaves ln(resistance) uncertain by 10 %, a charge from below 20 % to full the capacity by 2 %.
+                after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(0.1)));
             }
-            Measurement::Charge => after.capacity_std = self.capacity_std.min(CHARGE_CAPACITY_STD),
+            Measurement::Charge => after.capacity_std = self.capacity_std.min(0.02),
         }
         after
     }
-}
-
-/// Correlation of two places this many distances apart.
-fn near(distances: f64) -> f64 {
-    libm::exp(-0.5 * distances * distances)
 }
 
 /// Conditions a covariance on an observation of `at` with this variance.

@@ -7,7 +7,7 @@
 //!
 //! # Errors of a row
 //! What a circuit gets wrong repeats: at one SOC its voltage, its drop and the place on the curve are wrong alike. So the errors
-//! of rows are correlated over [`ERROR_SOC`], in proportion to a constant, to the slope of the curve and to the voltage drop. The
+//! of rows are correlated over 12 % of SOC, in proportion to a constant, to the slope of the curve and to the voltage drop. The
 //! drop's error grows with the drop: charge transfer is not linear (Butler-Volmer).
 //!
 //! The numbers were chosen on LG HG2, LG M50 (simulated) and the Leaf cell, all at 25 degrees C.
@@ -23,34 +23,21 @@ use crate::cell::chemistry::curve::CurvePrior;
 use crate::cell::chemistry::{Label, LabelPrior, ResistanceFactors, SOC, TEMPERATURE_C, usual_cold_sag_v};
 use crate::cell::notebook::{PresentStretch, Row};
 use crate::filter::ScalarGaussian;
+use crate::filter::levenberg_marquardt::{Damping, minimise};
 use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
 use noise::{NormalEquations, RepeatedErrors};
 
-/// Fewest rows, and least part of the capacity that a stretch of them must span.
-const LEAST_ROWS: usize = 12;
-const LEAST_SPAN: f64 = 0.15;
-/// Least rise of the curve between breakpoints, V.
-const LEAST_RISE_V: f64 = 2e-4;
-/// Most passes of Gauss-Newton, the gain of the cost below which it has converged, and its damping.
-const MOST_PASSES: usize = 12;
-const LEAST_GAIN: f64 = 0.02;
-const FIRST_DAMPING: f64 = 1e-3;
-const MOST_DAMPING: f64 = 1e6;
-/// Capacities of the grid relative to the rated one; the search begins at the rated one.
-const LEAST_CAPACITY: f64 = 0.52;
+/// Damping of a search.
+const DAMPING: Damping =
+    Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
+/// Capacities of the grid, in steps of this part of the rated one from 0.52 of it; the search begins at the rated one.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
-/// Cost above the least that a capacity at either end of the grid must have: what is most likely beyond it is not of this label.
-const LEAST_END_COST: f64 = 3.0;
 /// Cost above the least beyond which no further capacity is tried.
 const HOPELESS: f64 = 25.0;
 /// Points between two capacities of the grid at which the density is evaluated.
 const FINE: usize = 20;
-/// What the fit does not know of its own errors: factor of the capacity's deviation, and its least value, fraction (gain and offset
-/// of the current sensor).
-const CAPACITY_FACTOR: f64 = 1.4;
-const LEAST_CAPACITY_STD: f64 = 0.015;
 
 /// A fit.
 #[derive(Debug, Clone, PartialEq)]
@@ -117,7 +104,7 @@ struct Search<'a> {
 
 /// Whether rows are enough for a fit.
 pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
-    rows.len() >= LEAST_ROWS && span_ah(rows) >= LEAST_SPAN * label.rated_ah
+    rows.len() >= 12 && span_ah(rows) >= 0.15 * label.rated_ah
 }
 
 /// Fits; `None` when the rows say too little or are those of a capacity far from the label's.
@@ -195,25 +182,17 @@ impl<'a> Search<'a> {
     fn conditional_with(&self, errors: &RepeatedErrors, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         let mut theta = start.clone();
         theta[LOG_CAPACITY] = libm::log(capacity_ah);
-        let mut sums = self.sums(&theta, errors)?;
-        let mut damping = FIRST_DAMPING;
-        for _ in 0..MOST_PASSES {
+        let sums = self.sums(&theta, errors)?;
+        let step = |(theta, sums): &(DVector<f64>, NormalEquations), damping: f64| {
             let mut damped = sums.normal.clone();
             (0..theta.len()).for_each(|i| damped[(i, i)] *= 1.0 + damping);
-            let mut tried = &theta - damped.cholesky()?.solve(&sums.gradient);
+            let mut tried = theta - damped.cholesky()?.solve(&sums.gradient);
             Basis::bound(&mut tried);
-            match self.sums(&tried, errors).filter(|next| next.cost <= sums.cost) {
-                Some(next) => {
-                    let gained = sums.cost - next.cost;
-                    (theta, sums, damping) = (tried, next, (damping * 0.2).max(1e-9));
-                    if gained < LEAST_GAIN {
-                        break;
-                    }
-                }
-                None if damping > MOST_DAMPING => break,
-                None => damping *= 8.0,
-            }
-        }
+            let next = self.sums(&tried, errors).filter(|next| next.cost <= sums.cost)?;
+            Some((tried, next))
+        };
+        let (theta, sums) =
+            minimise(&DAMPING, 12, (theta, sums), step, |from, to, _| from.1.cost - to.1.cost < 0.02).best;
         let cost = sums.cost + 0.5 * prior::log_determinant(&sums.normal)?;
         let misfit = (sums.squares / self.basis.rows.len() as f64).sqrt();
         Some(Conditional { theta, normal: sums.normal, cost, misfit })
@@ -221,7 +200,7 @@ impl<'a> Search<'a> {
 
     /// The capacity, Ah.
     fn capacity(&self, start: &DVector<f64>) -> Option<ScalarGaussian> {
-        let at = |k: usize| self.rated_ah * (LEAST_CAPACITY + CAPACITY_STEP * k as f64);
+        let at = |k: usize| self.rated_ah * (0.52 + CAPACITY_STEP * k as f64);
         let mut found: Vec<Option<f64>> = vec![None; CAPACITIES];
         let first = self.conditional(at(FIRST_CAPACITY), start)?;
         let mut least = first.cost;
@@ -239,7 +218,8 @@ impl<'a> Search<'a> {
                 theta = next.theta;
             }
         }
-        let is_open = |end: Option<f64>| end.is_some_and(|cost| cost < least + LEAST_END_COST);
+        // What is most likely beyond the grid is not of this label.
+        let is_open = |end: Option<f64>| end.is_some_and(|cost| cost < least + 3.0);
         if is_open(found[0]) || is_open(found[CAPACITIES - 1]) {
             return None;
         }
@@ -248,7 +228,8 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        let std_ah = (CAPACITY_FACTOR * step_ah * variance.sqrt()).hypot(LEAST_CAPACITY_STD * capacity_ah);
+        // What the fit does not know of its own errors; at least those of the current sensor's gain and offset.
+        let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
@@ -282,7 +263,7 @@ impl<'a> Search<'a> {
         let squares_v2: f64 = rows.iter().enumerate().map(residual_v).map(|v| v * v).sum();
         let mut mean_v: Vec<f64> = (0..SOC_NODES).map(|s| curve.mean_v[s] + theta[s]).collect();
         for s in 1..SOC_NODES {
-            mean_v[s] = mean_v[s].max(mean_v[s - 1] + LEAST_RISE_V);
+            mean_v[s] = mean_v[s].max(mean_v[s - 1] + 2e-4);
         }
         let covariance_v2 = covariance.view((0, 0), (SOC_NODES, SOC_NODES)).into_owned();
         let posterior = CurvePrior { soc: SOC.to_vec(), mean_v, covariance: covariance_v2, electrodes: None };

@@ -8,17 +8,6 @@ use super::{OwnModel, rows_cost};
 use crate::cell::chemistry::{Chemistry, Label, LabelPrior};
 use crate::cell::notebook::{Notebook, Row};
 
-/// Difference of the costs (minus the logarithms of the probabilities) from which on another chemistry is the cell's: 50 times more
-/// likely; more where the rows deviate from either by more than they should. NCA and NMC differ by 4 to 9 on the drives of four
-/// cells, LFP from all others by hundreds.
-const CHEMISTRY_MARGIN: f64 = 4.0;
-
-/// The same from which on the model before is the better one.
-const BEFORE_MARGIN: f64 = 4.0;
-
-/// Misfit of drives that a circuit describes, at most.
-const USUAL_MISFIT: f64 = 0.45;
-
 /// What a fit is made from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitTask {
@@ -66,14 +55,17 @@ impl FitTask {
         let new_rows = &self.rows[self.rows.len() - self.new_rows..];
         let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
         let costs = cost(Some(own)).zip(cost(self.before.as_ref()));
-        costs.is_some_and(|(present, before)| before < present - BEFORE_MARGIN)
+        // 50 times more likely.
+        costs.is_some_and(|(present, before)| before < present - 4.0)
     }
 
     /// The chemistry that explains the rows clearly better than that of the label, if there is one; each at the capacity of the
     /// fit, if there is one, or the rated one, as suits it better.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        let margin = CHEMISTRY_MARGIN * fitted.map_or(1.0, |it| (it.misfit / USUAL_MISFIT).max(1.0));
+        // 50 times more likely; more where the rows deviate from either by more than drives that a circuit describes (0.45). NCA and NMC
+        // differ by 4 to 9 on the drives of four cells, LFP from all others by hundreds.
+        let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();
         let own = fit::label_cost(prior, rows, &capacities_ah)?;

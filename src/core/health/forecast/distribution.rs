@@ -13,7 +13,7 @@
 //! its own width w, an added variance of (w / L)^2 / 12.
 
 use super::{KNEE_DRIFT, RATE_WALK_USE, knee, walk_variance};
-use crate::filter::bisect;
+use crate::filter::{bell, bisect, normal_cdf};
 
 /// Slices of the loss.
 const SLICES: usize = 10;
@@ -22,9 +22,6 @@ const SLICED: f64 = 3.5;
 
 /// Steps of the bisections: from some 20 e-folds to a part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
-
-/// Half-width of the search for a quantile, deviations of each slice.
-const REACH: f64 = 6.0;
 
 /// Range of the logarithm of use and rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
@@ -55,11 +52,11 @@ impl Crossing {
         let zero = -mean[0] / loss_std;
         let from = zero.max(-SLICED);
         let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;
-        let mut before = normal(zero);
+        let mut before = normal_cdf(zero);
         let passed = before;
         let slices = std::array::from_fn(|index| {
             let upper = from + (index + 1) as f64 * width;
-            let until = if index + 1 == SLICES { 1.0 } else { normal(upper) };
+            let until = if index + 1 == SLICES { 1.0 } else { normal_cdf(upper) };
             let probability = (until - before).max(0.0);
             before = until;
             let deviation = upper - 0.5 * width;
@@ -83,8 +80,8 @@ impl Crossing {
     }
 
     fn probability_of_log(&self, log_use: f64) -> f64 {
-        let to_come: f64 = self.slices.iter().map(|(weight, log)| weight * below(log_use, *log)).sum();
-        self.passed + to_come
+        let of_slice = |(weight, (mean, std)): &Slice| weight * normal_cdf((log_use - mean) / std);
+        self.passed + self.slices.iter().map(of_slice).sum::<f64>()
     }
 
     /// Use within which the crossing has this probability.
@@ -93,21 +90,12 @@ impl Crossing {
             return 0.0;
         }
         let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
-        let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * REACH * std);
+        // Six deviations of each slice to either side.
+        let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * 6.0 * std);
         let least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
         let most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
         libm::exp(bisect((least, most), HALVINGS, |log_use| self.probability_of_log(log_use) < probability).1)
     }
-}
-
-/// Probability of a standard normal distribution below `value`.
-fn normal(value: f64) -> f64 {
-    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
-}
-
-/// Probability of a normal distribution (mean, standard deviation) below `value`.
-fn below(value: f64, (mean, std): (f64, f64)) -> f64 {
-    normal((value - mean) / std)
 }
 
 /// Mean and variance of the logarithm of a lognormal that has the moments of the normal (mean, variance) above 0.
@@ -118,8 +106,8 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     }
     // Further below 0 the ratio of density and tail exceeds f64; the rate is then merely small.
     let place = (mean / std).max(-8.0);
-    let density = libm::exp(-0.5 * place * place) / (2.0 * std::f64::consts::PI).sqrt();
-    let hazard = density / (0.5 * libm::erfc(-place / std::f64::consts::SQRT_2));
+    let density = bell(place) / (2.0 * std::f64::consts::PI).sqrt();
+    let hazard = density / normal_cdf(place);
     let first = std * (place + hazard);
     let second = (std * std * (1.0 - hazard * (hazard + place))).max(1e-24 * first * first);
     let log_variance = libm::log1p(second / (first * first));

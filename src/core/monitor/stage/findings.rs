@@ -9,7 +9,7 @@ use super::learning::Learning;
 use crate::cell_faults::fault::OFFSET_PER_H;
 use crate::cell_faults::gain::Learned;
 use crate::cell_faults::{BalancingConfig, CellFaultDetector, CellFaultKind, MeanCell};
-use crate::filter::ScalarGaussian;
+use crate::filter::{ScalarGaussian, probability_below};
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::{Event, EventKind, Outputs};
 use crate::quantity::{CellIndex, Fault, Timestamp};
@@ -142,6 +142,5 @@ fn current_offset(learning: &Learning, rated_ah: f64) -> (f64, ScalarGaussian) {
     let offset = learning.state.learner.current_offset().learned(learning.config.capacity.current_offset_std_a);
     let offset = offset.unwrap_or(ScalarGaussian { mean: 0.0, variance: 1.0 });
     let size = ScalarGaussian { mean: offset.mean / rated_ah, variance: offset.variance / (rated_ah * rated_ah) };
-    let beyond = (size.mean.abs() - OFFSET_PER_H) / (size.std() * std::f64::consts::SQRT_2).max(1e-12);
-    (0.5 * libm::erfc(-beyond), size)
+    (probability_below(size.mean.abs() - OFFSET_PER_H, size.std().max(1e-12)), size)
 }

@@ -207,7 +207,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (hot[SLOW_RATIO].0[lane], hot[SLOW_STD].0[lane]) = (memory.slow_branch.ratio, slow_std);
         hot[SLOW_INFORMATION].0[lane] = memory.slow_branch.information;
         hot[SLOW_SCORE].0[lane] = memory.slow_branch.score;
-        (hot[CURVE_AH].0[lane], hot[CURVE_STD_AH].0[lane]) = (memory.curve().mean, memory.curve().std());
+        (hot[CURVE_AH].0[lane], hot[CURVE_STD_AH].0[lane]) = (memory.curve.mean, memory.curve.std());
         false
     }
 }

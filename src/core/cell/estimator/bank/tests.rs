@@ -168,9 +168,9 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
             // Half-cycles restate the curve's capacity: the curve of an aged cell holds at each temperature and interval after it.
             for (cell, estimator) in readable.iter_mut().enumerate() {
                 let mean = model.capacity_ah * (0.95 - 0.02 * cell as f64);
-                let curve = ScalarGaussian { mean, ..estimator.memory.curve() };
-                estimator.memory.set_curve(curve);
-                bank.change(cell, |estimator| estimator.memory.set_curve(curve));
+                let curve = ScalarGaussian { mean, ..estimator.memory.curve };
+                estimator.memory.curve = curve;
+                bank.change(cell, |estimator| estimator.memory.curve = curve);
             }
         }
         if time % 2500 == 2499 {

@@ -9,6 +9,7 @@ use crate::cell::chemistry::{FACTOR_SOC, LabelPrior, RESISTANCES, SOC, cold_shar
 use crate::cell::model::{CellModel, arrhenius};
 use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
+use crate::filter::interpolation::{between, locate_clamped};
 
 /// First indices of the parameters: the curve's deviations from the label's, V, at the SOC breakpoints; ln of the resistances'
 /// factors over SOC; their deviation from the law of temperature; the curve's sag in the cold less the label's, V; ln of the capacity,
@@ -22,14 +23,8 @@ pub(super) const BEGINNINGS: usize = OFFSET + 1;
 /// Parameters of curve and SOC among those of a row.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
-/// Limits of the parameters: SOC at a beginning, ln of a factor, deviation from the law of temperature.
+/// Limits of the SOC at a beginning.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
-const MOST_LOG_FACTOR: f64 = 2.5;
-const MOST_BY_TEMPERATURE: f64 = 1.5;
-
-/// Error with which the first beginnings are found, V and fraction of the drop.
-const FIRST_V: f64 = 0.02;
-const FIRST_DROP: f64 = 0.1;
 
 /// The label as the fit uses it.
 pub(super) struct Basis<'a> {
@@ -54,12 +49,6 @@ pub(super) struct Prediction {
     /// Parameters on which the voltage depends: six of curve and SOC, then three of each resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
-}
-
-/// Interval of `x` among rising `nodes` and the weight of its upper end, within 0 to 1.
-fn interval(nodes: &[f64], x: f64) -> (usize, f64) {
-    let at = nodes[1..nodes.len() - 1].iter().take_while(|&&node| x >= node).count();
-    (at, ((x - nodes[at]) / (nodes[at + 1] - nodes[at])).clamp(0.0, 1.0))
 }
 
 impl<'a> Basis<'a> {
@@ -96,8 +85,8 @@ impl<'a> Basis<'a> {
     pub(super) fn bound(theta: &mut DVector<f64>) {
         for (i, value) in theta.iter_mut().enumerate().skip(FACTORS) {
             let (low, high) = match i {
-                ..BY_TEMPERATURE => (-MOST_LOG_FACTOR, MOST_LOG_FACTOR),
-                BY_TEMPERATURE..COLD_SAG => (-MOST_BY_TEMPERATURE, MOST_BY_TEMPERATURE),
+                ..BY_TEMPERATURE => (-2.5, 2.5),
+                BY_TEMPERATURE..COLD_SAG => (-1.5, 1.5),
                 COLD_SAG..=OFFSET => continue,
                 BEGINNINGS.. => BEGINNING,
             };
@@ -115,22 +104,21 @@ impl<'a> Basis<'a> {
         let soc = theta[beginning] - moved;
         let temperature_c = f64::from(row.temperature_c);
         let position = self.model.grid_position(soc, temperature_c);
-        let (node, along) = interval(&SOC, soc);
-        let own_v = theta[node] + along * (theta[node + 1] - theta[node]);
+        let (node, along) = locate_clamped(&SOC, soc);
+        let own_v = between(theta.as_slice(), node, along);
         let own_slope_v =
             if (0.0..1.0).contains(&soc) { (theta[node + 1] - theta[node]) / (SOC[node + 1] - SOC[node]) } else { 0.0 };
         let slope_v = self.model.ocv_slope_v(&position, self.model.capacity_ah) + own_slope_v;
         let cold = cold_share(temperature_c);
         let mut index = vec![node, node + 1, COLD_SAG, LOG_CAPACITY, OFFSET, beginning];
         let mut slope = vec![1.0 - along, along, -cold, slope_v * moved, slope_v * hours / capacity_ah, slope_v];
-        let (low, part) = interval(&FACTOR_SOC, soc);
+        let (low, part) = locate_clamped(&FACTOR_SOC, soc);
         let by_temperature = libm::log(arrhenius(temperature_c));
         let by_factor = [1.0 - part, part, by_temperature];
         let mut drop_v = 0.0;
         let ohm: [f64; RESISTANCES] = std::array::from_fn(|j| {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln =
-                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln = between(theta.as_slice(), first, part) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm = match j {
                 0 => self.model.r0_ohm(&position),
                 j => self.model.branch_r_ohm(j - 1, &position),
@@ -156,7 +144,7 @@ impl<'a> Basis<'a> {
             let row_cost = |&at: &usize| {
                 let Prediction { voltage_v, drop_v, .. } = self.predict(&theta, at);
                 let deviations =
-                    (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / FIRST_V.hypot(FIRST_DROP * drop_v);
+                    (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / f64::hypot(0.02, 0.1 * drop_v);
                 // Beyond three deviations linearly.
                 if deviations <= 3.0 { 0.5 * deviations * deviations } else { 3.0 * (deviations - 1.5) }
             };
@@ -170,13 +158,12 @@ impl<'a> Basis<'a> {
     pub(super) fn drop_std(&self, theta: &DVector<f64>, covariance: &DMatrix<f64>, temperature_c: f64) -> f64 {
         let position = self.model.grid_position(0.5, temperature_c);
         let by_temperature = libm::log(arrhenius(temperature_c));
-        let (low, part) = interval(&FACTOR_SOC, 0.5);
+        let (low, part) = locate_clamped(&FACTOR_SOC, 0.5);
         let mut share = DVector::zeros(theta.len());
         let mut settled_ohm = 0.0;
         for j in 0..RESISTANCES {
             let first = FACTORS + j * FACTOR_NODES + low;
-            let ln =
-                theta[first] + part * (theta[first + 1] - theta[first]) + by_temperature * theta[BY_TEMPERATURE + j];
+            let ln = between(theta.as_slice(), first, part) + by_temperature * theta[BY_TEMPERATURE + j];
             let label_ohm =
                 if j == 0 { self.model.r0_ohm(&position) } else { self.model.branch_r_ohm(j - 1, &position) };
             let ohm = label_ohm * libm::exp(ln);

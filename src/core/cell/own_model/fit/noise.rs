@@ -6,23 +6,12 @@ use nalgebra::{DMatrix, DVector};
 
 use super::basis::{Basis, CURVE_AND_SOC, Prediction};
 use crate::cell::notebook::{CurrentSteps, Row};
+use crate::filter::bell;
 
-/// Standard deviations of a row's error: of the voltage, V; of the drop, fraction; of the SOC.
+/// Standard deviation of a row's voltage, V.
 const ROW_V: f64 = 0.006;
-const ROW_DROP: f64 = 0.08;
-const ROW_SOC: f64 = 0.01;
-/// Distance of SOC over which the part that repeats changes.
-const ERROR_SOC: f64 = 0.12;
-/// Growth of the drop's relative error with the drop, per V.
-const DROP_GROWTH_PER_V: f64 = 3.0;
 /// Residual, in standard deviations, from which on it counts linearly (Huber).
 const HUBER: f64 = 3.0;
-/// Standard deviation of the steps' voltage, V.
-const STEP_V: f64 = 0.01;
-/// Least sum of squared steps that says something, A^2.
-const LEAST_STEPS_A2: f64 = 1e-12;
-/// Most that the steps of one row say of a resistance: its standard deviation of ln.
-const STEPS_LOG_STD: f64 = 0.2;
 
 /// Standard deviations of the part of the errors that repeats: of the voltage, V; of the SOC; of the drop, fraction.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -103,14 +92,16 @@ impl NormalEquations {
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
-        if ii <= LEAST_STEPS_A2 {
+        // Smaller steps say nothing.
+        if ii <= 1e-12 {
             return;
         }
         let of_i = [ii.sqrt(), ix / ii.sqrt()];
         let of_x = (xx - of_i[1] * of_i[1]).max(0.0).sqrt();
         let v_i = iv / of_i[0];
         let v_x = if of_x > 0.0 { (xv - of_i[1] * v_i) / of_x } else { 0.0 };
-        let weight = (1.0 / (STEP_V * STEP_V)).min(1.0 / (STEPS_LOG_STD * STEPS_LOG_STD * v_i * v_i));
+        // The steps' voltage errs by 10 mV; the steps of one row say no more of a resistance than 20 %.
+        let weight = f64::min(1.0 / (0.01 * 0.01), 1.0 / (0.2 * 0.2 * v_i * v_i));
         let Prediction { ohm: [series_ohm, fast_ohm, ..], by_factor, index, .. } = prediction;
         let residuals_v = [v_i + of_i[0] * series_ohm + of_i[1] * fast_ohm, v_x + of_x * fast_ohm];
         let slope = |per_series: f64, per_fast: f64| {
@@ -127,16 +118,16 @@ impl NormalEquations {
 
 /// Covariance of the rows' errors, V^2.
 fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f64> {
-    let drop_v: Vec<f64> =
-        predictions.iter().map(|it| it.drop_v * (1.0 + DROP_GROWTH_PER_V * it.drop_v.abs())).collect();
+    let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
         let (x, y) = (&predictions[a], &predictions[b]);
-        let distance = (x.soc - y.soc) / ERROR_SOC;
-        let near = libm::exp(-0.5 * distance * distance);
+        // The part that repeats changes over 12 % of SOC.
+        let near = bell((x.soc - y.soc) / 0.12);
         let of = |v: f64, soc: f64, drop: f64| {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]
         };
-        let own = if a == b { of(ROW_V, ROW_SOC, ROW_DROP) } else { 0.0 };
+        // Errors of one row alone.
+        let own = if a == b { of(ROW_V, 0.01, 0.08) } else { 0.0 };
         own + near * of(errors.voltage_v, errors.soc, errors.drop)
     })
 }

@@ -6,57 +6,45 @@ use super::basis::{BEGINNINGS, BY_TEMPERATURE, COLD_SAG, FACTORS, LOG_CAPACITY, 
 use crate::cell::chemistry::curve::CurvePrior;
 use crate::cell::chemistry::{FACTOR_SOC, RESISTANCES, usual_cold_sag_v};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
+use crate::filter::bell;
 
 /// Deviations of ln(resistance) between cells: common to all parts of one cell, of each part, over SOC; and of the part of its
 /// activation energy. As between the five cells of the chemistry's resistances.
 const COMMON_LOG_STD: f64 = 0.35;
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
 const SHAPE_LOG_STD: f64 = 0.15;
-const SHAPE_SOC: f64 = 0.3;
-const BY_TEMPERATURE_STD: f64 = 0.25;
 /// The same of all parts near empty, at the first nodes: where the curve turns steep, diffusion counts as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
-const LOW_SOC: f64 = 0.1;
-/// Least variance of a factor.
-const LEAST_VARIANCE: f64 = 1e-4;
-/// Standard deviation of ln(capacity) from the label.
-const CAPACITY_STD: f64 = 0.1;
-/// Roughness of a curve beside the modes of its prior, V.
-const ROUGH_V: f64 = 0.002;
-/// Standard deviation of the current sensor's offset: the rated capacity over this time, h.
-const OFFSET_H: f64 = 700.0;
-/// Standard deviation of the SOC at which a stretch begins: it is found from the voltages.
-const BEGINNING_STD: f64 = 0.5;
 
 /// Information matrix about the label's values; `None` when a covariance has no factor.
 pub(super) fn information(curve: &CurvePrior, rated_ah: f64, size: usize) -> Option<DMatrix<f64>> {
     let mut prior = DMatrix::zeros(size, size);
-    let own = DMatrix::from_diagonal_element(SOC_NODES, SOC_NODES, ROUGH_V * ROUGH_V);
+    // Roughness of a curve beside the modes of its prior: 2 mV.
+    let own = DMatrix::from_diagonal_element(SOC_NODES, SOC_NODES, 0.002 * 0.002);
     let curve = (&curve.covariance + own).cholesky()?.inverse();
     prior.view_mut((0, 0), (SOC_NODES, SOC_NODES)).copy_from(&curve);
     let count = RESISTANCES * FACTOR_NODES;
     let covariance = DMatrix::from_fn(count, count, factor_covariance);
     prior.view_mut((FACTORS, FACTORS), (count, count)).copy_from(&covariance.cholesky()?.inverse());
     let mut near = |i: usize, std: f64| prior[(i, i)] = 1.0 / (std * std);
-    (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, BY_TEMPERATURE_STD));
+    (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, 0.25));
     near(COLD_SAG, usual_cold_sag_v().std());
-    near(LOG_CAPACITY, CAPACITY_STD);
-    near(OFFSET, rated_ah / OFFSET_H);
-    (BEGINNINGS..size).for_each(|i| near(i, BEGINNING_STD));
+    near(LOG_CAPACITY, 0.1);
+    // The rated capacity in 700 h.
+    near(OFFSET, rated_ah / 700.0);
+    // The SOC at which a stretch begins is found from the voltages.
+    (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)
 }
 
 /// Covariance of two factors, by their index.
 fn factor_covariance(a: usize, b: usize) -> f64 {
     let ((i, n), (j, m)) = ((a / FACTOR_NODES, a % FACTOR_NODES), (b / FACTOR_NODES, b % FACTOR_NODES));
-    let near = |width: f64| {
-        let distance = (FACTOR_SOC[n] - FACTOR_SOC[m]) / width;
-        libm::exp(-0.5 * distance * distance)
-    };
+    let near = |width: f64| bell((FACTOR_SOC[n] - FACTOR_SOC[m]) / width);
     let low = |n: usize| LOW_LOG_STD.get(n).copied().unwrap_or(0.0);
-    let common = COMMON_LOG_STD * COMMON_LOG_STD + low(n) * low(m) * near(LOW_SOC);
-    let part = PART_LOG_STD[i] * PART_LOG_STD[i] + SHAPE_LOG_STD * SHAPE_LOG_STD * near(SHAPE_SOC);
-    common + if i == j { part } else { 0.0 } + if a == b { LEAST_VARIANCE } else { 0.0 }
+    let common = COMMON_LOG_STD * COMMON_LOG_STD + low(n) * low(m) * near(0.1);
+    let part = PART_LOG_STD[i] * PART_LOG_STD[i] + SHAPE_LOG_STD * SHAPE_LOG_STD * near(0.3);
+    common + if i == j { part } else { 0.0 } + if a == b { 1e-4 } else { 0.0 }
 }
 
 /// Logarithm of the determinant of a positive matrix.

@@ -1,0 +1,39 @@
+//! Linear interpolation over rising breakpoints, at least two.
+
+/// Interval of `x` among the breakpoints, and how far along it `x` is: below 0 or above 1 outside.
+pub fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
+    let last = breakpoints.len() - 2;
+    let i = breakpoints[1..=last].iter().take_while(|&&b| x >= b).count();
+    (i, (x - breakpoints[i]) / (breakpoints[i + 1] - breakpoints[i]))
+}
+
+/// As [`locate`], with the share held within 0 to 1.
+pub fn locate_clamped(breakpoints: &[f64], x: f64) -> (usize, f64) {
+    let (i, along) = locate(breakpoints, x);
+    (i, along.clamp(0.0, 1.0))
+}
+
+/// Value at the share `along` of the interval that begins at index `i`.
+#[inline]
+pub fn between(y: &[f64], i: usize, along: f64) -> f64 {
+    y[i] + along * (y[i + 1] - y[i])
+}
+
+/// Value of `y` over `x` at `at`; outside, that of the nearest end.
+pub fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
+    let (i, along) = locate_clamped(x, at);
+    between(y, i, along)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_lie_on_the_line_between_two_breakpoints_and_stay_beyond_the_ends() {
+        let (x, y) = ([0.0, 1.0, 3.0], [10.0, 20.0, 0.0]);
+        let found = [-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.0].map(|at| interpolate(&x, &y, at));
+        assert_eq!(found, [10.0, 10.0, 15.0, 20.0, 10.0, 0.0, 0.0]);
+        assert_eq!((locate(&x, -1.0), locate(&x, 5.0)), ((0, -1.0), (1, 2.0)));
+    }
+}
