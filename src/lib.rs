@@ -62,11 +62,12 @@
 //! | a configuration key | its table in `host/config/schema/keys/` (`pack`, `input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
 //! | how drop-ins are found and merged | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | what identifies the vehicle | `host/config/result/vehicle.rs` |
-//! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
-//! | a metric | `host/status/metrics.rs` |
-//! | an entity of MQTT; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
-//! | a signal of VSS or of its overlay | `uplink/kuksa/signals/standard.rs`, `own.rs` (the page: `packwatch vss --reference`) |
-//! | when a question of the databroker is answered; what is sent in which order | `uplink/kuksa/questions.rs`; `uplink/kuksa/outgoing.rs` |
+//! | a published number of pack or cell: in status, metrics, MQTT, VSS | `core/quantity/catalogue.rs` (its row), `core/monitor/view.rs` (its value) |
+//! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
+//! | another metric | `host/status/metrics.rs` |
+//! | another entity of MQTT; its topics; the queue for a lost link | `uplink/mqtt/entity.rs`; `uplink/mqtt/mod.rs`; `uplink/mqtt/queue.rs` |
+//! | another signal of VSS or of its overlay | `uplink/kuksa/signals/derived.rs` (the page: `packwatch vss --reference`) |
+//! | what is sent to the databroker in which order | `uplink/kuksa/outgoing.rs` |
 //! | a history table or column | `host/store/rows.rs`; tables of packs, moments and segments: `host/store/database.rs` |
 //! | the files of the stored state; when a checkpoint is due | `host/store/state_files.rs`; `host/store/checkpoint.rs` |
 //! | how the history is verified, and how long it is kept | `host/store/segments.rs` |

@@ -10,6 +10,9 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::common::output::{print, word};
+use crate::monitor::PackView;
+use crate::quantity::CellIndex;
+use crate::quantity::catalogue::{Estimate, Quantity, Unit, Values};
 use crate::status::client::{StatusClient, parse};
 use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
@@ -68,26 +71,56 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// A cell's number, from 1.
-fn number(cell: u16) -> u32 {
-    u32::from(cell) + 1
+fn number(cell: CellIndex) -> u32 {
+    u32::from(cell.0) + 1
 }
 
-/// A value with its unit, or a dash.
+/// ` (cell 3)`, or nothing.
+fn in_brackets(cell: Option<CellIndex>) -> String {
+    cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)))
+}
+
+/// A number with its unit, or a dash.
 fn shown(value: Option<f64>, decimals: usize, unit: &str) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}{unit}"))
 }
 
-/// A fraction as percent, or a dash.
-fn percent(value: Option<f64>) -> String {
-    shown(value.map(|value| 100.0 * value), 1, " %")
+/// A value, with its standard deviation if it has one, or a dash.
+fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
+    let (unit, factor) = screen_unit(quantity.row().unit);
+    match values.get(quantity) {
+        Some(Estimate { mean, std: Some(std) }) => {
+            format!("{:.decimals$} ± {:.decimals$}{unit}", factor * mean, factor * std)
+        }
+        value => shown(value.map(|value| factor * value.mean), decimals, unit),
+    }
 }
 
-/// A value and its standard deviation.
-fn with_std(value: Option<f64>, std: Option<f64>, decimals: usize, unit: &str) -> String {
-    match (value, std) {
-        (Some(value), Some(std)) => format!("{value:.decimals$} ± {std:.decimals$}{unit}"),
-        (value, _) => shown(value, decimals, unit),
+/// A value without its standard deviation, or a dash.
+fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
+    let (unit, factor) = screen_unit(quantity.row().unit);
+    shown(values.mean(quantity).map(|mean| factor * mean), decimals, unit)
+}
+
+/// The unit on the screen, after a number, and its factor.
+const fn screen_unit(unit: Unit) -> (&'static str, f64) {
+    match unit {
+        Unit::Level | Unit::Fraction => (" %", 100.0),
+        Unit::Ratio => ("", 1.0),
+        Unit::Volts => (" V", 1.0),
+        Unit::Amperes => (" A", 1.0),
+        Unit::Celsius => (" °C", 1.0),
+        Unit::AmpereHours => (" Ah", 1.0),
+        Unit::Seconds => (" s", 1.0),
+        Unit::Days => (" days", 1.0),
+        Unit::Cycles => (" cycles", 1.0),
     }
+}
+
+/// `95 %: 60.8 to 65.6 %`; `None` = the state of charge is not known.
+fn soc_band(pack: &PackView) -> Option<String> {
+    let [low, high] = [Quantity::SocLow, Quantity::SocHigh].map(|edge| pack.values.mean(edge));
+    Some(format!("95 %: {:.1} to {:.1} %", 100.0 * low?, 100.0 * high?))
 }
 
 /// A duration in its two largest units.

@@ -1,7 +1,6 @@
-//! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and the test code in DM1 if
-//! there is a J1939 node, and reports the frames seen on the bus.
+//! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and reports the frames seen on the bus.
 //!
-//! Succeeds only when every channel saw at least one such frame, intact and in sequence.
+//! Succeeds only when every interface saw at least one such frame, intact and in sequence.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -12,7 +11,7 @@ use super::common::numbers::above_0_to;
 use super::common::output::{print, word};
 use crate::alarm::{AlarmState, Rule};
 use crate::config;
-use crate::control::test_alarm::{self, ChannelReport, GenuineAlarm};
+use crate::control::test_alarm::{self, ChannelReport};
 use crate::io::stamp;
 use crate::monitor::MAX_TEST_S;
 use packwatch_host::failure::Failure;
@@ -40,7 +39,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let reports = test_alarm::run(&config, &args.control.client(), args.rule, duration).map_err(Failure::new)?;
     print(&table(args.rule, &reports))?;
     let bad = reports.iter().filter(|report| !report.is_good());
-    let bad: Vec<String> = bad.map(|report| format!("{} ({})", report.interface, report.what)).collect();
+    let bad: Vec<&str> = bad.map(|report| report.interface.as_str()).collect();
     if bad.is_empty() {
         return Ok(());
     }
@@ -55,16 +54,15 @@ fn table(rule: Rule, reports: &[ChannelReport]) -> String {
     let mut text = format!("test of {}, as seen on the interfaces:\n", rule.name());
     let _ = writeln!(
         text,
-        "{:<12} {:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} end-to-end",
-        "interface", "what", "id", "frames", "first", "last", "ended"
+        "{:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} end-to-end",
+        "interface", "id", "frames", "first", "last", "ended"
     );
     for report in reports {
         let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc_micros);
         let _ = writeln!(
             text,
-            "{:<12} {:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} {}",
+            "{:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} {}",
             report.interface,
-            report.what,
             report.id.to_string(),
             report.observed.tests,
             stamp(report.observed.first),
@@ -99,17 +97,11 @@ const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Unknown,
 ];
 
-/// Appends the other frames of the channel.
+/// Appends the other frames of the interface.
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let observed = &report.observed;
-    push_code(text, report);
-    for (genuine, count) in &observed.genuine {
-        let _ = match *genuine {
-            GenuineAlarm::Alarm { rule, state } => {
-                writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state))
-            }
-            GenuineAlarm::Code { spn, fmi } => writeln!(text, "  meanwhile REAL: SPN {spn}, FMI {fmi}, in {count} DM1"),
-        };
+    for (&(rule, state), count) in &observed.genuine {
+        let _ = writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state));
     }
     let others = [
         (observed.foreign, "test frames of other rules"),
@@ -129,56 +121,4 @@ fn alarm_words(rule: u8, state: u8) -> String {
     let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == state);
     let kind = if found.is_some_and(AlarmState::is_raised) { "REAL, " } else { "" };
     format!("{kind}without the marker: {name} {}", found.map_or_else(|| "in an unknown state".to_owned(), word))
-}
-
-/// Appends the test code in DM1: a trouble code has no marker, so its number identifies the test.
-fn push_code(text: &mut String, report: &ChannelReport) {
-    let Some(code) = report.test_code else { return };
-    let observed = &report.observed;
-    let messages = observed.tests + observed.without_code + observed.unreadable;
-    let (spn, fmi) = (code.spn(), code.fmi());
-    let _ = writeln!(text, "  {} of {messages} DM1 had the test code, SPN {spn}, FMI {fmi}", observed.tests);
-    if observed.tests == 0 {
-        text.push_str("  no DM1 with the test code was seen; does the node have its address?\n");
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::can::CanId;
-    use crate::can::j1939::TroubleCode;
-    use crate::control::test_alarm::ObservedFrames;
-
-    fn dm1(observed: ObservedFrames) -> String {
-        let report = ChannelReport {
-            interface: "can0".to_owned(),
-            what: "J1939 DM1",
-            id: CanId::Extended(0x18FE_CAF9),
-            observed,
-            test_code: Some(TroubleCode::new(524_286, 31, 0).unwrap()),
-            protection: None,
-            dropped: 0,
-            error: None,
-        };
-        table(Rule::SocLow, &[report])
-    }
-
-    #[test]
-    fn dm1_has_a_separate_line_and_genuine_codes_are_marked() {
-        let genuine = [(GenuineAlarm::Code { spn: 520_196, fmi: 9 }, 2)].into();
-        let text = dm1(ObservedFrames { tests: 4, without_code: 2, ended: true, genuine, ..ObservedFrames::default() });
-        let line = text.lines().nth(2).unwrap();
-        assert!(line.starts_with("can0         J1939 DM1      18FECAF9      4  "), "{text}");
-        assert!(text.contains("\n  4 of 6 DM1 had the test code, SPN 524286, FMI 31\n"), "{text}");
-        assert!(text.contains("\n  meanwhile REAL: SPN 520196, FMI 9, in 2 DM1\n"), "{text}");
-        assert!(!text.contains("does the node have its address?"), "{text}");
-    }
-
-    #[test]
-    fn a_silent_node_is_pointed_out() {
-        let text = dm1(ObservedFrames::default());
-        assert!(text.contains("  0 of 0 DM1 had the test code"), "{text}");
-        assert!(text.contains("  no DM1 with the test code was seen; does the node have its address?\n"), "{text}");
-    }
 }

@@ -5,9 +5,10 @@
 //! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
 //! * SOC and SOH are fractions 0..1.
 //!
-//! [`bounds`] states what each of them can be at most.
+//! [`bounds`] states what each of them can be at most, [`catalogue`] which numbers are published, and under which names.
 
 pub mod bounds;
+pub mod catalogue;
 
 use serde::{Deserialize, Serialize};
 

@@ -24,6 +24,9 @@ pub mod counters;
 pub mod document;
 pub mod metrics;
 #[cfg(test)]
+#[path = "status/tests/quantities.rs"]
+mod quantities;
+#[cfg(test)]
 #[path = "status/tests/sample.rs"]
 pub mod sample;
 mod server;

@@ -144,7 +144,7 @@ fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
 
 /// The page: a table of VSS's signals and one of the overlay's.
 fn reference() -> String {
-    let mut page = "# VSS signals\n\nA page of `packwatch vss --reference`. A signal has no value while the daemon is silent, while one of its fields \
+    let mut page = "# VSS signals\n\nA page of `packwatch vss --reference`: the signals beside those of the [quantities](quantities.md). A signal has no value while the daemon is silent, while one of its fields \
                     in the [status document](status.md) is unknown, or where a column says so. Cells count from 0; an array has a value only \
                     when that of every cell is known, because VSS has no unknown number.\n"
         .to_owned();
@@ -153,7 +153,7 @@ fn reference() -> String {
             if origin == Origin::Standard { STANDARD_BRANCH.to_owned() } else { KuksaSettings::default().branch };
         let _ = write!(page, "\n## {title}\n\nBelow `{branch}`.\n\n");
         page.push_str("| signal | datatype | unit | status field | remark |\n| --- | --- | --- | --- | --- |\n");
-        for signal in signals::all().filter(|signal| signal.origin == origin) {
+        for signal in signals::all().filter(|signal| signal.origin == origin && !signal.is_quantity()) {
             let Signal { name, data_type, fields, description, .. } = signal;
             let _ = writeln!(
                 page,

@@ -1,6 +1,7 @@
 //! Contactors that say they are open: no current flows, whatever its sensor reports, and a state without news is unknown.
 
 use packwatch::monitor::Downtime;
+use packwatch::quantity::catalogue::Quantity;
 use packwatch::quantity::{CellIndex, Channel, Mode};
 
 use crate::support::rig::Rig;
@@ -15,12 +16,12 @@ fn rig() -> Rig {
 }
 
 fn current_a(rig: &Rig) -> Option<f64> {
-    rig.monitor.pack_view().current_a
+    rig.monitor.pack_view().values.mean(Quantity::Current)
 }
 
 fn soc(rig: &Rig) -> f64 {
-    let of_first = rig.monitor.cell_views().next().and_then(|cell| cell.soc);
-    of_first.expect("an estimate").mean
+    let of_first = rig.monitor.cell_views().next().and_then(|cell| cell.values.mean(Quantity::Soc));
+    of_first.expect("an estimate")
 }
 
 #[test]
@@ -31,7 +32,7 @@ fn open_contactors_mean_no_current_and_closed_ones_the_measured_one() {
         rig.contactor = Some(open);
         rig.seconds(20);
         assert_eq!((current_a(&rig), rig.monitor.mode()), (Some(0.0), Mode::Rest), "{open}");
-        assert_eq!(rig.monitor.cell_views().next().and_then(|cell| cell.current_a), Some(0.0));
+        assert_eq!(rig.monitor.cell_views().next().and_then(|cell| cell.values.mean(Quantity::Current)), Some(0.0));
         rig.contactor = Some(2.0);
         rig.seconds(10);
         assert_eq!((current_a(&rig), rig.monitor.mode()), (Some(1.0), Mode::Discharge), "{open}");

@@ -10,6 +10,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::{self, ConfigFiles};
 use packwatch::monitor::{Downtime, EventKind, Monitor, MonitorConfig, Outputs, Record, Snapshot, Validity};
+use packwatch::quantity::catalogue::{Estimate, Quantity};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex, Timestamp, bounds};
 
 use crate::support::config_texts;
@@ -76,18 +77,16 @@ fn check_shown(monitor: &Monitor, run: u64, second: u32) {
         return;
     }
     let what = || format!("run {run}, {second} s: {pack:#?}");
-    let is_soc = |soc: packwatch::filter::ScalarGaussian| {
-        (0.0..=1.0).contains(&soc.mean) && soc.variance > 0.0 && soc.variance.is_finite()
-    };
+    let is_soc = |soc: Estimate| (0.0..=1.0).contains(&soc.mean) && soc.std.is_some_and(|std| std > 0.0);
     let is_capacity = |ah: f64| bounds::TRUSTED_CAPACITY.has(ah / model_ah);
-    assert!(pack.soc.is_none_or(is_soc), "{}", what());
-    assert!(pack.weakest.is_none_or(|(_, capacity)| is_capacity(capacity.mean)), "{}", what());
-    assert!(pack.soh.is_none_or(is_capacity_of_rated), "{}", what());
+    assert!(pack.values.get(Quantity::Soc).is_none_or(is_soc), "{}", what());
+    assert!(pack.values.mean(Quantity::Capacity).is_none_or(is_capacity), "{}", what());
+    assert!(pack.values.mean(Quantity::Soh).is_none_or(is_capacity_of_rated), "{}", what());
     for cell in monitor.cell_views() {
-        assert!(cell.soc.is_none_or(is_soc), "{cell:#?} {}", what());
-        assert!(cell.capacity.is_none_or(|capacity| is_capacity(capacity.mean)), "{cell:#?} {}", what());
+        assert!(cell.values.get(Quantity::Soc).is_none_or(is_soc), "{cell:#?} {}", what());
+        assert!(cell.values.mean(Quantity::Capacity).is_none_or(is_capacity), "{cell:#?} {}", what());
         let is_ratio = |ratio: f64| bounds::TRUSTED_LOG_RESISTANCE.has(ratio.ln());
-        assert!(cell.resistance_ratio.is_none_or(|ratio| is_ratio(ratio.mean)), "{cell:#?} {}", what());
+        assert!(cell.values.mean(Quantity::ResistanceRatio).is_none_or(is_ratio), "{cell:#?} {}", what());
     }
 }
 

@@ -1,7 +1,8 @@
 //! What the core counts, and what it shows to those who look: on hand-made frames of a pack of two cells.
 
 use crate::support::rig::{Rig, learned};
-use packwatch::monitor::{BusStatistics, Downtime, Statistics, Validity};
+use packwatch::monitor::{BusStatistics, CellView, Downtime, Statistics, Validity};
+use packwatch::quantity::catalogue::{CellValues, PackValues, Quantity};
 use packwatch::quantity::{CellIndex, Mode};
 
 #[test]
@@ -65,20 +66,25 @@ fn values_no_longer_known_are_not_shown() {
     let mut rig = learned();
     let pack = rig.monitor.pack_view();
     assert_eq!((pack.validity, pack.mode), (Validity::Valid, Mode::Rest));
-    let voltage_v = pack.voltage_v.unwrap();
+    let voltage_v = pack.values.mean(Quantity::Voltage).unwrap();
     assert!((voltage_v - rig.voltages_v.iter().flatten().sum::<f64>()).abs() < 1e-3, "{voltage_v}");
-    assert!(pack.weakest.is_some() && pack.soh.is_some_and(|soh| soh > 0.0));
+    assert!(pack.weakest_cell.is_some() && pack.values.mean(Quantity::Soh).is_some_and(|soh| soh > 0.0));
     // One cell is silent: nothing of it is shown but what was learned, and of the pack nothing that needs it.
     rig.voltages_v[1] = None;
     rig.seconds(20);
     let cells: Vec<_> = rig.monitor.cell_views().collect();
-    assert!(cells[0].voltage_v.is_some() && cells[0].soc.is_some());
-    let silent = cells[1];
-    assert_eq!((silent.cell, silent.voltage_v, silent.soc, silent.resistance_ratio), (CellIndex(1), None, None, None));
+    let known = |cell: &CellView, quantity| cell.values.get(quantity).is_some();
+    assert!(known(&cells[0], Quantity::Voltage) && known(&cells[0], Quantity::Soc));
+    let silent = &cells[1];
+    assert_eq!(silent.cell, CellIndex(1));
+    for quantity in [Quantity::Voltage, Quantity::Soc, Quantity::ResistanceRatio] {
+        assert!(!known(silent, quantity), "{quantity:?}");
+    }
     assert_eq!((cells[0].trusted, silent.trusted), (Some(true), None));
-    assert!(silent.capacity.is_some());
+    assert!(known(silent, Quantity::Capacity));
     let pack = rig.monitor.pack_view();
-    assert_eq!((pack.validity, pack.soc, pack.voltage_v), (Validity::Unavailable, None, None));
+    let values = [Quantity::Soc, Quantity::Voltage].map(|quantity| pack.values.get(quantity));
+    assert_eq!((pack.validity, values), (Validity::Unavailable, [None; 2]));
 }
 
 #[test]
@@ -86,20 +92,22 @@ fn the_highest_temperature_is_not_known_while_a_sensor_is_silent() {
     let mut rig = Rig::new("");
     rig.temperatures_c = [Some(25.0), Some(60.0)];
     rig.seconds(3);
-    assert_eq!(rig.monitor.pack_view().temperature_max_c, Some(60.0));
+    assert_eq!(rig.monitor.pack_view().values.mean(Quantity::TemperatureMax), Some(60.0));
     // The hot one: what the other says is no "at most".
     rig.temperatures_c[1] = None;
     rig.seconds(10);
-    assert_eq!(rig.monitor.cell_views().map(|cell| cell.temperature_c).collect::<Vec<_>>(), [Some(25.0), None]);
-    assert_eq!(rig.monitor.pack_view().temperature_max_c, None);
+    assert_eq!(
+        rig.monitor.cell_views().map(|cell| cell.values.mean(Quantity::Temperature)).collect::<Vec<_>>(),
+        [Some(25.0), None]
+    );
+    assert_eq!(rig.monitor.pack_view().values.mean(Quantity::TemperatureMax), None);
 }
 
 #[test]
 fn nothing_is_known_before_the_first_frame() {
     let rig = Rig::new("");
-    assert!(
-        rig.monitor.cell_views().all(|cell| cell.soc.is_none() && cell.capacity.is_none() && cell.trusted.is_none())
-    );
+    let is_unknown = |cell: CellView| cell.values == CellValues::default() && cell.trusted.is_none();
+    assert!(rig.monitor.cell_views().all(is_unknown));
     let pack = rig.monitor.pack_view();
-    assert_eq!((pack.validity, pack.soc, pack.soh, pack.weakest), (Validity::Unavailable, None, None, None));
+    assert_eq!((pack.validity, pack.values), (Validity::Unavailable, PackValues::default()));
 }

@@ -2,6 +2,7 @@
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::monitor::{CellView, Command, Downtime, EventKind, Record};
+use packwatch::quantity::catalogue::Quantity;
 
 use crate::support::rig::Rig;
 
@@ -12,8 +13,17 @@ const B: f64 = 1002.0;
 
 /// What half-cycles have taught of each cell, exactly: capacity, usable capacity, remaining life, loss modes.
 fn learned(rig: &Rig) -> Vec<String> {
+    let quantities = [
+        Quantity::Capacity,
+        Quantity::UsableCapacity,
+        Quantity::RemainingCycles,
+        Quantity::RemainingDays,
+        Quantity::LithiumLoss,
+        Quantity::NegativeLoss,
+        Quantity::PositiveLoss,
+    ];
     let cell = |view: CellView| {
-        format!("{:?} {:?} {:?} {:?}", view.capacity, view.usable_capacity, view.remaining_life, view.losses)
+        format!("{:?} {:?}", quantities.map(|quantity| view.values.get(quantity)), view.remaining_unknown)
     };
     rig.monitor.cell_views().map(cell).collect()
 }
@@ -21,7 +31,7 @@ fn learned(rig: &Rig) -> Vec<String> {
 /// Resistances relative to new, after the next voltages, each of which moves them a little.
 fn resistances(rig: &mut Rig) -> Vec<f64> {
     rig.tick_with_frames();
-    rig.monitor.cell_views().map(|view| view.resistance_ratio.unwrap().mean).collect()
+    rig.monitor.cell_views().map(|view| view.values.mean(Quantity::ResistanceRatio).unwrap()).collect()
 }
 
 fn assert_near(found: &[f64], wanted: &[f64]) {
@@ -71,7 +81,7 @@ fn what_was_learned_of_a_pack_is_back_when_its_number_returns() {
     let of_a = learned(&rig);
     connect(&mut rig, B);
     assert_ne!(learned(&rig), of_a, "another pack begins anew");
-    assert!(rig.monitor.cell_views().all(|view| view.capacity.is_none()));
+    assert!(rig.monitor.cell_views().all(|view| view.values.get(Quantity::Capacity).is_none()));
     assert!(
         (resistances(&mut rig)[0] - resistances_of_a[0]).abs() > 0.02 * resistances_of_a[0],
         "{resistances_of_a:?}"
@@ -91,7 +101,11 @@ fn what_was_learned_of_a_pack_is_back_when_its_number_returns() {
     connect(&mut rig, A);
     assert_eq!(learned(&rig), of_a);
     rig.seconds(60);
-    assert!(rig.monitor.cell_views().all(|view| view.soc.is_some_and(|soc| (0.0..1.0).contains(&soc.mean))));
+    assert!(
+        rig.monitor
+            .cell_views()
+            .all(|view| view.values.mean(Quantity::Soc).is_some_and(|soc| (0.0..1.0).contains(&soc)))
+    );
 }
 
 #[test]

@@ -112,7 +112,7 @@ PACK_NUMBERS = {
 }
 PACK_PERCENT = {
     "StateOfCharge.StandardDeviation": "soc_std", "StateOfCharge.Low": "soc_low", "StateOfCharge.High": "soc_high",
-    "StateOfCharge.Reported": "reported_soc", "StateOfHealth.Learned": "soh", "StateOfHealth.Reported": "reported_soh",
+    "StateOfCharge.Reported": "reported_soc", "StateOfHealth.Learned": "soh", "StateOfHealth.LearnedStandardDeviation": "soh_std", "StateOfHealth.Reported": "reported_soh",
     "Loss.LithiumInventory": "lli", "Loss.LithiumInventoryStandardDeviation": "lli_std",
     "Loss.NegativeElectrode": "lam_ne", "Loss.NegativeElectrodeStandardDeviation": "lam_ne_std",
     "Loss.PositiveElectrode": "lam_pe", "Loss.PositiveElectrodeStandardDeviation": "lam_pe_std",

@@ -2,13 +2,14 @@
 
 use std::fmt::Write as _;
 
-use super::{config, duration, number, percent, shown, store, with_std, word};
+use super::{config, duration, in_brackets, mean, number, shown, soc_band, store, with_std, word};
 use crate::cli::common::alarms::{AlarmGroup, grouped, with_unit};
 use crate::cli::common::output;
 use crate::io::stamp;
-use crate::monitor::ModelState;
+use crate::monitor::{CellView, ModelState, PackView};
+use crate::quantity::catalogue::{PackValues, Quantity};
 use crate::status::counters::LATENCY_BOUNDS_S;
-use crate::status::document::{CellStatus, Intruder, IntruderKind, LossStatus, PackStatus, StatusDocument};
+use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
 /// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;
@@ -70,66 +71,59 @@ fn pack(text: &mut String, document: &StatusDocument) {
     if let more @ 1.. = document.findings.len().saturating_sub(MOST_FOUND) {
         let _ = writeln!(text, "           and {more} more: `packwatch status --json` lists all");
     }
-    let band = match (pack.soc_low, pack.soc_high) {
-        (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),
-        _ => String::new(),
-    };
     let _ = writeln!(
         text,
-        "pack       {}: SOC {}{band}, {}, {}, {}, at most {}",
+        "pack       {}: SOC {}{}, {}, {}, {}, at most {}",
         word(pack.validity),
-        percent(pack.soc),
+        mean(&pack.values, Quantity::Soc, 1),
+        soc_band(pack).map(|band| format!(" ({band})")).unwrap_or_default(),
         word(pack.mode),
-        shown(pack.voltage_v, 2, " V"),
-        shown(pack.current_a, 2, " A"),
-        shown(pack.temperature_max_c, 1, " °C"),
+        mean(&pack.values, Quantity::Voltage, 2),
+        mean(&pack.values, Quantity::Current, 2),
+        mean(&pack.values, Quantity::TemperatureMax, 1),
     );
-    let weakest = pack.weakest_cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)));
     let _ = writeln!(
         text,
-        "health     capacity {}{weakest}, SOH {}, usable {}, recharge period {}, with the reference charger {}",
-        with_std(pack.capacity_ah, pack.capacity_std_ah, 3, " Ah"),
-        percent(pack.soh),
-        with_std(pack.usable_capacity_ah, pack.usable_capacity_std_ah, 3, " Ah"),
-        shown(pack.recharge_period_s, 0, " s"),
-        with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
+        "health     capacity {}{}, SOH {}, usable {}, recharge period {}, with the reference charger {}",
+        with_std(&pack.values, Quantity::Capacity, 3),
+        in_brackets(pack.weakest_cell),
+        mean(&pack.values, Quantity::Soh, 1),
+        with_std(&pack.values, Quantity::UsableCapacity, 3),
+        mean(&pack.values, Quantity::RechargePeriod, 0),
+        with_std(&pack.values, Quantity::NormalisedRechargePeriod, 0),
     );
-    if pack.current_offset_a.is_some() {
-        let offset = with_std(pack.current_offset_a, pack.current_offset_std_a, 3, " A");
+    if pack.values.get(Quantity::CurrentOffset).is_some() {
+        let offset = with_std(&pack.values, Quantity::CurrentOffset, 3);
         let _ = writeln!(text, "offset     current sensor {offset} (reading less true current)");
     }
     if let Some(state) = pack.model_state.filter(|state| *state != ModelState::Given) {
         let better = pack.model_fits_better.map_or_else(String::new, |it| format!(": {} fits better", it.name()));
         let _ = writeln!(text, "model      {}{better}", word(state));
     }
-    let _ = writeln!(text, "losses     {}", losses(&pack.losses));
+    let _ = writeln!(text, "losses     {}", losses(&pack.values));
     let _ = writeln!(text, "life       {}", remaining(pack));
 }
 
 /// What the weakest cell has lost.
-fn losses(losses: &LossStatus) -> String {
-    if losses.lli.is_none() {
+fn losses(values: &PackValues) -> String {
+    if values.get(Quantity::LithiumLoss).is_none() {
         return "not known".to_owned();
     }
-    let part = |mean: Option<f64>, std: Option<f64>| with_std(mean.map(|m| 100.0 * m), std.map(|s| 100.0 * s), 1, " %");
     format!(
         "lithium {}, negative electrode {}, positive electrode {}",
-        part(losses.lli, losses.lli_std),
-        part(losses.lam_ne, losses.lam_ne_std),
-        part(losses.lam_pe, losses.lam_pe_std),
+        with_std(values, Quantity::LithiumLoss, 1),
+        with_std(values, Quantity::NegativeLoss, 1),
+        with_std(values, Quantity::PositiveLoss, 1),
     )
 }
 
 /// The remaining life of the cell whose life ends first.
-fn remaining(pack: &PackStatus) -> String {
-    let life = &pack.remaining;
-    let (Some(cycles), Some(low), Some(high)) =
-        (life.remaining_cycles, life.remaining_cycles_low, life.remaining_cycles_high)
-    else {
+fn remaining(pack: &PackView) -> String {
+    let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
+    let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {
         return "not known".to_owned();
     };
-    let cell = pack.shortest_lived_cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)));
-    let days = shown(life.remaining_days, 0, " days");
+    let (cell, days) = (in_brackets(pack.shortest_lived_cell), mean(&pack.values, Quantity::RemainingDays, 0));
     format!("{cycles:.0} equivalent full cycles (90 %: {low:.0} to {high:.0}){cell}, {days} at the recent use")
 }
 
@@ -207,9 +201,9 @@ pub(super) fn alarm_line(group: &AlarmGroup) -> String {
 
 const HEAD: [&str; 7] = ["cell", "voltage", "temp.", "SOC", "capacity", "resistance", "trusted"];
 
-fn cells(text: &mut String, cells: &[CellStatus], all: bool) {
+fn cells(text: &mut String, cells: &[CellView], all: bool) {
     let is_short = cells.len() > MAX_LISTED && !all;
-    let listed: Vec<&CellStatus> = if is_short { outliers(cells) } else { cells.iter().collect() };
+    let listed: Vec<&CellView> = if is_short { outliers(cells) } else { cells.iter().collect() };
     if is_short {
         spread(text, cells);
         if listed.is_empty() {
@@ -221,15 +215,14 @@ fn cells(text: &mut String, cells: &[CellStatus], all: bool) {
     text.push_str(&output::table(&HEAD, listed.into_iter().map(row), 0));
 }
 
-fn row(cell: &CellStatus) -> Vec<String> {
-    let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
+fn row(cell: &CellView) -> Vec<String> {
     vec![
         number(cell.cell).to_string(),
-        shown(cell.voltage_v, 3, " V"),
-        shown(cell.temperature_c, 1, " °C"),
-        soc,
-        with_std(cell.capacity_ah, cell.capacity_std_ah, 3, " Ah"),
-        with_std(cell.resistance_ratio, cell.resistance_ratio_std, 2, ""),
+        mean(&cell.values, Quantity::Voltage, 3),
+        mean(&cell.values, Quantity::Temperature, 1),
+        with_std(&cell.values, Quantity::Soc, 1),
+        with_std(&cell.values, Quantity::Capacity, 3),
+        with_std(&cell.values, Quantity::ResistanceRatio, 2),
         match cell.trusted {
             None => "-",
             Some(true) => "yes",
@@ -239,55 +232,51 @@ fn row(cell: &CellStatus) -> Vec<String> {
     ]
 }
 
-/// A quantity compared over the cells.
-struct Quantity {
-    name: &'static str,
-    unit: &'static str,
-    decimals: usize,
-    /// Distance from the median up to which no cell is an outlier, in the unit and as a part of the median: what sensors and equal
-    /// cells differ by.
-    floor: (f64, f64),
-    of: fn(&CellStatus) -> Option<f64>,
-}
+/// A quantity compared over the cells: name, decimals, and the distance from the median up to which no cell is an outlier, in the
+/// quantity's unit and as a part of the median: what sensors and equal cells differ by.
+type Comparison = (&'static str, Quantity, usize, f64, f64);
 
-const QUANTITIES: [Quantity; 5] = [
-    Quantity { name: "voltage", unit: " V", decimals: 3, floor: (0.010, 0.0), of: |cell| cell.voltage_v },
-    Quantity { name: "SOC", unit: " %", decimals: 1, floor: (1.0, 0.0), of: |cell| cell.soc.map(|soc| 100.0 * soc) },
-    Quantity { name: "temp.", unit: " °C", decimals: 1, floor: (2.0, 0.0), of: |cell| cell.temperature_c },
-    Quantity { name: "capacity", unit: " Ah", decimals: 3, floor: (0.0, 0.01), of: |cell| cell.capacity_ah },
-    Quantity { name: "resistance", unit: "", decimals: 2, floor: (0.05, 0.0), of: |cell| cell.resistance_ratio },
+const COMPARISONS: [Comparison; 5] = [
+    ("voltage", Quantity::Voltage, 3, 0.010, 0.0),
+    ("SOC", Quantity::Soc, 1, 0.01, 0.0),
+    ("temp.", Quantity::Temperature, 1, 2.0, 0.0),
+    ("capacity", Quantity::Capacity, 3, 0.0, 0.01),
+    ("resistance", Quantity::ResistanceRatio, 2, 0.05, 0.0),
 ];
 
 /// Least and greatest of every quantity, with their cells.
-fn spread(text: &mut String, cells: &[CellStatus]) {
-    for Quantity { name, unit, decimals, of, .. } in QUANTITIES {
-        let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
+fn spread(text: &mut String, cells: &[CellView]) {
+    for (name, quantity, decimals, ..) in COMPARISONS {
+        let known = || cells.iter().filter_map(|cell| Some((cell, cell.values.mean(quantity)?)));
         let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
         let greatest = known().rev().max_by(|a, b| a.1.total_cmp(&b.1));
-        let count = known().count();
-        let _ = match (least, greatest) {
-            (Some((low, least)), Some((high, greatest))) => writeln!(
+        let end = |cell: &CellView| format!("{} (cell {})", mean(&cell.values, quantity, decimals), number(cell.cell));
+        let _ = match least.zip(greatest) {
+            Some(((least, _), (greatest, _))) => writeln!(
                 text,
-                "{name:<10} {least:.decimals$}{unit} (cell {low}) to {greatest:.decimals$}{unit} (cell {high}), known \
-                 of {count} of {}",
+                "{name:<10} {} to {}, known of {} of {}",
+                end(least),
+                end(greatest),
+                known().count(),
                 cells.len()
             ),
-            _ => writeln!(text, "{name:<10} not known of any of {}", cells.len()),
+            None => writeln!(text, "{name:<10} not known of any of {}", cells.len()),
         };
     }
 }
 
 /// Outliers: cells that are not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
-fn outliers(cells: &[CellStatus]) -> Vec<&CellStatus> {
-    let mut ranked: Vec<(f64, &CellStatus)> = cells.iter().map(|cell| (0.0, cell)).collect();
-    for Quantity { floor, of, .. } in QUANTITIES {
+fn outliers(cells: &[CellView]) -> Vec<&CellView> {
+    let mut ranked: Vec<(f64, &CellView)> = cells.iter().map(|cell| (0.0, cell)).collect();
+    for (_, quantity, _, floor, relative_floor) in COMPARISONS {
+        let of = |cell: &CellView| cell.values.mean(quantity);
         let mut known: Vec<f64> = cells.iter().filter_map(of).collect();
         known.sort_by(f64::total_cmp);
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
         // Relative to the median distance; cells within the floor are no outliers.
-        let floor = floor.0.max(floor.1 * median.abs());
+        let floor = floor.max(relative_floor * median.abs());
         let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {
             // A cell with an unknown value ranks first.
@@ -299,7 +288,7 @@ fn outliers(cells: &[CellStatus]) -> Vec<&CellStatus> {
     }
     // A stable sort: the first cells of equal rank.
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let mut found: Vec<&CellStatus> =
+    let mut found: Vec<&CellView> =
         ranked.into_iter().filter(|(rank, _)| *rank > OUTLYING).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();
     found.sort_by_key(|cell| cell.cell);
     found

@@ -6,6 +6,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::quantity::catalogue::Estimate;
+
 /// A scalar estimate and its variance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ScalarGaussian {
@@ -22,6 +24,12 @@ pub struct Measurement {
     pub value: f64,
     /// Variance, positive.
     pub variance: f64,
+}
+
+impl From<ScalarGaussian> for Estimate {
+    fn from(gaussian: ScalarGaussian) -> Self {
+        Self { mean: gaussian.mean, std: Some(gaussian.std()) }
+    }
 }
 
 impl ScalarGaussian {

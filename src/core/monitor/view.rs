@@ -2,7 +2,7 @@
 
 use super::Monitor;
 use super::config::CommandConfig;
-use super::message::{CellView, Estimate, PackView, ReportedState};
+use super::message::{CellView, PackView};
 use super::stage::intake::ControllerCount;
 use super::stage::intake::command_gate::CommandCounts;
 use super::stage::modelling::ModelView;
@@ -17,8 +17,12 @@ use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
+use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
+
+/// Half the width of the 95 % interval, in standard deviations.
+const Z95: f64 = 1.96;
 
 impl Monitor {
     /// Time of the latest input.
@@ -136,7 +140,7 @@ impl Monitor {
 
     /// The latest estimate of every cell, for live tables; `None` before its first. Samples since the last
     /// [`settle`](Self::settle) are not in it.
-    pub fn latest(&self) -> impl Iterator<Item = Option<Estimate>> {
+    pub fn latest(&self) -> impl Iterator<Item = Option<super::Estimate>> {
         (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
     }
 
@@ -223,24 +227,28 @@ impl Monitor {
         let is_fresh = sampler.is_fresh(channel, now);
         let soc = estimation.bank.soc(cell.index()).filter(|_| is_fresh);
         let has_learned = learning.state.learner.has_learned(cell.index());
+        let life = learning.lives.of_cell(cell);
+        let mut values = CellValues::default();
+        values.set(Quantity::Voltage, sampler.reported(channel, now).filter(|_| is_fresh));
+        values.set(Quantity::Current, sampler.cell_current_a(now));
+        values.set(Quantity::Temperature, sampler.temperature_c(cell, now));
+        values.set(Quantity::Soc, soc);
+        values.set(Quantity::Capacity, has_learned.then(|| learning.capacity(cell.index())));
+        values.set(Quantity::UsableCapacity, learning.cells[cell.index()].usable.filter(|_| has_learned));
+        values.set(Quantity::ResistanceRatio, soc.map(|_| estimation.resistance(cell.index())));
+        set_losses(&mut values, self.loss_modes(cell));
+        set_remaining_life(&mut values, life.ok());
         CellView {
             cell,
-            voltage_v: sampler.reported(channel, now).filter(|_| is_fresh),
-            current_a: sampler.cell_current_a(now),
-            temperature_c: sampler.temperature_c(cell, now),
-            soc,
-            capacity: has_learned.then(|| learning.capacity(cell.index())),
-            usable_capacity: learning.cells[cell.index()].usable.filter(|_| has_learned),
-            losses: self.loss_modes(cell),
-            resistance_ratio: soc.map(|_| estimation.resistance(cell.index())),
-            remaining_life: learning.lives.of_cell(cell),
+            values,
+            remaining_unknown: life.err().map(|why| why.to_string()),
             trusted: soc.map(|_| estimation.is_trusted(cell.index())),
         }
     }
 
     /// Sum of the cells' voltages, while all are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
-        let sum_v: Option<f64> = self.cell_views().map(|view| view.voltage_v).sum();
+        let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
         match self.stages.sampling.sampler.config().voltage_source {
             VoltageSource::Cells => sum_v,
             VoltageSource::PackTotal { series } => sum_v.map(|cell_v| cell_v * f64::from(series)),
@@ -252,30 +260,59 @@ impl Monitor {
         let Stages { sampling, estimation, learning, .. } = &self.stages;
         let (sampler, now, pack) = (&sampling.sampler, self.now(), self.pack());
         let health = learning.health_fields(&estimation.bank);
-        let capacities = self.cell_views().filter_map(|view| view.capacity.map(|capacity| (view.cell, capacity)));
-        let weakest = capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean));
+        let weakest = learning.weakest();
+        let weakest_cell = weakest.and_then(|(index, _)| estimation.cell_indices().nth(index));
+        let capacity = weakest.map(|(_, capacity)| capacity);
         let hottest = sampler.hottest_c(now);
+        let soc = pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
+        let edge = |sign: f64| soc.map(|soc| (soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0));
+        let usable = health.usable_capacity_ah.zip(health.usable_capacity_std_ah);
+        let soh = health.soh.map(|mean| {
+            let relative_std = capacity.map(|ah| ah.std() / ah.mean);
+            Estimate { mean, std: relative_std.map(|std| mean * std) }
+        });
+        let life = learning.lives.of_pack();
+        let model = self.model();
+        let mut values = PackValues::default();
+        values.set(Quantity::Soc, soc);
+        values.set(Quantity::SocLow, edge(-1.0));
+        values.set(Quantity::SocHigh, edge(1.0));
+        values.set(Quantity::ReportedSoc, sampler.reported(Channel::ReportedSoc, now));
+        values.set(Quantity::Voltage, self.pack_voltage_v());
+        values.set(Quantity::Current, sampler.pack_current_a(now));
+        values.set(Quantity::CurrentOffset, self.current_offset());
+        values.set(Quantity::TemperatureMax, hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)));
+        values.set(Quantity::Capacity, capacity);
+        values.set(Quantity::UsableCapacity, usable.map(|(mean, std)| Estimate { mean, std: Some(std) }));
+        values.set(Quantity::Soh, soh);
+        values.set(Quantity::ReportedSoh, sampler.reported(Channel::ReportedSoh, now));
+        values.set(Quantity::RechargePeriod, learning.state.recharge_period_s);
+        values.set(Quantity::NormalisedRechargePeriod, learning.state.normalised_recharge);
+        set_losses(&mut values, weakest_cell.and_then(|cell| self.loss_modes(cell)));
+        set_remaining_life(&mut values, life.map(|(_, life)| life));
         PackView {
             validity: self.stages.validity(),
             mode: learning.mode(),
-            soc: pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-            voltage_v: self.pack_voltage_v(),
-            current_a: sampler.pack_current_a(now),
-            temperature_max_c: hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)),
-            weakest: weakest.filter(|_| learning.state.learner.has_learned_all()),
-            usable_capacity: health
-                .usable_capacity_ah
-                .zip(health.usable_capacity_std_ah)
-                .map(|(mean, std)| ScalarGaussian::from_std(mean, std)),
-            soh: health.soh,
-            remaining_life: learning.lives.of_pack(),
-            recharge_period_s: learning.state.recharge_period_s,
-            normalised_recharge_period: learning.state.normalised_recharge,
-            reported: ReportedState {
-                soc: sampler.reported(Channel::ReportedSoc, now),
-                soh: sampler.reported(Channel::ReportedSoh, now),
-            },
+            weakest_cell,
+            shortest_lived_cell: life.map(|(cell, _)| cell),
+            model_state: Some(model.state),
+            model_fits_better: model.chemistry,
+            values,
         }
     }
+}
+
+fn set_losses<const IS_PACK: bool>(values: &mut Values<IS_PACK>, losses: Option<LossModes>) {
+    values.set(Quantity::LithiumLoss, losses.map(|losses| losses.lithium));
+    values.set(Quantity::NegativeLoss, losses.map(|losses| losses.negative));
+    values.set(Quantity::PositiveLoss, losses.map(|losses| losses.positive));
+}
+
+fn set_remaining_life<const IS_PACK: bool>(values: &mut Values<IS_PACK>, life: Option<RemainingLife>) {
+    let (cycles, days) = (life.and_then(|life| life.cycles), life.and_then(|life| life.days));
+    values.set(Quantity::RemainingCycles, cycles.map(|cycles| cycles.median));
+    values.set(Quantity::RemainingCyclesLow, cycles.map(|cycles| cycles.low));
+    values.set(Quantity::RemainingCyclesHigh, cycles.map(|cycles| cycles.high));
+    values.set(Quantity::RemainingDays, days.map(|days| days.median));
 }

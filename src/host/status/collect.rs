@@ -4,30 +4,23 @@ use std::collections::VecDeque;
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, Intruder, IntruderKind,
-    LossStatus, MessageFlood, MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters,
-    StatusDocument, StoreStatus, VERSION,
+    AlarmStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, Intruder, IntruderKind, MessageFlood,
+    MessageProtection, PollStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::CanId;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
-use crate::cell::LossModes;
 use crate::config::VehicleIdentity;
 use crate::control::answer;
-use crate::filter::ScalarGaussian;
-use crate::health::RemainingLife;
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkHealth, LinkOutput};
-use crate::monitor::{BusStatistics, CellView, CommandCounts, ControllerCount, Event, EventKind, Monitor, Statistics};
+use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
 /// Events in the document: a screenful.
 pub const MAX_EVENTS: usize = 32;
-
-/// Half the width of the 95 % interval, in standard deviations.
-const Z95: f64 = 1.96;
 
 /// The latest events, without those that come once per cell and half-cycle: they would displace all others.
 #[derive(Debug, Default)]
@@ -112,7 +105,7 @@ impl Sources<'_> {
 
     fn document(self, now: Timestamp) -> StatusDocument {
         let Self { identity, monitor, before, counters, .. } = self;
-        let pack = pack(monitor);
+        let pack = monitor.pack_view();
         let core = monitor.statistics().since(&before.statistics);
         StatusDocument {
             version: VERSION,
@@ -127,7 +120,7 @@ impl Sources<'_> {
             state: pack.validity,
             interfaces: self.interfaces(&core),
             pack,
-            cells: monitor.cell_views().map(cell).collect(),
+            cells: monitor.cell_views().collect(),
             alarms: alarms(monitor),
             counters: StatusCounters {
                 core,
@@ -231,104 +224,6 @@ impl Sources<'_> {
 fn interface(name: &str, health: LinkHealth, received: BusStatistics) -> InterfaceStatus {
     let LinkHealth { state, ups, counts } = health;
     InterfaceStatus { name: name.to_owned(), state, reconnects: ups.saturating_sub(1), received, link: counts }
-}
-
-/// A finite number, or none.
-fn finite(value: f64) -> Option<f64> {
-    value.is_finite().then_some(value)
-}
-
-fn mean(estimate: Option<&ScalarGaussian>) -> Option<f64> {
-    estimate.and_then(|estimate| finite(estimate.mean))
-}
-
-fn std(estimate: Option<&ScalarGaussian>) -> Option<f64> {
-    estimate.and_then(|estimate| finite(estimate.std()))
-}
-
-/// The remaining life, as far as it is known.
-fn remaining(life: Option<RemainingLife>) -> RemainingStatus {
-    let (cycles, days) = (life.and_then(|life| life.cycles), life.and_then(|life| life.days));
-    RemainingStatus {
-        remaining_cycles: cycles.and_then(|cycles| finite(cycles.median)),
-        remaining_cycles_low: cycles.and_then(|cycles| finite(cycles.low)),
-        remaining_cycles_high: cycles.and_then(|cycles| finite(cycles.high)),
-        remaining_days: days.and_then(|days| finite(days.median)),
-    }
-}
-
-/// What a cell has lost, as far as it is known.
-fn losses(losses: Option<LossModes>) -> LossStatus {
-    let losses = losses.as_ref();
-    let [lithium, negative, positive] =
-        [losses.map(|it| &it.lithium), losses.map(|it| &it.negative), losses.map(|it| &it.positive)];
-    LossStatus {
-        lli: mean(lithium),
-        lli_std: std(lithium),
-        lam_ne: mean(negative),
-        lam_ne_std: std(negative),
-        lam_pe: mean(positive),
-        lam_pe_std: std(positive),
-    }
-}
-
-fn pack(monitor: &Monitor) -> PackStatus {
-    let view = monitor.pack_view();
-    let soc = view.soc.as_ref();
-    let edge = |sign: f64| soc.and_then(|soc| finite((soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0)));
-    let (weakest, offset, model) = (view.weakest.as_ref(), monitor.current_offset(), monitor.model());
-    let normalised = view.normalised_recharge_period.as_ref();
-    PackStatus {
-        validity: view.validity,
-        mode: view.mode,
-        soc: mean(soc),
-        soc_std: std(soc),
-        soc_low: edge(-1.0),
-        soc_high: edge(1.0),
-        limiting_cell: view.limiting_cell.map(|cell| cell.0),
-        voltage_v: view.voltage_v.and_then(finite),
-        current_a: view.current_a.and_then(finite),
-        current_offset_a: mean(offset.as_ref()),
-        current_offset_std_a: std(offset.as_ref()),
-        model_state: Some(model.state),
-        model_fits_better: model.chemistry,
-        temperature_max_c: view.temperature_max_c.and_then(finite),
-        weakest_cell: weakest.map(|(cell, _)| cell.0),
-        capacity_ah: mean(weakest.map(|(_, capacity)| capacity)),
-        capacity_std_ah: std(weakest.map(|(_, capacity)| capacity)),
-        soh: view.soh.and_then(finite),
-        losses: losses(weakest.and_then(|&(cell, _)| monitor.loss_modes(cell))),
-        shortest_lived_cell: view.remaining_life.map(|(cell, _)| cell.0),
-        remaining: remaining(view.remaining_life.map(|(_, life)| life)),
-        usable_capacity_ah: mean(view.usable_capacity.as_ref()),
-        usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
-        recharge_period_s: view.recharge_period_s.and_then(finite),
-        normalised_recharge_period_s: mean(normalised),
-        normalised_recharge_period_std_s: std(normalised),
-        reported_soc: view.reported.soc.and_then(finite),
-        reported_soh: view.reported.soh.and_then(finite),
-    }
-}
-
-fn cell(view: CellView) -> CellStatus {
-    CellStatus {
-        cell: view.cell.0,
-        voltage_v: view.voltage_v.and_then(finite),
-        current_a: view.current_a.and_then(finite),
-        temperature_c: view.temperature_c.and_then(finite),
-        soc: mean(view.soc.as_ref()),
-        soc_std: std(view.soc.as_ref()),
-        capacity_ah: mean(view.capacity.as_ref()),
-        capacity_std_ah: std(view.capacity.as_ref()),
-        losses: losses(view.losses),
-        usable_capacity_ah: mean(view.usable_capacity.as_ref()),
-        usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
-        remaining: remaining(view.remaining_life.ok()),
-        remaining_unknown: view.remaining_life.err().map(|why| why.to_string()),
-        resistance_ratio: mean(view.resistance_ratio.as_ref()),
-        resistance_ratio_std: std(view.resistance_ratio.as_ref()),
-        trusted: view.trusted,
-    }
 }
 
 fn alarms(monitor: &Monitor) -> AlarmStatus {

@@ -16,13 +16,13 @@ use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Rule, Severity};
 use crate::can::poll::PollSilence;
 use crate::can::uds::ControllerCounts;
-use crate::cell::Chemistry;
 use crate::cell_faults::CellFault;
 use crate::config::{ConfigFiles, VehicleIdentity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::{LinkCounts, LinkState};
-use crate::monitor::{BusStatistics, ModelState, Statistics, Validity};
-use crate::quantity::{Mode, Timestamp};
+use crate::monitor::{BusStatistics, CellView, PackView, Statistics, Validity};
+use crate::quantity::catalogue::Quantity;
+use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
 /// Version of [`StatusDocument`].
@@ -55,9 +55,9 @@ pub struct StatusDocument {
     /// The interfaces, in the order of the configuration.
     pub interfaces: Vec<InterfaceStatus>,
     /// The pack.
-    pub pack: PackStatus,
+    pub pack: PackView,
     /// Its cells.
-    pub cells: Vec<CellStatus>,
+    pub cells: Vec<CellView>,
     /// Alarms that need attention.
     pub alarms: AlarmStatus,
     /// Counts.
@@ -95,6 +95,24 @@ pub struct StatusDocument {
     pub events: Vec<serde_json::Value>,
 }
 
+impl StatusDocument {
+    /// The first cell with the least value, and that; `None` while the value of a cell is unknown.
+    pub fn least(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
+        self.extreme(quantity, |candidate, best| candidate < best)
+    }
+
+    /// The first cell with the greatest value, likewise.
+    pub fn greatest(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
+        self.extreme(quantity, |candidate, best| candidate > best)
+    }
+
+    fn extreme(&self, quantity: Quantity, beats: fn(f64, f64) -> bool) -> Option<(CellIndex, f64)> {
+        let values = self.cells.iter().map(|cell| Some((cell.cell, cell.values.mean(quantity)?)));
+        let values: Vec<_> = values.collect::<Option<_>>()?;
+        values.into_iter().reduce(|best, candidate| if beats(candidate.1, best.1) { candidate } else { best })
+    }
+}
+
 /// The configuration file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ConfigFile {
@@ -123,146 +141,6 @@ pub struct InterfaceStatus {
     /// Frames sent and lost.
     #[serde(flatten)]
     pub link: LinkCounts,
-}
-
-/// The pack, as its limiting cells determine it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct PackStatus {
-    /// Validity of the estimates.
-    pub validity: Validity,
-    /// Charge, rest or discharge.
-    pub mode: Mode,
-    /// State of charge.
-    pub soc: Option<f64>,
-    /// Its standard deviation.
-    pub soc_std: Option<f64>,
-    /// Lower end of the 95 % interval of the state of charge.
-    pub soc_low: Option<f64>,
-    /// Upper end.
-    pub soc_high: Option<f64>,
-    /// The cell that ends a discharge.
-    pub limiting_cell: Option<u16>,
-    /// Sum of the cells' voltages.
-    pub voltage_v: Option<f64>,
-    /// Current, positive = discharge.
-    pub current_a: Option<f64>,
-    /// Learned offset of the current sensor: what it reads less the true current, positive = discharge.
-    #[serde(default)]
-    pub current_offset_a: Option<f64>,
-    /// Its standard deviation.
-    #[serde(default)]
-    pub current_offset_std_a: Option<f64>,
-    /// How well the model of the cells is known; `None` in documents of earlier programs.
-    #[serde(default)]
-    pub model_state: Option<ModelState>,
-    /// The chemistry that explains the voltages better than that on the label.
-    #[serde(default)]
-    pub model_fits_better: Option<Chemistry>,
-    /// Highest temperature, while all sensors are fresh.
-    pub temperature_max_c: Option<f64>,
-    /// The cell with the least capacity, once the capacity of every cell was learned.
-    pub weakest_cell: Option<u16>,
-    /// Its capacity.
-    pub capacity_ah: Option<f64>,
-    /// Standard deviation of that.
-    pub capacity_std_ah: Option<f64>,
-    /// Capacity relative to rated.
-    pub soh: Option<f64>,
-    /// What the cell with the least capacity has lost.
-    #[serde(flatten)]
-    pub losses: LossStatus,
-    /// The cell whose life ends first, once the remaining life of every cell is known.
-    #[serde(default)]
-    pub shortest_lived_cell: Option<u16>,
-    /// Remaining life of that cell.
-    #[serde(flatten)]
-    pub remaining: RemainingStatus,
-    /// Least usable capacity at the configured load.
-    pub usable_capacity_ah: Option<f64>,
-    /// Its standard deviation.
-    pub usable_capacity_std_ah: Option<f64>,
-    /// Last recorded recharge period.
-    pub recharge_period_s: Option<f64>,
-    /// Recharge period with the reference charger.
-    pub normalised_recharge_period_s: Option<f64>,
-    /// Its standard deviation.
-    pub normalised_recharge_period_std_s: Option<f64>,
-    /// SOC as the pack itself reports it.
-    pub reported_soc: Option<f64>,
-    /// SOH as the pack itself reports it.
-    pub reported_soh: Option<f64>,
-}
-
-/// Remaining life of a cell, as far as it is known.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct RemainingStatus {
-    /// Equivalent full cycles until the end of life, median.
-    pub remaining_cycles: Option<f64>,
-    /// 5 % quantile of the cycles.
-    pub remaining_cycles_low: Option<f64>,
-    /// 95 % quantile of the cycles.
-    pub remaining_cycles_high: Option<f64>,
-    /// Days until the end of life at the recent use, median.
-    pub remaining_days: Option<f64>,
-}
-
-/// What a cell has lost, parts of the model's new cell, as far as it is known.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct LossStatus {
-    /// Loss of lithium inventory.
-    pub lli: Option<f64>,
-    /// Its standard deviation.
-    pub lli_std: Option<f64>,
-    /// Loss of active material of the negative electrode.
-    pub lam_ne: Option<f64>,
-    /// Its standard deviation.
-    pub lam_ne_std: Option<f64>,
-    /// Loss of active material of the positive electrode.
-    pub lam_pe: Option<f64>,
-    /// Its standard deviation.
-    pub lam_pe_std: Option<f64>,
-}
-
-/// One cell.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct CellStatus {
-    /// Its number, from 0.
-    pub cell: u16,
-    /// Voltage.
-    pub voltage_v: Option<f64>,
-    /// Current, positive = discharge.
-    pub current_a: Option<f64>,
-    /// Temperature of its sensor.
-    pub temperature_c: Option<f64>,
-    /// State of charge.
-    pub soc: Option<f64>,
-    /// Its standard deviation.
-    pub soc_std: Option<f64>,
-    /// Learned capacity.
-    pub capacity_ah: Option<f64>,
-    /// Its standard deviation.
-    pub capacity_std_ah: Option<f64>,
-    /// What it has lost.
-    #[serde(flatten)]
-    pub losses: LossStatus,
-    /// Usable capacity at the configured load.
-    pub usable_capacity_ah: Option<f64>,
-    /// Its standard deviation.
-    pub usable_capacity_std_ah: Option<f64>,
-    /// Remaining life.
-    #[serde(flatten)]
-    pub remaining: RemainingStatus,
-    /// Why the remaining life is not known.
-    #[serde(default)]
-    pub remaining_unknown: Option<String>,
-    /// Resistance relative to new.
-    pub resistance_ratio: Option<f64>,
-    /// Its standard deviation.
-    pub resistance_ratio_std: Option<f64>,
-    /// Whether the filter is consistent; unknown without SOC.
-    pub trusted: Option<bool>,
 }
 
 /// The alarms.

@@ -15,14 +15,15 @@ use prometheus_client::encoding::text::encode;
 use prometheus_client::encoding::{DescriptorEncoder, NoLabelSet};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
-use prometheus_client::registry::{Registry, Unit};
+use prometheus_client::registry::{self, Registry};
 
-use super::document::{CellStatus, PackStatus, StatusDocument};
+use super::document::StatusDocument;
 use crate::alarm::Severity;
 use crate::can::uds::ControllerCounts;
 use crate::io::socket::LinkState;
-use crate::monitor::Validity;
-use crate::quantity::Mode;
+use crate::monitor::{CellView, PackView, Validity};
+use crate::quantity::catalogue::{Part, Presentation, Unit, Values};
+use crate::quantity::{CellIndex, Mode};
 
 /// OpenMetrics text that ends with `# EOF`; `None` = there is no daemon.
 pub fn openmetrics(document: Option<StatusDocument>) -> String {
@@ -89,7 +90,7 @@ impl Families<'_> {
         if known.peek().is_none() {
             return Ok(());
         }
-        let unit = (!unit.is_empty()).then(|| Unit::Other(unit.to_owned()));
+        let unit = (!unit.is_empty()).then(|| registry::Unit::Other(unit.to_owned()));
         let mut family = self.0.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?;
         for (labels, value) in known {
             if labels.is_empty() {
@@ -238,132 +239,62 @@ fn message(interface: &str, id: &str) -> Labels {
     vec![("interface", interface.to_owned()), ("id", id.to_owned())]
 }
 
-fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
-    let number = |cell: Option<u16>| cell.map(|cell| f64::from(cell) + 1.0);
-    let (life, losses) = (&pack.remaining, &pack.losses);
+fn pack(families: &mut Families<'_>, pack: &PackView) -> fmt::Result {
+    let number = |cell: Option<CellIndex>| cell.map(|cell| f64::from(cell.0) + 1.0);
+    let state = pack.model_state.map(|state| f64::from(state.code()));
     let rows = [
-        ("pack_soc", "ratio", "State of charge", pack.soc),
-        ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
-        ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
-        ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
-        (
-            "pack_current_offset",
-            "amperes",
-            "Learned offset of the current sensor, reading less true current",
-            pack.current_offset_a,
-        ),
-        (
-            "pack_current_offset_std",
-            "amperes",
-            "Standard deviation of the current sensor's offset",
-            pack.current_offset_std_a,
-        ),
-        (
-            "pack_model_state",
-            "",
-            "Model of the cells: 0 prior, 1 learning, 2 learned, 3 unfit, 4 given",
-            pack.model_state.map(|state| f64::from(state.code())),
-        ),
-        ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
-        ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
-        ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),
-        ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
-        ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
-        ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
-        ("pack_lli", "ratio", "Loss of lithium inventory of the weakest cell", losses.lli),
-        ("pack_lli_std", "ratio", "Standard deviation of the loss of lithium inventory", losses.lli_std),
-        ("pack_lam_ne", "ratio", "Loss of active material of its negative electrode", losses.lam_ne),
-        ("pack_lam_ne_std", "ratio", "Standard deviation of the negative electrode's loss", losses.lam_ne_std),
-        ("pack_lam_pe", "ratio", "Loss of active material of its positive electrode", losses.lam_pe),
-        ("pack_lam_pe_std", "ratio", "Standard deviation of the positive electrode's loss", losses.lam_pe_std),
-        ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
-        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", life.remaining_cycles),
-        (
-            "pack_remaining_cycles_low",
-            "",
-            "5 % quantile of the cycles until the end of life",
-            life.remaining_cycles_low,
-        ),
-        (
-            "pack_remaining_cycles_high",
-            "",
-            "95 % quantile of the cycles until the end of life",
-            life.remaining_cycles_high,
-        ),
-        (
-            "pack_remaining_life",
-            "seconds",
-            "Time until the end of life at the recent use, median",
-            life.remaining_days.map(|d| 86_400.0 * d),
-        ),
-        ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
-        (
-            "pack_usable_capacity_std",
-            "amperehours",
-            "Standard deviation of the least usable capacity",
-            pack.usable_capacity_std_ah,
-        ),
-        ("pack_recharge_period", "seconds", "Last recharge period", pack.recharge_period_s),
-        (
-            "pack_recharge_period_normalised",
-            "seconds",
-            "Recharge period with the reference charger",
-            pack.normalised_recharge_period_s,
-        ),
-        (
-            "pack_recharge_period_normalised_std",
-            "seconds",
-            "Standard deviation of the recharge period with the reference charger",
-            pack.normalised_recharge_period_std_s,
-        ),
-        ("pack_reported_soc", "ratio", "State of charge as the pack reports it", pack.reported_soc),
-        ("pack_reported_soh", "ratio", "State of health as the pack reports it", pack.reported_soh),
+        ("pack_model_state", "Model of the cells: 0 prior, 1 learning, 2 learned, 3 unfit, 4 given", state),
+        ("pack_limiting_cell", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
+        ("pack_weakest_cell", "Number of the cell with the least capacity", number(pack.weakest_cell)),
+        ("pack_shortest_lived_cell", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
     ];
-    rows.into_iter().try_for_each(|(name, unit, help, value)| families.gauge(name, unit, help, one(value)))
+    rows.into_iter().try_for_each(|(name, help, value)| families.gauge(name, "", help, one(value)))?;
+    quantities(families, "pack", &one(&pack.values))
 }
 
-/// Name, unit, help, and the value.
-type CellRow = (&'static str, &'static str, &'static str, fn(&CellStatus) -> Option<f64>);
+fn cells(families: &mut Families<'_>, cells: &[CellView]) -> fmt::Result {
+    let number = |cell: &CellView| label("cell", (u32::from(cell.cell.0) + 1).to_string());
+    let trusted = cells.iter().map(|cell| (number(cell), cell.trusted.and_then(flag)));
+    families.gauge("cell_trusted", "", "Whether the filter is consistent", trusted)?;
+    let values: Vec<_> = cells.iter().map(|cell| (number(cell), &cell.values)).collect();
+    quantities(families, "cell", &values)
+}
 
-const CELL_ROWS: &[CellRow] = &[
-    ("cell_voltage", "volts", "Voltage", |cell| cell.voltage_v),
-    ("cell_current", "amperes", "Current, positive when discharging", |cell| cell.current_a),
-    ("cell_temperature", "celsius", "Temperature of the cell's sensor", |cell| cell.temperature_c),
-    ("cell_soc", "ratio", "State of charge", |cell| cell.soc),
-    ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
-    ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
-    ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
-    ("cell_lli", "ratio", "Loss of lithium inventory", |cell| cell.losses.lli),
-    ("cell_lli_std", "ratio", "Standard deviation of the loss of lithium inventory", |cell| cell.losses.lli_std),
-    ("cell_lam_ne", "ratio", "Loss of active material of the negative electrode", |cell| cell.losses.lam_ne),
-    ("cell_lam_ne_std", "ratio", "Standard deviation of the negative electrode's loss", |cell| cell.losses.lam_ne_std),
-    ("cell_lam_pe", "ratio", "Loss of active material of the positive electrode", |cell| cell.losses.lam_pe),
-    ("cell_lam_pe_std", "ratio", "Standard deviation of the positive electrode's loss", |cell| cell.losses.lam_pe_std),
-    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| {
-        cell.remaining.remaining_cycles
-    }),
-    ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| {
-        cell.remaining.remaining_cycles_low
-    }),
-    ("cell_remaining_cycles_high", "", "95 % quantile of the cycles until the end of life", |cell| {
-        cell.remaining.remaining_cycles_high
-    }),
-    ("cell_usable_capacity", "amperehours", "Usable capacity", |cell| cell.usable_capacity_ah),
-    ("cell_usable_capacity_std", "amperehours", "Standard deviation of the usable capacity", |cell| {
-        cell.usable_capacity_std_ah
-    }),
-    ("cell_resistance", "ratio", "Resistance relative to new", |cell| cell.resistance_ratio),
-    ("cell_resistance_std", "ratio", "Standard deviation of the resistance relative to new", |cell| {
-        cell.resistance_ratio_std
-    }),
-    ("cell_trusted", "", "Whether the filter is consistent", |cell| cell.trusted.and_then(flag)),
-];
+/// The quantities of the catalogue, each with its standard deviation.
+fn quantities<const IS_PACK: bool>(
+    families: &mut Families<'_>,
+    owner: &str,
+    values: &[(Labels, &Values<IS_PACK>)],
+) -> fmt::Result {
+    for (row, Presentation { about, .. }) in Values::<IS_PACK>::rows() {
+        let (unit, factor) = metric_unit(row.unit);
+        let sign = if row.unit == Unit::Amperes { ", positive when discharging" } else { "" };
+        for (part, _) in row.parts() {
+            let samples = values
+                .iter()
+                .map(|(labels, values)| (labels.clone(), values.part(row.quantity, part).map(|value| factor * value)));
+            let (ending, help) = match part {
+                Part::Mean => ("", format!("{about}{sign}")),
+                Part::Std => ("_std", format!("Standard deviation: {about}")),
+            };
+            families.gauge(&format!("{owner}_{}{ending}", row.metric), unit, &help, samples)?;
+        }
+    }
+    Ok(())
+}
 
-fn cells(families: &mut Families<'_>, cells: &[CellStatus]) -> fmt::Result {
-    CELL_ROWS.iter().try_for_each(|(name, unit, help, of)| {
-        let samples = cells.iter().map(|cell| (label("cell", (u32::from(cell.cell) + 1).to_string()), of(cell)));
-        families.gauge(name, unit, help, samples)
-    })
+/// The unit in a metric's name, and its factor.
+const fn metric_unit(unit: Unit) -> (&'static str, f64) {
+    match unit {
+        Unit::Level | Unit::Fraction | Unit::Ratio => ("ratio", 1.0),
+        Unit::Volts => ("volts", 1.0),
+        Unit::Amperes => ("amperes", 1.0),
+        Unit::Celsius => ("celsius", 1.0),
+        Unit::AmpereHours => ("amperehours", 1.0),
+        Unit::Seconds => ("seconds", 1.0),
+        Unit::Days => ("seconds", 86_400.0),
+        Unit::Cycles => ("", 1.0),
+    }
 }
 
 fn alarms(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
@@ -436,7 +367,7 @@ fn service(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Resul
     let latency = &document.latency;
     let buckets: Vec<(f64, u64)> =
         latency.buckets.iter().map(|bucket| (bucket.le_s.unwrap_or(f64::INFINITY), bucket.frames)).collect();
-    let unit = Unit::Seconds;
+    let unit = registry::Unit::Seconds;
     let help = "Time from the kernel's receive stamp of a frame to its estimate";
     let mut family = families.0.encode_descriptor("frame_to_estimate", help, Some(&unit), MetricType::Histogram)?;
     family.encode_histogram::<NoLabelSet>(latency.sum_s, latency.frames, &buckets, None)

@@ -10,7 +10,7 @@ use super::record::{CellRecord, Learned, Record};
 use crate::cell::CellModel;
 use crate::config::Config;
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
-use crate::quantity::{CellIndex, Channel, Timestamp};
+use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
 /// Stamps before 2001-01-01, s since 1970, are no dates. A clock that was not set begins in 1970, 1980 or 2000; a log that counts from its
 /// start is shorter than 30 years.
@@ -280,7 +280,11 @@ impl<'a> Battery<'a> {
     fn learned(&self) -> Result<Vec<(usize, Learned)>, String> {
         self.check_trust()?;
         let of_cell = |index: usize| {
-            let has_learned = self.monitor.cell_views().nth(index).is_some_and(|view| view.capacity.is_some());
+            let has_learned = self
+                .monitor
+                .cell_views()
+                .nth(index)
+                .is_some_and(|view| view.values.get(catalogue::Quantity::Capacity).is_some());
             let learned = self.record.cells.get(index).and_then(|cell: &CellRecord| cell.learned);
             learned.filter(|_| has_learned).map(|learned| (index, learned)).ok_or_else(|| {
                 format!("nothing has been learned of cell {} yet: it needs a deep charge or discharge", index + 1)

@@ -80,7 +80,7 @@ impl Routes {
 
     /// Name of the signal with this id.
     pub(crate) fn name(&self, id: i32) -> Option<&'static str> {
-        self.by_id.get(&id).map(|route| route.signal.name)
+        self.by_id.get(&id).map(|route| &*route.signal.name)
     }
 
     /// Claims every signal.
@@ -103,11 +103,12 @@ impl Routes {
         let timestamp = Some(document.map_or_else(now, |document| timestamp(document.wall_time)));
         let mut points = Points::default();
         for (id, route) in ids.into_iter().filter_map(|id| self.by_id.get_key_value(id)) {
-            let value =
-                document.and_then(route.signal.value).filter(|value| value.data_type() == route.signal.data_type);
+            let value = document
+                .and_then(|document| route.signal.value(document))
+                .filter(|value| value.data_type() == route.signal.data_type);
             let is_withheld = value.as_ref().is_some_and(|value| !value.is_within(route.limits));
             if is_withheld {
-                points.withheld.push(route.signal.name);
+                points.withheld.push(&route.signal.name);
             }
             let value = value.filter(|_| !is_withheld).map(|value| Value { typed: Some(value.into_message()) });
             points.by_id.insert(*id, Datapoint { timestamp, value });

@@ -4,11 +4,16 @@
 //! Out: VSS values: current positive = into the battery, percent, cells from 0. `None` = no value: something it needs is unknown.
 //! An array has a value only when that of every cell is known: its places are the cells, and VSS has no unknown number.
 
-mod own;
-mod standard;
+mod derived;
 
-use packwatch_host::status::document::{CellStatus, StatusDocument};
-use serde::Serialize;
+use std::borrow::Cow;
+use std::sync::LazyLock;
+
+use packwatch_host::monitor::CellView;
+use packwatch_host::quantity::catalogue::{
+    CellValues, PackValues, Part, Presentation, Quantity, QuantityRow, Unit, VssPath,
+};
+use packwatch_host::status::document::StatusDocument;
 
 use super::value::{DataType, Value, single};
 
@@ -28,17 +33,24 @@ pub(crate) enum Origin {
 #[derive(Debug)]
 pub(crate) struct Signal {
     /// Its path below the branch.
-    pub(crate) name: &'static str,
+    pub(crate) name: Cow<'static, str>,
     pub(crate) origin: Origin,
     pub(crate) data_type: DataType,
     /// Name of the unit in VSS 5 and 6.
     pub(crate) unit: Option<&'static str>,
     /// For the overlay and the manual.
-    pub(crate) description: &'static str,
+    pub(crate) description: Cow<'static, str>,
     /// Fields of the status document that it follows from.
-    pub(crate) fields: &'static str,
-    /// Its value; `None` = none.
-    pub(crate) value: fn(&StatusDocument) -> Option<Value>,
+    pub(crate) fields: Cow<'static, str>,
+    source: Source,
+}
+
+/// Where a value comes from. A number of the catalogue is multiplied by the factor.
+#[derive(Debug, Clone, Copy)]
+enum Source {
+    Document(fn(&StatusDocument) -> Option<Value>),
+    Pack(Quantity, Part, f64),
+    Cells(Quantity, Part, f64),
 }
 
 impl Signal {
@@ -50,74 +62,109 @@ impl Signal {
         };
         format!("{branch}.{}", self.name)
     }
+
+    /// Its value; `None` = none.
+    pub(crate) fn value(&self, document: &StatusDocument) -> Option<Value> {
+        // Adding 0 makes -0 a 0.
+        let scaled = |value: Option<f64>, factor: f64| single(value.map(|value| factor * value + 0.0));
+        match self.source {
+            Source::Document(value) => value(document),
+            Source::Pack(quantity, part, factor) => {
+                scaled(document.pack.values.part(quantity, part), factor).map(Value::Float)
+            }
+            Source::Cells(quantity, part, factor) => {
+                of_cells(document, |cell| scaled(cell.values.part(quantity, part), factor)).map(Value::Floats)
+            }
+        }
+    }
+
+    /// Whether it is a row of the catalogue.
+    pub(crate) fn is_quantity(&self) -> bool {
+        !matches!(self.source, Source::Document(_))
+    }
 }
 
-/// Every signal, those of VSS first.
+/// Every signal.
 pub(crate) fn all() -> impl Iterator<Item = &'static Signal> {
-    standard::SIGNALS.iter().chain(own::SIGNALS)
+    static SIGNALS: LazyLock<Vec<Signal>> = LazyLock::new(|| {
+        let pack = PackValues::rows().flat_map(|(row, it)| signals_of(row, it, true));
+        let cells = CellValues::rows().flat_map(|(row, it)| signals_of(row, it, false));
+        derived::signals().into_iter().chain(pack).chain(cells).collect()
+    });
+    SIGNALS.iter()
 }
 
 /// The signals of the overlay.
 pub(crate) fn of_overlay() -> impl Iterator<Item = &'static Signal> {
-    own::SIGNALS.iter()
+    all().filter(|signal| signal.origin == Origin::Overlay)
 }
 
-fn float(number: Option<f64>) -> Option<Value> {
-    single(number).map(Value::Float)
+/// The signals of a row of the catalogue: its mean, and its standard deviation if it has one.
+fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: bool) -> impl Iterator<Item = Signal> {
+    let (unit, factor) = vss_unit(row.unit);
+    let (owner, data_type) = if is_pack { ("pack", DataType::Float) } else { ("cells", DataType::Floats) };
+    let sign = if row.unit == Unit::Amperes { ", positive = into the battery" } else { "" };
+    row.parts().map(move |(part, key)| {
+        let (origin, name) = path(it.vss, part);
+        let about = match part {
+            Part::Mean => format!("{}{sign}", it.about),
+            Part::Std => format!("Standard deviation: {}", it.about),
+        };
+        // An array has no unit in VSS.
+        let description = if is_pack {
+            format!("{about}.")
+        } else {
+            format!("{about}, {}each cell.", unit.map_or(String::new(), |unit| format!("{unit}, ")))
+        };
+        let factor = if part == Part::Std { factor.abs() } else { factor };
+        Signal {
+            name,
+            origin,
+            data_type,
+            unit: unit.filter(|_| is_pack),
+            description: description.into(),
+            fields: format!("{owner}.{key}").into(),
+            source: if is_pack {
+                Source::Pack(row.quantity, part, factor)
+            } else {
+                Source::Cells(row.quantity, part, factor)
+            },
+        }
+    })
 }
 
-/// A fraction in percent.
-fn percent(fraction: Option<f64>) -> Option<Value> {
-    float(fraction.map(|fraction| 100.0 * fraction))
-}
-
-/// A current or an offset with VSS's sign; 0 stays without a sign.
-fn negated(number: Option<f64>) -> Option<f64> {
-    number.map(|number| 0.0 - number)
-}
-
-fn number(number: Option<impl TryInto<u16>>) -> Option<Value> {
-    number?.try_into().ok().map(Value::Uint16)
-}
-
-/// A word of the status document, as its JSON has it.
-fn word(value: Option<impl Serialize>) -> Option<Value> {
-    match serde_json::to_value(value?) {
-        Ok(serde_json::Value::String(word)) => Some(Value::Text(word)),
-        _ => None,
+/// The path of a part. A standard deviation is always of the overlay: beside a signal of VSS itself, or named after one of the overlay.
+fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
+    match (path, part) {
+        (VssPath::Standard(path), Part::Mean) => (Origin::Standard, path.into()),
+        (VssPath::Overlay(path), Part::Mean) => (Origin::Overlay, path.into()),
+        (VssPath::Standard(path), Part::Std) => {
+            let branch = path.rsplit_once('.').map_or(path, |(branch, _)| branch);
+            (Origin::Overlay, format!("{branch}.StandardDeviation").into())
+        }
+        (VssPath::Overlay(path), Part::Std) => (Origin::Overlay, format!("{path}StandardDeviation").into()),
     }
 }
 
-/// One number per cell, in the order of the cells.
-fn cell_numbers(document: &StatusDocument, value: fn(&CellStatus) -> Option<f64>) -> Option<Vec<f32>> {
-    let numbers: Option<Vec<f32>> = in_order(document)?.iter().map(|cell| single(value(cell))).collect();
-    numbers.filter(|numbers| !numbers.is_empty())
+/// The unit in VSS, and its factor.
+const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
+    match unit {
+        Unit::Level | Unit::Fraction => (Some("percent"), 100.0),
+        Unit::Ratio | Unit::Cycles => (None, 1.0),
+        Unit::Volts => (Some("V"), 1.0),
+        Unit::Amperes => (Some("A"), -1.0),
+        Unit::Celsius => (Some("Celsius"), 1.0),
+        Unit::AmpereHours => (Some("Ah"), 1.0),
+        Unit::Seconds => (Some("s"), 1.0),
+        Unit::Days => (Some("day"), 1.0),
+    }
 }
 
-fn cells(document: &StatusDocument, value: fn(&CellStatus) -> Option<f64>) -> Option<Value> {
-    cell_numbers(document, value).map(Value::Floats)
-}
-
-/// The cells, if they are numbered from 0 without a gap: a place in an array is the number of a cell.
-fn in_order(document: &StatusDocument) -> Option<&[CellStatus]> {
-    let cells = &document.cells;
-    cells.iter().enumerate().all(|(index, cell)| usize::from(cell.cell) == index).then_some(cells)
-}
-
-/// Codes of the raised alarms, `RULE:SEVERITY` and of a cell `RULE:SEVERITY:cell3`; without any, only when every threshold was
-/// judged.
-fn alarm_codes(document: &StatusDocument) -> Option<Value> {
-    let alarms = &document.alarms;
-    let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
-    let codes: Vec<String> = raised
-        .map(|alarm| {
-            let cell = alarm.cell.map_or_else(String::new, |cell| format!(":cell{}", cell.0));
-            format!("{}:{}{cell}", alarm.rule.name(), alarm.severity.name())
-        })
-        .collect();
-    // An empty list means "no error": only where that is known.
-    let is_known = !codes.is_empty() || (alarms.raised == 0 && alarms.are_judged());
-    is_known.then_some(Value::Texts(codes))
+/// A value per cell, if each has one, and if the cells are numbered from 0 without a gap: a place in an array is the number of a cell.
+fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
+    let cells = document.cells.iter().enumerate();
+    let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });
+    values.collect::<Option<Vec<T>>>().filter(|values| !values.is_empty())
 }
 
 #[cfg(test)]

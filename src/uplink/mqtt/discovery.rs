@@ -6,7 +6,7 @@
 use packwatch_host::status::document::StatusDocument;
 use serde_json::{Value, json};
 
-use super::entity::{ENTITIES, Kind};
+use super::entity::{Kind, entities};
 use super::link::Message;
 use super::settings::MqttSettings;
 use super::topic;
@@ -22,13 +22,13 @@ const UPLINK: &[(&str, &str, &str, &str, &str)] = &[
 /// Every discovery message.
 pub fn messages(settings: &MqttSettings, document: &StatusDocument) -> Vec<Message> {
     let device = Device::new(settings, document);
-    let pack = ENTITIES.iter().map(|entity| {
-        let mut config = device.entity(entity.name, entity.key, topic::INFO, entity.key);
+    let pack = entities().iter().map(|entity| {
+        let mut config = device.entity(&entity.name, &entity.key, topic::INFO, &entity.key);
         describe(&mut config, entity.kind);
         if entity.is_diagnostic {
             config["entity_category"] = "diagnostic".into();
         }
-        device.message("sensor", entity.key, &config)
+        device.message("sensor", &entity.key, &config)
     });
     let alarms = document.alarms.rules.iter().map(|rule| device.alarm(rule.name()));
     let cells = if settings.discovery.cells { document.cells.len() } else { 0 };

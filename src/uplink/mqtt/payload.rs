@@ -4,16 +4,19 @@
 
 use packwatch_host::alarm::Rule;
 use packwatch_host::io::stamp::format_utc;
+use packwatch_host::monitor::CellView;
 use packwatch_host::quantity::Timestamp;
-use packwatch_host::status::document::{AlarmStatus, CellStatus, StatusDocument};
+use packwatch_host::quantity::catalogue::{CellValues, Part, Quantity};
+use packwatch_host::status::document::{AlarmStatus, StatusDocument};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::entity::{ENTITIES, percent, rounded};
+use super::entity::{entities, published, rounded};
 
 /// The pack: every entity, and `alarms` with the state of each rule that has a threshold.
 pub fn info(document: &StatusDocument) -> Value {
-    let mut info: Map<_, _> = ENTITIES.iter().map(|entity| (entity.key.to_owned(), entity.value(document))).collect();
+    let mut info: Map<_, _> =
+        entities().iter().map(|entity| (entity.key.to_string(), entity.value(document))).collect();
     let alarms = document.alarms.rules.iter().map(|&rule| (rule.name().to_owned(), alarm(&document.alarms, rule)));
     info.insert("alarms".to_owned(), alarms.collect::<Map<_, _>>().into());
     info.into()
@@ -28,20 +31,21 @@ fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
 
 /// The cells: voltages in mV and, as Battery-Emulator has them, in V; SOC, capacity and resistance with standard deviations.
 pub fn spec_data(document: &StatusDocument) -> Value {
-    let each = |of: fn(&CellStatus) -> Value| document.cells.iter().map(of).collect::<Vec<_>>();
-    json!({
-        "time": stamp(document.wall_time),
-        "cell_voltages_mv": each(|cell| whole(cell.voltage_v.map(|volts| volts * 1000.0))),
-        "cell_voltages": each(|cell| rounded(cell.voltage_v, 3)),
-        "cell_temperatures": each(|cell| rounded(cell.temperature_c, 1)),
-        "cell_soc": each(|cell| percent(cell.soc)),
-        "cell_soc_std": each(|cell| percent(cell.soc_std)),
-        "cell_capacity": each(|cell| rounded(cell.capacity_ah, 3)),
-        "cell_capacity_std": each(|cell| rounded(cell.capacity_std_ah, 3)),
-        "cell_resistance_ratio": each(|cell| rounded(cell.resistance_ratio, 3)),
-        "cell_resistance_ratio_std": each(|cell| rounded(cell.resistance_ratio_std, 3)),
-        "cell_trusted": each(|cell| cell.trusted.into()),
-    })
+    let each = |of: &dyn Fn(&CellView) -> Value| document.cells.iter().map(of).collect::<Value>();
+    let millivolts = |cell: &CellView| whole(cell.values.mean(Quantity::Voltage).map(|volts| volts * 1000.0));
+    let mut data = Map::new();
+    data.insert("time".to_owned(), stamp(document.wall_time).into());
+    data.insert("cell_voltages_mv".to_owned(), each(&millivolts));
+    data.insert("cell_trusted".to_owned(), each(&|cell| cell.trusted.into()));
+    for (row, it) in CellValues::rows() {
+        let Some(key) = it.mqtt_key else { continue };
+        for (part, _) in row.parts() {
+            let ending = if part == Part::Std { "_std" } else { "" };
+            let value = |cell: &CellView| published(row.quantity, part, cell.values.part(row.quantity, part));
+            data.insert(format!("{key}{ending}"), each(&value));
+        }
+    }
+    data.into()
 }
 
 /// One sample of the history: what `info` and `spec_data` held.

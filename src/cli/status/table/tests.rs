@@ -93,16 +93,24 @@ fn a_failing_store_and_late_estimates_are_shown() {
 fn cells_that_differ_by_less_than_their_sensors_are_no_outliers() {
     let mut document = sample(96);
     for cell in &mut document.cells {
-        (cell.voltage_v, cell.soc, cell.temperature_c) = (Some(3.7), Some(0.5), Some(25.0));
-        (cell.capacity_ah, cell.resistance_ratio, cell.trusted) = (Some(2.4), Some(1.0), Some(true));
+        for (quantity, value) in [
+            (Quantity::Voltage, 3.7),
+            (Quantity::Soc, 0.5),
+            (Quantity::Temperature, 25.0),
+            (Quantity::Capacity, 2.4),
+            (Quantity::ResistanceRatio, 1.0),
+        ] {
+            cell.values.set(quantity, Some(value));
+        }
+        cell.trusted = Some(true);
     }
-    document.cells[7].voltage_v = Some(3.709);
-    document.cells[8].soc = Some(0.508);
-    document.cells[9].temperature_c = Some(26.5);
-    document.cells[10].capacity_ah = Some(2.38);
-    document.cells[11].resistance_ratio = Some(1.04);
+    document.cells[7].values.set(Quantity::Voltage, Some(3.709));
+    document.cells[8].values.set(Quantity::Soc, Some(0.508));
+    document.cells[9].values.set(Quantity::Temperature, Some(26.5));
+    document.cells[10].values.set(Quantity::Capacity, Some(2.38));
+    document.cells[11].values.set(Quantity::ResistanceRatio, Some(1.04));
     assert!(table(&document, false).contains("no outliers"), "{}", table(&document, false));
-    document.cells[7].voltage_v = Some(3.711);
+    document.cells[7].values.set(Quantity::Voltage, Some(3.711));
     let text = table(&document, false);
     assert!(text.contains("outliers (--cells lists all):\n") && text.contains("\n   8  3.711 V"), "{text}");
 }
@@ -110,7 +118,7 @@ fn cells_that_differ_by_less_than_their_sensors_are_no_outliers() {
 #[test]
 fn of_many_cells_only_the_outliers_are_listed() {
     let mut document = sample(96);
-    document.cells[40].soc = Some(0.1);
+    document.cells[40].values.set(Quantity::Soc, Some(0.1));
     let text = table(&document, false);
     assert!(text.contains("SOC        10.0 % (cell 41) to 79.2 % (cell 24), known of 95 of 96\n"), "{text}");
     let listed: Vec<&str> = text

@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use ratatui::crossterm::event::KeyCode;
 
 use crate::quantity::Timestamp;
+use crate::quantity::catalogue::Quantity;
 use crate::status::STALE;
-use crate::status::document::{CellStatus, StatusDocument};
+use crate::status::document::StatusDocument;
 
 /// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
@@ -50,25 +51,11 @@ impl Page {
     }
 }
 
-/// The quantity in the map of the cells.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Quantity {
-    Soc,
-    Voltage,
-}
-
-impl Quantity {
-    /// Its value in a cell.
-    pub(super) fn of(self, cell: &CellStatus) -> Option<f64> {
-        match self {
-            Self::Soc => cell.soc,
-            Self::Voltage => cell.voltage_v,
-        }
-    }
-}
+/// The quantities of the map of the cells, in the order in which the key `v` changes them.
+pub(super) const MAPPED: [(Quantity, &str); 2] = [(Quantity::Soc, "SOC"), (Quantity::Voltage, "voltage")];
 
 /// A cell's values at one document, a quantity after the other.
-pub(super) type CellPoint = [Option<f32>; 2];
+pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 
 /// The view.
 #[derive(Debug)]
@@ -84,7 +71,8 @@ pub(super) struct App {
     /// Per cell, oldest first.
     pub(super) history: Vec<VecDeque<CellPoint>>,
     pub(super) page: Page,
-    pub(super) quantity: Quantity,
+    /// Index of the mapped quantity.
+    pub(super) mapped: usize,
     /// The selected cell.
     pub(super) selected: usize,
     /// First line shown of the other pages.
@@ -107,7 +95,7 @@ impl App {
             received_at: None,
             history: Vec::new(),
             page: Page::Cells,
-            quantity: Quantity::Soc,
+            mapped: 0,
             selected: 0,
             scroll: 0,
             row_cells: 1,
@@ -159,7 +147,7 @@ impl App {
                 points.pop_front();
             }
             // The plots are a few dots high, so single precision suffices.
-            points.push_back([Quantity::Soc, Quantity::Voltage].map(|quantity| Some(quantity.of(cell)? as f32)));
+            points.push_back(MAPPED.map(|(quantity, _)| Some(cell.values.mean(quantity)? as f32)));
         }
     }
 
@@ -168,12 +156,7 @@ impl App {
         match key {
             KeyCode::Tab => self.turn_to(self.page.step(1)),
             KeyCode::BackTab => self.turn_to(self.page.step(Page::ALL.len() - 1)),
-            KeyCode::Char('v') => {
-                self.quantity = match self.quantity {
-                    Quantity::Soc => Quantity::Voltage,
-                    Quantity::Voltage => Quantity::Soc,
-                };
-            }
+            KeyCode::Char('v') => self.mapped = (self.mapped + 1) % MAPPED.len(),
             _ if self.page == Page::Cells => {
                 let last = self.history.len().saturating_sub(1);
                 self.selected = moved(self.selected, key, self.row_cells, self.page_lines * self.row_cells, last);

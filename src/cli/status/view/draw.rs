@@ -10,7 +10,8 @@ use super::app::{App, Page};
 use super::theme::{Theme, clock};
 use super::{pages, plot};
 use crate::cli::common::alarms::grouped;
-use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
+use crate::cli::status::{config, duration, mean, number, soc_band, store, with_std, word};
+use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
 
 /// Smallest usable size.
@@ -82,14 +83,12 @@ fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Re
     let block = Block::bordered().title(title).title_bottom(stored);
     let inner = block.inner(area);
     frame.render_widget(block, area);
-    let band = match (pack.soc_low, pack.soc_high) {
-        (Some(low), Some(high)) => format!(" 95 %: {:.1} to {:.1} %", 100.0 * low, 100.0 * high),
-        _ => " not known".to_owned(),
-    };
-    let label = format!("SOC {:>7} ", percent(pack.soc));
+    let band = soc_band(pack).map_or_else(|| " not known".to_owned(), |band| format!(" {band}"));
+    let label = format!("SOC {:>7} ", mean(&pack.values, Quantity::Soc, 1));
     let taken = label.chars().count() + band.chars().count();
     let width = usize::from(inner.width).saturating_sub(taken);
-    let gauge = plot::gauge(pack.soc, pack.soc_low, pack.soc_high, width);
+    let [soc, low, high] = [Quantity::Soc, Quantity::SocLow, Quantity::SocHigh].map(|it| pack.values.mean(it));
+    let gauge = plot::gauge(soc, low, high, width);
     let soc = Line::from(vec![
         Span::styled(label, Style::new().add_modifier(Modifier::BOLD)),
         Span::styled(gauge, theme.validity(document.state)),
@@ -98,16 +97,16 @@ fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Re
     let limiting = pack.limiting_cell.map_or_else(String::new, |cell| format!(", cell {} limits", number(cell)));
     let now = format!(
         "{}  {}  at most {}{limiting}",
-        shown(pack.voltage_v, 2, " V"),
-        shown(pack.current_a, 2, " A"),
-        shown(pack.temperature_max_c, 1, " °C"),
+        mean(&pack.values, Quantity::Voltage, 2),
+        mean(&pack.values, Quantity::Current, 2),
+        mean(&pack.values, Quantity::TemperatureMax, 1),
     );
     let health = format!(
         "capacity {}  SOH {}  usable {}  recharge {}",
-        with_std(pack.capacity_ah, pack.capacity_std_ah, 2, " Ah"),
-        percent(pack.soh),
-        with_std(pack.usable_capacity_ah, pack.usable_capacity_std_ah, 2, " Ah"),
-        shown(pack.normalised_recharge_period_s, 0, " s"),
+        with_std(&pack.values, Quantity::Capacity, 2),
+        mean(&pack.values, Quantity::Soh, 1),
+        with_std(&pack.values, Quantity::UsableCapacity, 2),
+        mean(&pack.values, Quantity::NormalisedRechargePeriod, 0),
     );
     frame.render_widget(Paragraph::new(vec![soc, Line::from(now), Line::from(health)]), inner);
 }

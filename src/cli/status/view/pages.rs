@@ -7,14 +7,15 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Sparkline};
 use serde_json::Value;
 
-use super::app::{App, Page, Quantity};
+use super::app::{App, MAPPED, Page};
 use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
 use crate::cli::common::alarms::{AlarmGroup, grouped};
 use crate::cli::status::table::alarm_line;
-use crate::cli::status::{duration, number, shown, with_std, word};
+use crate::cli::status::{duration, mean, number, screen_unit, with_std, word};
 use crate::quantity::Timestamp;
+use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
 
 /// Width of a row's first cell number in the map.
@@ -85,19 +86,17 @@ impl Grid {
 
 fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: usize) -> Vec<Line<'static>> {
     let cells = &document.cells;
-    let known = ValueRange::of(cells.iter().filter_map(|cell| app.quantity.of(cell)));
-    let (title, scale) = match (app.quantity, known) {
+    let (quantity, name) = MAPPED[app.mapped];
+    let known = ValueRange::of(cells.iter().filter_map(|cell| cell.values.mean(quantity)));
+    let (title, scale) = match (quantity, known) {
+        (_, None) => (format!("{name} not known"), None),
         (Quantity::Soc, Some(known)) => {
             let bars = known.at_least(LEAST_SOC_RANGE);
             let [least, greatest, from, to] =
                 [known.least, known.greatest, bars.least, bars.greatest].map(|soc| 100.0 * soc);
-            (format!("SOC {least:.1} to {greatest:.1} %, bars from {from:.1} to {to:.1} %"), Some(bars))
+            (format!("{name} {least:.1} to {greatest:.1} %, bars from {from:.1} to {to:.1} %"), Some(bars))
         }
-        (Quantity::Voltage, Some(known)) => {
-            (format!("voltage, bars from {:.3} to {:.3} V", known.least, known.greatest), Some(known))
-        }
-        (Quantity::Soc, None) => ("SOC not known".to_owned(), None),
-        (Quantity::Voltage, None) => ("voltage not known".to_owned(), None),
+        (_, Some(known)) => (format!("{name}, bars from {:.3} to {:.3} V", known.least, known.greatest), Some(known)),
     };
     let rows = lines.saturating_sub(1);
     let first = (app.selected / grid.per_row.max(1)).saturating_sub(rows.saturating_sub(1));
@@ -106,7 +105,7 @@ fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: u
         let from = row * grid.per_row;
         let mut spans = vec![Span::raw(format!("{:>4} ", from + 1))];
         for (index, cell) in cells.iter().enumerate().skip(from).take(grid.per_row) {
-            let share = app.quantity.of(cell).and_then(|value| scale?.share(value));
+            let share = cell.values.mean(quantity).and_then(|value| scale?.share(value));
             let bars = bar(share).to_string().repeat((grid.cell_width - 1).max(1));
             let mut style = match cell.trusted {
                 Some(false) => theme.colour(Color::Red).add_modifier(Modifier::UNDERLINED),
@@ -132,24 +131,20 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
     let rows = height.saturating_sub(1);
     let cells = &document.cells;
     let first = app.selected.saturating_sub(rows / 2).min(cells.len().saturating_sub(rows));
-    let what = match app.quantity {
-        Quantity::Soc => "SOC",
-        Quantity::Voltage => "voltage",
-    };
-    let head = format!("cell   voltage   temp.            SOC         capacity  {what} so far");
+    let (_, name) = MAPPED[app.mapped];
+    let head = format!("cell   voltage   temp.            SOC         capacity  {name} so far");
     let mut text = vec![Line::styled(head, Style::new().add_modifier(Modifier::DIM))];
     for (index, cell) in cells.iter().enumerate().skip(first).take(rows) {
-        let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
         let row = format!(
-            "{:>4} {:>9} {:>7} {soc:>14} {:>16}  ",
+            "{:>4} {:>9} {:>7} {:>14} {:>16}  ",
             number(cell.cell),
-            shown(cell.voltage_v, 3, " V"),
-            shown(cell.temperature_c, 1, " °C"),
-            with_std(cell.capacity_ah, cell.capacity_std_ah, 2, " Ah"),
+            mean(&cell.values, Quantity::Voltage, 3),
+            mean(&cell.values, Quantity::Temperature, 1),
+            with_std(&cell.values, Quantity::Soc, 1),
+            with_std(&cell.values, Quantity::Capacity, 2),
         );
         let width = usize::from(area.width).saturating_sub(row.chars().count());
-        let points =
-            app.history.get(index).map(|points| points.iter().map(|point| point[app.quantity as usize].map(f64::from)));
+        let points = app.history.get(index).map(|points| points.iter().map(|point| point[app.mapped].map(f64::from)));
         let plotted = points.map_or_else(String::new, |points| sparkline(points, width.min(super::app::HISTORY)));
         let style = if index == app.selected { Style::new().add_modifier(Modifier::BOLD) } else { Style::new() };
         text.push(Line::from(vec![Span::styled(row, style), Span::styled(plotted, theme.colour(Color::Cyan))]));
@@ -161,23 +156,16 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
 fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let Some(points) = app.history.get(app.selected) else { return };
     let width = usize::from(area.width.saturating_sub(2));
-    let values: Vec<Option<f64>> = points
-        .iter()
-        .skip(points.len().saturating_sub(width))
-        .map(|point| point[app.quantity as usize].map(f64::from))
-        .collect();
+    let values: Vec<Option<f64>> =
+        points.iter().skip(points.len().saturating_sub(width)).map(|point| point[app.mapped].map(f64::from)).collect();
     let Some(scale) = ValueRange::of(values.iter().copied().flatten()) else { return };
     let cell = app.selected + 1;
-    let title = match app.quantity {
-        Quantity::Soc => {
-            let (least, greatest) = (100.0 * scale.least, 100.0 * scale.greatest);
-            format!(" SOC of cell {cell}, {least:.2} to {greatest:.2} % in {} s ", values.len())
-        }
-        Quantity::Voltage => {
-            let ValueRange { least, greatest } = scale;
-            format!(" voltage of cell {cell}, {least:.3} to {greatest:.3} V in {} s ", values.len())
-        }
-    };
+    let (quantity, name) = MAPPED[app.mapped];
+    let (unit, factor) = screen_unit(quantity.row().unit);
+    let (least, greatest) = (factor * scale.least, factor * scale.greatest);
+    let digits = if quantity == Quantity::Soc { 2 } else { 3 };
+    let seconds = values.len();
+    let title = format!(" {name} of cell {cell}, {least:.digits$} to {greatest:.digits$}{unit} in {seconds} s ");
     // At least one dot for a known value; 1 to 1,001.
     let dots = values.into_iter().map(|value| value.and_then(|value| Some((1000.0 * scale.share(value)?) as u64 + 1)));
     let dots: Vec<Option<u64>> = dots.collect();

@@ -11,6 +11,7 @@ use super::app::{FeedUpdate, HISTORY, Page};
 use super::*;
 use crate::cli::status::sample::sample;
 use crate::quantity::Timestamp;
+use crate::quantity::catalogue::{Estimate, PackValues, Quantity};
 use crate::status::document::StatusDocument;
 
 fn app() -> App {
@@ -24,9 +25,11 @@ fn watched(cells: u16, seconds: usize) -> App {
         let mut document = sample(cells);
         document.wall_time = document.wall_time.plus_secs(second as f64);
         for cell in &mut document.cells {
-            let wave = (second as f64 / 10.0 + f64::from(cell.cell)).sin();
-            cell.voltage_v = cell.voltage_v.map(|voltage_v| voltage_v + 0.02 * wave);
-            cell.soc = cell.soc.map(|soc| soc - 0.0005 * second as f64);
+            let wave = (second as f64 / 10.0 + f64::from(cell.cell.0)).sin();
+            let moved = |quantity, by: f64| cell.values.get(quantity).map(|it| Estimate { mean: it.mean + by, ..it });
+            let voltage = moved(Quantity::Voltage, 0.02 * wave);
+            let soc = moved(Quantity::Soc, -0.0005 * second as f64);
+            cell.values = cell.values.with(Quantity::Voltage, voltage).with(Quantity::Soc, soc);
         }
         app.poll(document.wall_time);
         app.handle_update(FeedUpdate::StatusDocument(Box::new(document)));
@@ -112,8 +115,7 @@ fn a_silent_daemon_is_reported_as_lost() {
 #[test]
 fn unknown_is_drawn_as_unknown() {
     let mut document = StatusDocument { cells: Vec::new(), ..sample(2) };
-    document.pack.soc = None;
-    (document.pack.soc_low, document.pack.soc_high) = (None, None);
+    document.pack.values = PackValues::default();
     let mut app = app();
     app.handle_update(FeedUpdate::StatusDocument(Box::new(document)));
     let screen = drawn(&mut app, SMALL).to_string();

@@ -10,7 +10,6 @@
 //! | `trouble_code` | a code, the lamps, and the payload of DM1 and DM2 |
 //! | `codes` | the codes as sent: at most one change a second each, no short activity lost |
 //! | `transport` | payloads of more than 8 bytes, broadcast in packets (BAM) |
-//! | `dm1_receiver` | the receiving side, to check sent messages: reassembles the DM1 of one address |
 //! | `address` | claiming the address, defending it, falling silent |
 //! | `event` | events of the node |
 //! | `node` | the node that consists of these parts |
@@ -28,7 +27,6 @@
 
 mod address;
 mod codes;
-mod dm1_receiver;
 mod event;
 mod id;
 mod name;
@@ -37,7 +35,6 @@ mod transport;
 mod trouble_code;
 
 pub use codes::ActiveCode;
-pub use dm1_receiver::{Dm1Receiver, ReceivedDm1};
 pub use event::NodeEvent;
 pub use id::{
     GLOBAL_ADDRESS, MAX_ADDRESS, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
@@ -45,4 +42,4 @@ pub use id::{
 };
 pub use name::{Name, NameFields, OutOfRange};
 pub use node::{Node, NodeConfig, NodeOutputs};
-pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_codes, dm_payload};
+pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_payload};

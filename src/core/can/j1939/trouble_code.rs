@@ -26,8 +26,6 @@ const MAX_SPN: u32 = (1 << 19) - 1;
 const MAX_FMI: u8 = 31;
 /// Largest occurrence count; one more means "not available", so counting stops here.
 const MAX_OCCURRENCES: u8 = 126;
-/// In place of a code: not available, or filled up.
-const NOT_AVAILABLE: [u8; 4] = [0xFF; 4];
 
 /// A failure and its number of occurrences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -82,16 +80,6 @@ impl TroubleCode {
     fn to_bytes(self) -> [u8; 4] {
         let [low, middle, high, _] = self.spn.to_le_bytes();
         [low, middle, (high << 5) | self.fmi, self.occurrence_count]
-    }
-
-    /// The reverse; `None` = in an older layout, or about no parameter.
-    fn from_bytes([low, middle, high_and_fmi, count]: [u8; 4]) -> Option<Self> {
-        // Conversion method, in the byte of the occurrence count.
-        if count & 0x80 != 0 {
-            return None;
-        }
-        let spn = u32::from_le_bytes([low, middle, high_and_fmi >> 5, 0]);
-        Self::new(spn, high_and_fmi & MAX_FMI, count.into()).ok()
     }
 }
 
@@ -205,15 +193,6 @@ pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     DmPayload { bytes, len, left_out: codes.len() - taken }
 }
 
-/// The codes of a DM1 or DM2 from any node; `None` = too short, or with a code that cannot be read. An occurrence count
-/// that is not available (127) reads as 126.
-pub fn dm_codes(payload: &[u8]) -> Option<Vec<TroubleCode>> {
-    let (places, _) = payload.get(2..)?.as_chunks::<4>();
-    // Zeros stand in place of a code: there is none.
-    let codes = places.iter().filter(|place| **place != [0; 4] && **place != NOT_AVAILABLE);
-    if places.is_empty() { None } else { codes.map(|place| TroubleCode::from_bytes(*place)).collect() }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -291,17 +270,6 @@ mod tests {
         assert_eq!(payload.as_slice()[106], 27, "the first 27 are in it");
     }
 
-    #[test]
-    fn no_code_reads_as_none_and_an_unreadable_one_does_not() {
-        assert_eq!(dm_codes(&[0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]), Some(vec![]));
-        assert_eq!(dm_codes(&[0x00, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]), Some(vec![]), "not available");
-        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2, 3, 0xFF, 0xFF]), Some(vec![code(520_193, 18, 3)]));
-        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2, 0x83, 0xFF, 0xFF]), None, "old conversion method");
-        assert_eq!(dm_codes(&[0x04, 0xFF, 0, 0, 18, 3, 0xFF, 0xFF]), None, "about no parameter");
-        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2]), None, "too short");
-        assert_eq!(dm_codes(&[]), None);
-    }
-
     proptest! {
         #[test]
         fn a_code_reads_back_as_it_was(spn in 1_u32..=524_287, fmi in 0_u8..=31, count in 0_u32..=126) {
@@ -311,17 +279,14 @@ mod tests {
         }
 
         #[test]
-        fn a_message_reads_back_as_it_was(
+        fn a_message_has_every_code_in_order(
             parts in prop::collection::vec((1_u32..=524_287, 0_u8..=31, 0_u32..=126), 0..=MAX_CODES),
         ) {
             let codes: Vec<_> = parts.into_iter().map(|(spn, fmi, count)| code(spn, fmi, count)).collect();
-            prop_assert_eq!(dm_codes(dm_payload(Lamps::default(), &codes).as_slice()), Some(codes));
-        }
-
-        #[test]
-        fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..=120)) {
-            let read = dm_codes(&bytes);
-            prop_assert!(read.is_none_or(|codes| codes.len() <= bytes.len() / 4));
+            let payload = dm_payload(Lamps::default(), &codes);
+            let (places, _) = payload.as_slice()[2..].as_chunks::<4>();
+            let wanted: Vec<_> = codes.iter().map(|code| code.to_bytes()).collect();
+            prop_assert_eq!(&places[..codes.len()], wanted);
         }
     }
 }

@@ -12,4 +12,4 @@ pub use event::{Event, EventKind, ModelState};
 pub use learned_cell::LearnedCell;
 pub use outputs::{Estimate, MeasuredValues, Outputs, Secured, Transmit, Validity};
 pub use record::{BusEvent, Downtime, DowntimeParseError, MERGE_TOLERANCE_NS, Record, RecordKind, TICK_PERIOD_MS};
-pub use view::{CellView, PackView, ReportedState};
+pub use view::{CellView, PackView};

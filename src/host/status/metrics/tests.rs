@@ -5,6 +5,7 @@ use std::process::{Command, Stdio};
 
 use super::super::sample::sample;
 use super::*;
+use crate::quantity::catalogue::Quantity;
 
 /// The samples of a family, as written.
 fn samples<'a>(text: &'a str, name: &str) -> Vec<&'a str> {
@@ -44,8 +45,8 @@ fn the_vehicle_is_one_metric_and_no_label_of_the_others() {
 #[test]
 fn what_is_not_known_is_left_out() {
     let mut document = sample(2);
-    document.pack.soc = None;
-    document.cells[0].voltage_v = None;
+    document.pack.values.set(Quantity::Soc, None::<f64>);
+    document.cells[0].values.set(Quantity::Voltage, None::<f64>);
     let text = openmetrics(Some(document));
     assert!(!text.contains("packwatch_pack_soc_ratio") && !text.contains("packwatch_cell_voltage_volts"));
     let mut samples_only = text.lines().filter(|line| !line.starts_with('#'));

@@ -8,14 +8,16 @@ use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::filter::ScalarGaussian;
 use crate::io::socket::{LinkCounts, LinkState};
-use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, ModelState, Statistics, Validity, VoltageCounts};
+use crate::monitor::{
+    AlarmCounts, BusStatistics, CellView, LearningCounts, ModelState, PackView, Statistics, Validity, VoltageCounts,
+};
+use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, Values};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    AlarmStatus, CellStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, LossStatus, MessageFlood,
-    MessageProtection, PackStatus, PollStatus, RemainingStatus, StatusCount, StatusCounters, StatusDocument,
-    StoreStatus, VERSION,
+    AlarmStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, MessageFlood, MessageProtection,
+    PollStatus, StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
@@ -123,79 +125,71 @@ fn interface(name: &str, state: LinkState) -> InterfaceStatus {
     }
 }
 
-fn pack(cells: u16) -> PackStatus {
-    PackStatus {
+fn pack(cells: u16) -> PackView {
+    let mut values = PackValues::default();
+    for (quantity, mean, std) in [
+        (Quantity::Soc, 0.632, Some(0.012)),
+        (Quantity::SocLow, 0.608, None),
+        (Quantity::SocHigh, 0.656, None),
+        (Quantity::Voltage, 3.65 * f64::from(cells), None),
+        (Quantity::Current, 12.5, None),
+        (Quantity::CurrentOffset, -0.034, Some(0.011)),
+        (Quantity::TemperatureMax, 31.25, None),
+        (Quantity::Capacity, 2.412, Some(0.021)),
+        (Quantity::Soh, 0.928, Some(0.008)),
+        (Quantity::UsableCapacity, 2.31, Some(0.04)),
+        (Quantity::NormalisedRechargePeriod, 5432.0, Some(61.0)),
+    ] {
+        values.set(quantity, Some(Estimate { mean, std }));
+    }
+    PackView {
         model_state: Some(ModelState::Learning),
         model_fits_better: None,
         validity: Validity::Valid,
         mode: Mode::Discharge,
-        soc: Some(0.632),
-        soc_std: Some(0.012),
-        soc_low: Some(0.608),
-        soc_high: Some(0.656),
-        limiting_cell: Some(0),
-        voltage_v: Some(3.65 * f64::from(cells)),
-        current_a: Some(12.5),
-        current_offset_a: Some(-0.034),
-        current_offset_std_a: Some(0.011),
-        temperature_max_c: Some(31.25),
-        weakest_cell: Some(0),
-        capacity_ah: Some(2.412),
-        capacity_std_ah: Some(0.021),
-        soh: Some(0.928),
-        losses: losses(0.061),
-        shortest_lived_cell: Some(0),
-        remaining: remaining(412.3),
-        usable_capacity_ah: Some(2.31),
-        usable_capacity_std_ah: Some(0.04),
-        recharge_period_s: None,
-        normalised_recharge_period_s: Some(5432.0),
-        normalised_recharge_period_std_s: Some(61.0),
-        reported_soc: None,
-        reported_soh: None,
+        limiting_cell: Some(CellIndex(0)),
+        weakest_cell: Some(CellIndex(0)),
+        shortest_lived_cell: Some(CellIndex(0)),
+        values: with_life(values, 0.061, 412.3),
     }
 }
 
-fn losses(lli: f64) -> LossStatus {
-    LossStatus {
-        lli: Some(lli),
-        lli_std: Some(0.012),
-        lam_ne: Some(0.022),
-        lam_ne_std: Some(0.023),
-        lam_pe: Some(0.021),
-        lam_pe_std: Some(0.024),
+/// The values with losses and a remaining life.
+fn with_life<const IS_PACK: bool>(mut values: Values<IS_PACK>, lli: f64, cycles: f64) -> Values<IS_PACK> {
+    for (quantity, mean, std) in [
+        (Quantity::LithiumLoss, lli, Some(0.012)),
+        (Quantity::NegativeLoss, 0.022, Some(0.023)),
+        (Quantity::PositiveLoss, 0.021, Some(0.024)),
+        (Quantity::RemainingCycles, cycles, None),
+        (Quantity::RemainingCyclesLow, 207.8, None),
+        (Quantity::RemainingCyclesHigh, 933.1, None),
+        (Quantity::RemainingDays, 533.2, None),
+    ] {
+        values.set(quantity, Some(Estimate { mean, std }));
     }
+    values
 }
 
-fn remaining(cycles: f64) -> RemainingStatus {
-    RemainingStatus {
-        remaining_cycles: Some(cycles),
-        remaining_cycles_low: Some(207.8),
-        remaining_cycles_high: Some(933.1),
-        remaining_days: Some(533.2),
-    }
-}
-
-fn cell(index: u16, cells: u16) -> CellStatus {
+fn cell(index: u16, cells: u16) -> CellView {
     let wave = f64::from(index % 24) / 24.0;
     let is_silent = cells > 1 && index + 1 == cells;
-    let known = |value: f64| (!is_silent).then_some(value);
-    CellStatus {
-        cell: index,
-        voltage_v: known(3.6 + 0.1 * wave),
-        current_a: Some(12.5),
-        temperature_c: known(25.0 + 6.0 * wave),
-        soc: known(0.6 + 0.2 * wave),
-        soc_std: known(0.012),
-        capacity_ah: known(2.4 + 0.05 * wave),
-        capacity_std_ah: known(0.02),
-        losses: if is_silent { LossStatus::default() } else { losses(0.06 + 0.01 * wave) },
-        usable_capacity_ah: None,
-        usable_capacity_std_ah: None,
-        remaining: if is_silent { RemainingStatus::default() } else { remaining(412.3 + wave) },
+    let mut values = CellValues::default().with(Quantity::Current, Some(12.5));
+    if !is_silent {
+        for (quantity, mean, std) in [
+            (Quantity::Voltage, 3.6 + 0.1 * wave, None),
+            (Quantity::Temperature, 25.0 + 6.0 * wave, None),
+            (Quantity::Soc, 0.6 + 0.2 * wave, Some(0.012)),
+            (Quantity::Capacity, 2.4 + 0.05 * wave, Some(0.02)),
+            (Quantity::ResistanceRatio, 1.1 + 0.2 * wave, Some(0.03)),
+        ] {
+            values.set(quantity, Some(Estimate { mean, std }));
+        }
+        values = with_life(values, 0.06 + 0.01 * wave, 412.3 + wave);
+    }
+    CellView {
+        cell: CellIndex(index),
+        values,
         remaining_unknown: is_silent.then(|| "0 capacity readings, needs 6".to_owned()),
-        resistance_ratio: known(1.1 + 0.2 * wave),
-        resistance_ratio_std: known(0.03),
         trusted: (!is_silent).then_some(cells < 3 || index + 2 != cells),
     }
 }

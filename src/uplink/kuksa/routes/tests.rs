@@ -1,5 +1,6 @@
 //! Ids and datatypes of a broker against those of the signals: what is skipped, what is withheld.
 
+use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::status::client::parse;
 
 use super::super::messages::{Texts, TypedValue};
@@ -74,10 +75,10 @@ fn an_id_of_two_paths_is_used_for_neither() {
 fn a_value_outside_the_limits_is_no_value() {
     let (routes, _) = Routes::resolve(&[entry(HEALTH, 7)], BRANCH);
     let mut status = document();
-    status.pack.soh = Some(1.02);
+    status.pack.values.set(Quantity::Soh, Some(1.02));
     let points = routes.points(Some(&status));
     assert_eq!((sent(&points, 7), points.withheld), (None, vec!["StateOfHealth"]));
-    status.pack.soh = Some(1.0);
+    status.pack.values.set(Quantity::Soh, Some(1.0));
     let points = routes.points(Some(&status));
     assert_eq!((sent(&points, 7), points.withheld.len()), (Some(100.0), 0));
 }

@@ -2,18 +2,29 @@
 
 use std::collections::BTreeSet;
 
+use packwatch_host::quantity::catalogue::{Estimate, Values};
 use packwatch_host::status::client::parse;
 
 use super::*;
 
-/// The document of the test with real clients: every value is known.
+/// The document of the test with real clients. Every value is known: those that it lacks are made up.
 fn document() -> StatusDocument {
-    parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap()
+    let mut document = parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap();
+    fill(&mut document.pack.values);
+    document.cells.iter_mut().for_each(|cell| fill(&mut cell.values));
+    document
+}
+
+fn fill<const IS_PACK: bool>(values: &mut Values<IS_PACK>) {
+    for (row, _) in Values::<IS_PACK>::rows() {
+        let made_up = Estimate { mean: 0.5, std: row.std_key.map(|_| 0.1) };
+        values.set(row.quantity, values.get(row.quantity).or(Some(made_up)));
+    }
 }
 
 fn value(document: &StatusDocument, name: &str) -> Option<Value> {
     let signal = all().find(|signal| signal.name == name).unwrap();
-    (signal.value)(document)
+    signal.value(document)
 }
 
 #[test]
@@ -21,9 +32,9 @@ fn every_signal_has_a_value_of_its_datatype_when_everything_is_known() {
     let document = document();
     let mut names = BTreeSet::new();
     for signal in all() {
-        let value = (signal.value)(&document);
+        let value = signal.value(&document);
         assert_eq!(value.map(|value| value.data_type()), Some(signal.data_type), "{}", signal.name);
-        assert!(names.insert((signal.name, signal.origin == Origin::Standard)), "{} twice", signal.name);
+        assert!(names.insert((&signal.name, signal.origin == Origin::Standard)), "{} twice", signal.name);
     }
 }
 
@@ -39,7 +50,7 @@ fn currents_have_the_sign_of_vss() {
             .map(|value| matches!(value, Value::Floats(all) if all.iter().all(|a| *a < 0.0))),
         Some(true)
     );
-    document.pack.current_a = Some(0.0);
+    document.pack.values.set(Quantity::Current, Some(0.0));
     let Some(Value::Float(rest_a)) = value(&document, "CurrentCurrent") else { panic!("no current") };
     assert!(rest_a.is_sign_positive(), "-0 A");
 }
@@ -47,14 +58,14 @@ fn currents_have_the_sign_of_vss() {
 #[test]
 fn one_unknown_cell_leaves_no_number_of_all_cells() {
     let mut document = document();
-    document.cells[2].voltage_v = None;
+    document.cells[2].values.set(Quantity::Voltage, None::<f64>);
     for name in
         ["CellVoltage.CellVoltages", "CellVoltage.Min", "CellVoltage.IdMin", "CellVoltage.Max", "CellVoltage.IdMax"]
     {
         assert_eq!(value(&document, name), None, "{name}");
     }
     assert!(value(&document, "Temperature.CellTemperature").is_some());
-    document.cells[1].temperature_c = None;
+    document.cells[1].values.set(Quantity::Temperature, None::<f64>);
     for name in ["Temperature.CellTemperature", "Temperature.Average", "Temperature.Min"] {
         assert_eq!(value(&document, name), None, "{name}");
     }
@@ -65,7 +76,7 @@ fn a_cell_that_is_missing_does_not_move_the_others_to_its_place() {
     let mut document = document();
     document.cells.remove(1);
     for signal in all().filter(|signal| matches!(signal.data_type, DataType::Floats | DataType::Flags)) {
-        assert_eq!((signal.value)(&document), None, "{}", signal.name);
+        assert_eq!(signal.value(&document), None, "{}", signal.name);
     }
     document.cells.clear();
     assert_eq!(value(&document, "Cells.Capacity"), None);
@@ -75,7 +86,7 @@ fn a_cell_that_is_missing_does_not_move_the_others_to_its_place() {
 fn the_extreme_cells_are_the_first_of_their_voltage() {
     let mut document = document();
     for (cell, voltage_v) in document.cells.iter_mut().zip([3.5, 3.25, 3.75, 3.25]) {
-        cell.voltage_v = Some(voltage_v);
+        cell.values.set(Quantity::Voltage, Some(voltage_v));
     }
     assert_eq!(value(&document, "CellVoltage.Min"), Some(Value::Float(3.25)));
     assert_eq!(value(&document, "CellVoltage.IdMin"), Some(Value::Uint16(1)));
@@ -110,9 +121,9 @@ fn without_estimates_nothing_looks_healthy() {
     let mut document = document();
     document.findings.clear();
     assert_eq!(value(&document, "Findings"), Some(Value::Texts(Vec::new())));
-    document.pack.soc = None;
+    document.pack.values.set(Quantity::Soc, None::<f64>);
     assert_eq!(value(&document, "Findings"), None);
-    document.pack.current_a = None;
+    document.pack.values.set(Quantity::Current, None::<f64>);
     assert_eq!(value(&document, "CurrentSensor.IsFrozen"), None);
     assert_eq!(value(&document, "CurrentPower"), None);
 }

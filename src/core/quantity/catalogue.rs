@@ -1,0 +1,482 @@
+//! The catalogue: every number that is published of the pack and of its cells, each declared once.
+//!
+//! [`TABLE`] has a row per quantity: its keys in JSON, its unit, and for the pack and for a cell a description and the names in
+//! metrics, MQTT and VSS. Status document, metrics, MQTT entities, VSS signals, export and the manual's page iterate over it; the
+//! [`Monitor`](crate::monitor::Monitor) sets the values. To publish another number, add a row here and set it there.
+
+use std::fmt;
+
+use serde::de::{IgnoredAny, MapAccess, Visitor};
+use serde::ser::SerializeMap as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// A value with its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Mean.
+    pub mean: f64,
+    /// Standard deviation; `None` = the value has none.
+    pub std: Option<f64>,
+}
+
+impl From<f64> for Estimate {
+    fn from(mean: f64) -> Self {
+        Self { mean, std: None }
+    }
+}
+
+/// Which number of an [`Estimate`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Its mean.
+    Mean,
+    /// Its standard deviation.
+    Std,
+}
+
+/// Unit of a quantity inside the program. Each output converts it: see the `match` on it there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// Part of a full or a new battery, 0 to 1.
+    Level,
+    /// Any other part, 0 to 1.
+    Fraction,
+    /// Times as new.
+    Ratio,
+    /// V.
+    Volts,
+    /// A, positive = discharge.
+    Amperes,
+    /// Degrees C.
+    Celsius,
+    /// Ah.
+    AmpereHours,
+    /// s.
+    Seconds,
+    /// Days.
+    Days,
+    /// Equivalent full cycles.
+    Cycles,
+}
+
+impl Unit {
+    /// As tables write it.
+    pub const fn symbol(self) -> &'static str {
+        match self {
+            Self::Level | Self::Fraction => "fraction",
+            Self::Ratio => "",
+            Self::Volts => "V",
+            Self::Amperes => "A",
+            Self::Celsius => "degrees C",
+            Self::AmpereHours => "Ah",
+            Self::Seconds => "s",
+            Self::Days => "days",
+            Self::Cycles => "cycles",
+        }
+    }
+}
+
+/// Path of a VSS signal. That of the standard deviation follows from it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum VssPath {
+    /// Of VSS itself, below its branch of the battery.
+    Standard(&'static str),
+    /// Of the overlay, below the configured branch.
+    Overlay(&'static str),
+}
+
+/// What describes a quantity of one owner: the pack, or each cell.
+#[derive(Debug, Clone, Copy)]
+pub struct Presentation {
+    /// Description, for readers.
+    pub about: &'static str,
+    /// Key in MQTT; `None` = not published there.
+    pub mqtt_key: Option<&'static str>,
+    /// Name of its entity in Home Assistant; empty for a cell, which has none.
+    pub mqtt_name: &'static str,
+    /// Signal of VSS.
+    pub vss: VssPath,
+}
+
+/// A row of the catalogue.
+#[derive(Debug, Clone, Copy)]
+pub struct QuantityRow {
+    /// The quantity.
+    pub quantity: Quantity,
+    /// Key of its mean in JSON, and name of its column.
+    pub key: &'static str,
+    /// The same of its standard deviation; `None` = it has none.
+    pub std_key: Option<&'static str>,
+    /// Unit.
+    pub unit: Unit,
+    /// Name of its metric without prefix and unit.
+    pub metric: &'static str,
+    /// As a value of the pack; `None` = only cells have it.
+    pub pack: Option<Presentation>,
+    /// As a value of a cell; `None` = only the pack has it.
+    pub cell: Option<Presentation>,
+}
+
+impl QuantityRow {
+    /// The key of each number that it has.
+    pub fn parts(&self) -> impl Iterator<Item = (Part, &'static str)> + use<> {
+        [(Part::Mean, self.key)].into_iter().chain(self.std_key.map(|key| (Part::Std, key)))
+    }
+
+    const fn number(quantity: Quantity, key: &'static str, unit: Unit, metric: &'static str) -> Self {
+        Self { quantity, key, std_key: None, unit, metric, pack: None, cell: None }
+    }
+
+    const fn estimate(
+        quantity: Quantity,
+        (key, std_key): (&'static str, &'static str),
+        unit: Unit,
+        metric: &'static str,
+    ) -> Self {
+        Self { std_key: Some(std_key), ..Self::number(quantity, key, unit, metric) }
+    }
+
+    const fn pack(self, about: &'static str, (key, name): (&'static str, &'static str), vss: VssPath) -> Self {
+        Self { pack: Some(Presentation { about, mqtt_key: Some(key), mqtt_name: name, vss }), ..self }
+    }
+
+    const fn cell(self, about: &'static str, mqtt_key: Option<&'static str>, vss: VssPath) -> Self {
+        Self { cell: Some(Presentation { about, mqtt_key, mqtt_name: "", vss }), ..self }
+    }
+}
+
+/// A published number. Its unit and meaning are in its row of [`TABLE`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the row describes it")]
+pub enum Quantity {
+    Soc,
+    SocLow,
+    SocHigh,
+    ReportedSoc,
+    Voltage,
+    Current,
+    CurrentOffset,
+    Temperature,
+    TemperatureMax,
+    Capacity,
+    UsableCapacity,
+    Soh,
+    ReportedSoh,
+    ResistanceRatio,
+    LithiumLoss,
+    NegativeLoss,
+    PositiveLoss,
+    RemainingCycles,
+    RemainingCyclesLow,
+    RemainingCyclesHigh,
+    RemainingDays,
+    RechargePeriod,
+    NormalisedRechargePeriod,
+}
+
+use Quantity as Q;
+use QuantityRow as Row;
+use VssPath::{Overlay, Standard};
+
+/// The catalogue, in the order of [`Quantity`].
+pub static TABLE: [QuantityRow; 23] =
+    [
+        Row::estimate(Q::Soc, ("soc", "soc_std"), Unit::Level, "soc")
+            .pack("State of charge of the limiting cell", ("SOC", "SoC"), Standard("StateOfCharge.Current"))
+            .cell("State of charge", Some("cell_soc"), Overlay("Cells.StateOfCharge")),
+        Row::number(Q::SocLow, "soc_low", Unit::Fraction, "soc_low").pack(
+            "Lower end of the 95 % interval of the state of charge",
+            ("SOC_low", "SoC 95 % Low"),
+            Overlay("StateOfCharge.Low"),
+        ),
+        Row::number(Q::SocHigh, "soc_high", Unit::Fraction, "soc_high").pack(
+            "Upper end of the 95 % interval of the state of charge",
+            ("SOC_high", "SoC 95 % High"),
+            Overlay("StateOfCharge.High"),
+        ),
+        Row::number(Q::ReportedSoc, "reported_soc", Unit::Level, "reported_soc").pack(
+            "State of charge as the battery management system reports it",
+            ("SOC_reported", "SoC (reported by the pack)"),
+            Overlay("StateOfCharge.Reported"),
+        ),
+        Row::number(Q::Voltage, "voltage_v", Unit::Volts, "voltage")
+            .pack("Sum of the cells' voltages", ("battery_voltage", "Battery Voltage"), Standard("CurrentVoltage"))
+            .cell("Voltage", Some("cell_voltages"), Standard("CellVoltage.CellVoltages")),
+        Row::number(Q::Current, "current_a", Unit::Amperes, "current")
+            .pack("Current", ("battery_current", "Battery Current"), Standard("CurrentCurrent"))
+            .cell("Current", None, Overlay("Cells.Current")),
+        Row::estimate(Q::CurrentOffset, ("current_offset_a", "current_offset_std_a"), Unit::Amperes, "current_offset")
+            .pack(
+                "Learned offset of the current sensor: its reading minus the true current",
+                ("battery_current_offset", "Battery Current Sensor Offset"),
+                Overlay("CurrentSensor.Offset"),
+            ),
+        Row::number(Q::Temperature, "temperature_c", Unit::Celsius, "temperature").cell(
+            "Temperature of the cell's sensor",
+            Some("cell_temperatures"),
+            Standard("Temperature.CellTemperature"),
+        ),
+        Row::number(Q::TemperatureMax, "temperature_max_c", Unit::Celsius, "temperature_max").pack(
+            "Highest temperature, while all sensors are fresh",
+            ("temperature_max", "Temperature Max"),
+            Standard("Temperature.Max"),
+        ),
+        Row::estimate(Q::Capacity, ("capacity_ah", "capacity_std_ah"), Unit::AmpereHours, "capacity")
+            .pack(
+                "Least learned capacity of a cell, once that of every cell was learned",
+                ("capacity", "Capacity"),
+                Overlay("Capacity.Learned"),
+            )
+            .cell(
+                "Learned capacity between the open-circuit voltages full and empty",
+                Some("cell_capacity"),
+                Overlay("Cells.Capacity"),
+            ),
+        Row::estimate(
+            Q::UsableCapacity,
+            ("usable_capacity_ah", "usable_capacity_std_ah"),
+            Unit::AmpereHours,
+            "usable_capacity",
+        )
+        .pack(
+            "Least charge that can be drawn from a full cell at the configured load",
+            ("usable_capacity", "Usable Capacity"),
+            Overlay("Capacity.Usable"),
+        )
+        .cell(
+            "Charge that can be drawn from the full cell at the configured load",
+            None,
+            Overlay("Cells.UsableCapacity"),
+        ),
+        Row::estimate(Q::Soh, ("soh", "soh_std"), Unit::Level, "soh").pack(
+            "Least learned capacity of a cell over the rated capacity; may exceed 1",
+            ("state_of_health", "State of Health"),
+            Overlay("StateOfHealth.Learned"),
+        ),
+        Row::number(Q::ReportedSoh, "reported_soh", Unit::Level, "reported_soh").pack(
+            "State of health as the battery management system reports it",
+            ("state_of_health_reported", "State of Health (reported by the pack)"),
+            Overlay("StateOfHealth.Reported"),
+        ),
+        Row::estimate(Q::ResistanceRatio, ("resistance_ratio", "resistance_ratio_std"), Unit::Ratio, "resistance")
+            .cell("Resistance relative to new", Some("cell_resistance_ratio"), Overlay("Cells.ResistanceRatio")),
+        Row::estimate(Q::LithiumLoss, ("lli", "lli_std"), Unit::Fraction, "lli")
+            .pack(
+                "Loss of lithium inventory of the cell with the least capacity, part of a new cell's",
+                ("lithium_loss", "Loss of Lithium Inventory"),
+                Overlay("Loss.LithiumInventory"),
+            )
+            .cell("Loss of lithium inventory, part of a new cell's", None, Overlay("Cells.LithiumInventoryLoss")),
+        Row::estimate(Q::NegativeLoss, ("lam_ne", "lam_ne_std"), Unit::Fraction, "lam_ne")
+            .pack(
+                "Loss of active material of the negative electrode of that cell",
+                ("negative_loss", "Loss of Negative Electrode"),
+                Overlay("Loss.NegativeElectrode"),
+            )
+            .cell("Loss of active material of the negative electrode", None, Overlay("Cells.NegativeElectrodeLoss")),
+        Row::estimate(Q::PositiveLoss, ("lam_pe", "lam_pe_std"), Unit::Fraction, "lam_pe")
+            .pack(
+                "Loss of active material of the positive electrode of that cell",
+                ("positive_loss", "Loss of Positive Electrode"),
+                Overlay("Loss.PositiveElectrode"),
+            )
+            .cell("Loss of active material of the positive electrode", None, Overlay("Cells.PositiveElectrodeLoss")),
+        Row::number(Q::RemainingCycles, "remaining_cycles", Unit::Cycles, "remaining_cycles")
+            .pack(
+                "Equivalent full cycles until the first end of life of a cell, median",
+                ("remaining_cycles", "Remaining Cycles"),
+                Overlay("RemainingLife.Cycles"),
+            )
+            .cell("Equivalent full cycles until the end of life, median", None, Overlay("Cells.RemainingCycles")),
+        Row::number(Q::RemainingCyclesLow, "remaining_cycles_low", Unit::Cycles, "remaining_cycles_low")
+            .pack(
+                "5 % quantile of the remaining cycles",
+                ("remaining_cycles_low", "Remaining Cycles 5 %"),
+                Overlay("RemainingLife.CyclesLow"),
+            )
+            .cell("5 % quantile of the remaining cycles", None, Overlay("Cells.RemainingCyclesLow")),
+        Row::number(Q::RemainingCyclesHigh, "remaining_cycles_high", Unit::Cycles, "remaining_cycles_high")
+            .pack(
+                "95 % quantile of the remaining cycles",
+                ("remaining_cycles_high", "Remaining Cycles 95 %"),
+                Overlay("RemainingLife.CyclesHigh"),
+            )
+            .cell("95 % quantile of the remaining cycles", None, Overlay("Cells.RemainingCyclesHigh")),
+        Row::number(Q::RemainingDays, "remaining_days", Unit::Days, "remaining_life")
+            .pack(
+                "Time until the first end of life of a cell at the recent use, median",
+                ("remaining_days", "Remaining Days"),
+                Overlay("RemainingLife.Time"),
+            )
+            .cell("Time until the end of life at the recent use, median", None, Overlay("Cells.RemainingDays")),
+        Row::number(Q::RechargePeriod, "recharge_period_s", Unit::Seconds, "recharge_period").pack(
+            "Last recorded recharge period",
+            ("recharge_period", "Recharge Period"),
+            Overlay("RechargePeriod.Last"),
+        ),
+        Row::estimate(
+            Q::NormalisedRechargePeriod,
+            ("normalised_recharge_period_s", "normalised_recharge_period_std_s"),
+            Unit::Seconds,
+            "recharge_period_normalised",
+        )
+        .pack(
+            "Recharge period with the reference charger",
+            ("normalised_recharge_period", "Normalised Recharge Period"),
+            Overlay("RechargePeriod.Normalised"),
+        ),
+    ];
+
+impl Quantity {
+    /// Its row.
+    pub fn row(self) -> &'static QuantityRow {
+        &TABLE[self as usize]
+    }
+}
+
+/// The values of the pack, or of a cell. `None` = unknown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Values<const IS_PACK: bool>([Option<Estimate>; TABLE.len()]);
+
+/// The values of the pack.
+pub type PackValues = Values<true>;
+/// The values of a cell.
+pub type CellValues = Values<false>;
+
+impl<const IS_PACK: bool> Default for Values<IS_PACK> {
+    fn default() -> Self {
+        Self([None; TABLE.len()])
+    }
+}
+
+impl<const IS_PACK: bool> Values<IS_PACK> {
+    /// The rows of its owner, each with its presentation.
+    pub fn rows() -> impl Iterator<Item = (&'static QuantityRow, &'static Presentation)> {
+        TABLE.iter().filter_map(|row| Some((row, if IS_PACK { row.pack.as_ref() } else { row.cell.as_ref() }?)))
+    }
+
+    /// A value.
+    pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
+        self.0[quantity as usize]
+    }
+
+    /// Its mean.
+    pub fn mean(&self, quantity: Quantity) -> Option<f64> {
+        self.get(quantity).map(|estimate| estimate.mean)
+    }
+
+    /// Its standard deviation.
+    pub fn std(&self, quantity: Quantity) -> Option<f64> {
+        self.get(quantity)?.std
+    }
+
+    /// Either of them.
+    pub fn part(&self, quantity: Quantity, part: Part) -> Option<f64> {
+        match part {
+            Part::Mean => self.mean(quantity),
+            Part::Std => self.std(quantity),
+        }
+    }
+
+    /// Sets a value. A mean that is not finite is unknown, and so is a standard deviation.
+    pub fn set(&mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) {
+        let value = value.map(Into::into).filter(|value| value.mean.is_finite());
+        self.0[quantity as usize] =
+            value.map(|Estimate { mean, std }| Estimate { mean, std: std.filter(|std| std.is_finite()) });
+    }
+
+    /// The same values with another one.
+    #[must_use]
+    pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
+        self.set(quantity, value);
+        self
+    }
+}
+
+impl<const IS_PACK: bool> Serialize for Values<IS_PACK> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        for (row, _) in Self::rows() {
+            for (part, key) in row.parts() {
+                map.serialize_entry(key, &self.part(row.quantity, part))?;
+            }
+        }
+        map.end()
+    }
+}
+
+impl<'de, const IS_PACK: bool> Deserialize<'de> for Values<IS_PACK> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_map(ValuesVisitor)
+    }
+}
+
+/// Reads the keys of the catalogue and ignores all others.
+struct ValuesVisitor<const IS_PACK: bool>;
+
+impl<'de, const IS_PACK: bool> Visitor<'de> for ValuesVisitor<IS_PACK> {
+    type Value = Values<IS_PACK>;
+
+    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("values by their keys")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
+        let (mut means, mut stds) = ([None; TABLE.len()], [None; TABLE.len()]);
+        while let Some(key) = map.next_key::<String>()? {
+            let place = TABLE.iter().zip(means.iter_mut().zip(&mut stds)).find_map(|(row, (mean, std))| {
+                if row.key == key { Some(mean) } else { (row.std_key? == key).then_some(std) }
+            });
+            match place {
+                Some(place) => *place = map.next_value::<Option<f64>>()?,
+                None => drop(map.next_value::<IgnoredAny>()?),
+            }
+        }
+        let mut values = Values::default();
+        for (row, (mean, std)) in TABLE.iter().zip(means.into_iter().zip(stds)) {
+            values.set(row.quantity, mean.map(|mean| Estimate { mean, std }));
+        }
+        Ok(values)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn every_quantity_has_its_own_row_with_names_of_its_own() {
+        assert!(TABLE.iter().enumerate().all(|(index, row)| row.quantity as usize == index));
+        let keys: Vec<_> = TABLE.iter().flat_map(|row| [Some(row.key), row.std_key]).flatten().collect();
+        assert_eq!(keys.iter().collect::<BTreeSet<_>>().len(), keys.len());
+        let endings = [
+            ("_v", Unit::Volts),
+            ("_a", Unit::Amperes),
+            ("_c", Unit::Celsius),
+            ("_ah", Unit::AmpereHours),
+            ("_s", Unit::Seconds),
+        ];
+        for row in &TABLE {
+            assert!(row.pack.is_some() || row.cell.is_some(), "{}", row.key);
+            for (ending, unit) in endings {
+                assert_eq!(row.key.ends_with(ending), row.unit == unit, "{}", row.key);
+            }
+        }
+    }
+
+    #[test]
+    fn values_survive_json_and_unknown_is_null() {
+        let values = CellValues::default()
+            .with(Quantity::Soc, Some(Estimate { mean: 0.5, std: Some(0.01) }))
+            .with(Quantity::Voltage, Some(3.6))
+            .with(Quantity::Temperature, Some(f64::NAN));
+        let json = serde_json::to_value(values).unwrap();
+        assert_eq!((json["soc"].as_f64(), json["soc_std"].as_f64()), (Some(0.5), Some(0.01)));
+        assert!(json["temperature_c"].is_null() && json.get("soh").is_none(), "{json}");
+        assert_eq!(serde_json::from_value::<CellValues>(json).unwrap(), values);
+        let earlier: CellValues = serde_json::from_str(r#"{"voltage_v":3.6,"trusted":true}"#).unwrap();
+        assert_eq!(earlier, CellValues::default().with(Quantity::Voltage, Some(3.6)));
+    }
+}

@@ -1,0 +1,47 @@
+//! The manual's page of the quantities, written from the catalogue. `PACKWATCH_WRITE_PAGES=1 cargo test quantities` rewrites it.
+
+use std::fmt::Write as _;
+
+use crate::quantity::catalogue::{CellValues, PackValues, Presentation, QuantityRow, VssPath};
+
+const HEAD: &str = "# Quantities
+
+The numbers that packwatch publishes of the pack and of each cell. This page is written from `src/core/quantity/catalogue.rs`.
+
+* A quantity with two keys has a standard deviation: the second key. Its metric and its key in MQTT end with `_std`, its VSS signal with
+  `StandardDeviation`.
+* [Status document](status.md): the keys are in `pack` and in each of `cells[]`. An unknown value is `null`.
+* [Metrics](metrics.md): the unit is in the name; days are seconds. An unknown value is left out.
+* [MQTT](../operations/mqtt.md) and [VSS](vss.md): fractions are percent, currents are positive into the battery. Cells have arrays.
+";
+
+/// A table of one owner's quantities.
+fn table(
+    title: &str,
+    owner: &str,
+    rows: impl Iterator<Item = (&'static QuantityRow, &'static Presentation)>,
+) -> String {
+    let mut page = format!(
+        "\n## {title}\n\n| status | unit | meaning | metric | MQTT | VSS |\n| --- | --- | --- | --- | --- | --- |\n"
+    );
+    for (row, it) in rows {
+        let keys: Vec<String> = row.parts().map(|(_, key)| format!("`{key}`")).collect();
+        let mqtt = it.mqtt_key.map_or_else(String::new, |key| format!("`{key}`"));
+        let (VssPath::Standard(vss) | VssPath::Overlay(vss)) = it.vss;
+        let (unit, about, metric) = (row.unit.symbol(), it.about, row.metric);
+        let _ = writeln!(page, "| {} | {unit} | {about} | `{owner}_{metric}` | {mqtt} | `{vss}` |", keys.join(", "));
+    }
+    page
+}
+
+#[test]
+fn the_manual_lists_every_quantity() {
+    let wanted =
+        HEAD.to_owned() + &table("Pack", "pack", PackValues::rows()) + &table("Cells", "cell", CellValues::rows());
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/src/reference/quantities.md");
+    if std::env::var_os("PACKWATCH_WRITE_PAGES").is_some() {
+        std::fs::write(path, &wanted).unwrap();
+    }
+    let found = std::fs::read_to_string(path).unwrap_or_default();
+    assert!(found == wanted, "rewrite the page: PACKWATCH_WRITE_PAGES=1 cargo test quantities");
+}

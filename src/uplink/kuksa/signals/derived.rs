@@ -1,0 +1,294 @@
+//! Signals that are not rows of the catalogue: what follows from several values, from the alarms, from the state of the daemon.
+//!
+//! Those of VSS itself have its names, datatypes and units (releases 3 to 6). Left out, because the status document cannot say it:
+//! `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah), `StateOfCharge.CurrentEnergy` and the energies (no energy is
+//! estimated), the throughputs "over lifetime of the battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what the
+//! customer sees), `Charging.IsCharging` (true only with a charger; a drive brakes into the battery too).
+//!
+//! Booleans of the overlay begin with `Is`, as VSS asks. None has a unit of temperature: its name changed from VSS 5 to 6. None has a list
+//! of allowed values: the databroker (0.7) compares it with "no value" too, and the last value would stay.
+
+use packwatch_host::quantity::catalogue::Quantity;
+use packwatch_host::quantity::{CellIndex, Mode};
+use packwatch_host::status::document::StatusDocument;
+use serde::Serialize;
+
+use super::super::value::{DataType, Value, single};
+use super::{Origin, Signal, Source, of_cells};
+
+/// Path, datatype, unit, fields of the status document, value, description.
+type Row =
+    (&'static str, DataType, Option<&'static str>, &'static str, fn(&StatusDocument) -> Option<Value>, &'static str);
+
+/// The signals, those of VSS itself first.
+pub(super) fn signals() -> Vec<Signal> {
+    let signal = |origin| {
+        move |(name, data_type, unit, fields, value, description): Row| Signal {
+            name: name.into(),
+            origin,
+            data_type,
+            unit,
+            description: description.into(),
+            fields: fields.into(),
+            source: Source::Document(value),
+        }
+    };
+    let standard = STANDARD.into_iter().map(signal(Origin::Standard));
+    standard.chain(OVERLAY.into_iter().map(signal(Origin::Overlay))).collect()
+}
+
+const STANDARD: [Row; 9] = [
+    (
+        "CurrentPower",
+        DataType::Float,
+        Some("W"),
+        "pack.voltage_v, pack.current_a",
+        |status| {
+            let values = &status.pack.values;
+            float(Some(0.0 - values.mean(Quantity::Current)? * values.mean(Quantity::Voltage)?))
+        },
+        "Positive = into the battery",
+    ),
+    (
+        "Temperature.Average",
+        DataType::Float,
+        Some("Celsius"),
+        "cells.temperature_c",
+        |status| float(average(status, Quantity::Temperature)),
+        "Of all cells",
+    ),
+    (
+        "Temperature.Min",
+        DataType::Float,
+        Some("Celsius"),
+        "cells.temperature_c",
+        |status| float(status.least(Quantity::Temperature).map(|(_, celsius)| celsius)),
+        "Of all cells",
+    ),
+    (
+        "CellVoltage.Min",
+        DataType::Float,
+        Some("V"),
+        "cells.voltage_v",
+        |status| float(status.least(Quantity::Voltage).map(|(_, volts)| volts)),
+        "Of all cells",
+    ),
+    (
+        "CellVoltage.IdMin",
+        DataType::Uint16,
+        None,
+        "cells.voltage_v",
+        |status| cell(status.least(Quantity::Voltage).map(|(cell, _)| cell)),
+        "First cell with that voltage, from 0",
+    ),
+    (
+        "CellVoltage.Max",
+        DataType::Float,
+        Some("V"),
+        "cells.voltage_v",
+        |status| float(status.greatest(Quantity::Voltage).map(|(_, volts)| volts)),
+        "Of all cells",
+    ),
+    (
+        "CellVoltage.IdMax",
+        DataType::Uint16,
+        None,
+        "cells.voltage_v",
+        |status| cell(status.greatest(Quantity::Voltage).map(|(cell, _)| cell)),
+        "First cell with that voltage, from 0",
+    ),
+    (
+        "StateOfHealth",
+        DataType::Float,
+        Some("percent"),
+        "pack.soh",
+        |status| float(status.pack.values.mean(Quantity::Soh).map(|soh| 100.0 * soh)),
+        "Learned capacity over rated capacity. VSS allows 0 to 100: a cell with more than its rated capacity gives no value here",
+    ),
+    (
+        "ErrorCodes",
+        DataType::Texts,
+        None,
+        "alarms",
+        alarm_codes,
+        "Raised alarms, `RULE:SEVERITY` or `RULE:SEVERITY:cell3`. Empty only when every threshold was judged",
+    ),
+];
+
+const OVERLAY: [Row; 15] = [
+    (
+        "Validity",
+        DataType::Text,
+        None,
+        "state",
+        |status| word(Some(status.state)),
+        "Whether the estimates can be used: unavailable, valid, degraded (coasting on stale inputs) or untrusted (the readings contradict the model).",
+    ),
+    (
+        "Mode",
+        DataType::Text,
+        None,
+        "pack.mode",
+        |status| word(Some(status.pack.mode).filter(|mode| *mode != Mode::Unknown)),
+        "What the pack does, by its current: charge, rest or discharge. Braking into the battery is charge too.",
+    ),
+    (
+        "LimitingCell",
+        DataType::Uint16,
+        None,
+        "pack.limiting_cell",
+        |status| cell(status.pack.limiting_cell),
+        "Cell that ends a discharge, counted from 0.",
+    ),
+    (
+        "WeakestCell",
+        DataType::Uint16,
+        None,
+        "pack.weakest_cell",
+        |status| cell(status.pack.weakest_cell),
+        "Cell with the least capacity, counted from 0.",
+    ),
+    (
+        "IsAsleep",
+        DataType::Flag,
+        None,
+        "asleep_since",
+        |status| Some(Value::Flag(status.asleep_since.is_some())),
+        "True while the buses sleep.",
+    ),
+    (
+        "RemainingLife.Cell",
+        DataType::Uint16,
+        None,
+        "pack.shortest_lived_cell",
+        |status| cell(status.pack.shortest_lived_cell),
+        "Cell whose life ends first, counted from 0.",
+    ),
+    (
+        "CurrentSensor.IsFrozen",
+        DataType::Flag,
+        None,
+        "current_frozen",
+        |status| status.pack.values.get(Quantity::Current).map(|_| Value::Flag(status.current_frozen)),
+        "True when the reading stays at one value while the voltages show another load.",
+    ),
+    (
+        "Model.State",
+        DataType::Text,
+        None,
+        "pack.model_state",
+        |status| word(status.pack.model_state),
+        "How well the cells' model is known: prior, learning, learned, unfit (another chemistry explains the voltages better) or given.",
+    ),
+    (
+        "Model.BetterChemistry",
+        DataType::Text,
+        None,
+        "pack.model_fits_better",
+        |status| word(status.pack.model_fits_better),
+        "Chemistry that explains the voltages better than the configured one; no value = none does.",
+    ),
+    (
+        "Alarms.Thresholds",
+        DataType::Uint16,
+        None,
+        "alarms.thresholds",
+        |status| count(status.alarms.thresholds),
+        "Thresholds configured.",
+    ),
+    (
+        "Alarms.Raised",
+        DataType::Uint16,
+        None,
+        "alarms.raised",
+        |status| count(status.alarms.raised),
+        "Alarms raised now.",
+    ),
+    (
+        "Alarms.Unknown",
+        DataType::Uint16,
+        None,
+        "alarms.unknown",
+        |status| count(status.alarms.unknown.len()),
+        "Thresholds that cannot be judged, because their value is not known.",
+    ),
+    (
+        "Alarms.HighestSeverity",
+        DataType::Text,
+        None,
+        "alarms.highest_severity",
+        |status| status.alarms.level().map(|word| Value::Text(word.to_owned())),
+        "Of the raised alarms: info, warning or severe; none only when every threshold was judged.",
+    ),
+    (
+        "Findings",
+        DataType::Texts,
+        None,
+        "findings",
+        findings,
+        "What is found of single cells and of the sensors, KIND, KIND:cell3 or KIND:cell3:cell7 (first and last cell, or the two of a pair). Empty = nothing reported.",
+    ),
+    (
+        "Cells.IsTrusted",
+        DataType::Flags,
+        None,
+        "cells.trusted",
+        |status| of_cells(status, |cell| cell.trusted).map(Value::Flags),
+        "Whether the filter of the cell is consistent, each cell.",
+    ),
+];
+
+fn float(number: Option<f64>) -> Option<Value> {
+    single(number).map(Value::Float)
+}
+
+fn cell(cell: Option<CellIndex>) -> Option<Value> {
+    cell.map(|cell| Value::Uint16(cell.0))
+}
+
+fn count(count: usize) -> Option<Value> {
+    count.try_into().ok().map(Value::Uint16)
+}
+
+/// A word of the status document, as its JSON has it.
+fn word(value: Option<impl Serialize>) -> Option<Value> {
+    match serde_json::to_value(value?) {
+        Ok(serde_json::Value::String(word)) => Some(Value::Text(word)),
+        _ => None,
+    }
+}
+
+fn average(status: &StatusDocument, quantity: Quantity) -> Option<f64> {
+    let numbers = of_cells(status, |cell| cell.values.mean(quantity))?;
+    Some(numbers.iter().sum::<f64>() / numbers.len() as f64)
+}
+
+/// Codes of the raised alarms, `RULE:SEVERITY` and of a cell `RULE:SEVERITY:cell3`; without any, only when every threshold was
+/// judged.
+fn alarm_codes(document: &StatusDocument) -> Option<Value> {
+    let alarms = &document.alarms;
+    let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
+    let codes: Vec<String> = raised
+        .map(|alarm| {
+            let cell = alarm.cell.map_or_else(String::new, |cell| format!(":cell{}", cell.0));
+            format!("{}:{}{cell}", alarm.rule.name(), alarm.severity.name())
+        })
+        .collect();
+    // An empty list means "no error": only where that is known.
+    let is_known = !codes.is_empty() || (alarms.raised == 0 && alarms.are_judged());
+    is_known.then_some(Value::Texts(codes))
+}
+
+/// Without estimates nothing is looked for: an empty list would look healthy.
+fn findings(status: &StatusDocument) -> Option<Value> {
+    let codes: Vec<String> = status
+        .findings
+        .iter()
+        .map(|finding| match finding.cells {
+            None => finding.kind.name().to_owned(),
+            Some((first, last)) if first == last => format!("{}:cell{}", finding.kind.name(), first.0),
+            Some((first, last)) => format!("{}:cell{}:cell{}", finding.kind.name(), first.0, last.0),
+        })
+        .collect();
+    (!codes.is_empty() || status.pack.values.get(Quantity::Soc).is_some()).then_some(Value::Texts(codes))
+}
