@@ -24,6 +24,7 @@ use crate::io::log::{Batch, LogCounts, LogError, LogSource};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
 use crate::monitor::{Downtime, Monitor, Outputs, Record, RecordKind, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
@@ -215,7 +216,7 @@ struct Replay {
     summary: ReplaySummary,
     /// Whether a reload of the recorded run was noted.
     reloaded: bool,
-    usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    learned: BTreeMap<CellIndex, RecordedValues>,
     /// Cell-steps of a restored state; `None` until the first input.
     steps_before: Option<u64>,
 }
@@ -240,7 +241,7 @@ impl Replay {
             snapshot: None,
             summary: ReplaySummary::default(),
             reloaded: false,
-            usable: BTreeMap::new(),
+            learned: BTreeMap::new(),
             steps_before: Some(0),
         })
     }
@@ -347,7 +348,7 @@ impl Replay {
             out.estimates.iter().try_for_each(|estimate| write_estimate(file, estimate))?;
         }
         for event in &out.events {
-            note_event(&mut self.summary, &mut self.usable, event);
+            note_event(&mut self.summary, &mut self.learned, event);
             if let Some(file) = &mut self.sinks.events {
                 event_log::write_line(file, event)?;
             }
@@ -389,7 +390,7 @@ impl Replay {
         }
         let (span, mut summary) = (self.span, self.summary);
         summary.log = counts.clone();
-        summary.cells = cells::summaries(&self.monitor, &self.usable);
+        summary.cells = cells::summaries(&self.monitor, &self.learned);
         let offset = self.monitor.current_offset();
         summary.current_offset_a = offset.map(|offset| offset.mean);
         summary.current_offset_std_a = offset.map(|offset| offset.std());

@@ -6,6 +6,7 @@
 use serde_json::{Map, Value};
 
 use crate::monitor::EventKind;
+use crate::quantity::catalogue::Quantity;
 use crate::store::HistoryEntry;
 
 /// Values by name.
@@ -40,6 +41,12 @@ impl Fields {
     /// A mean with its standard deviation.
     pub(crate) fn pair(&self, mean: &str, std: &str) -> Option<(f64, f64)> {
         self.number(mean).zip(self.number(std))
+    }
+
+    /// A quantity with its standard deviation.
+    pub(crate) fn quantity(&self, quantity: Quantity) -> Option<(f64, f64)> {
+        let row = quantity.row();
+        self.pair(row.key, row.std_key?)
     }
 
     /// A text; empty when there is none.

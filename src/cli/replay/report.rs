@@ -5,6 +5,7 @@ use std::path::Path;
 
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
+use crate::quantity::catalogue::Quantity;
 use crate::replay::{ProtectedSummary, ReplaySummary};
 
 /// Alarms listed for people; JSON has more.
@@ -118,15 +119,18 @@ fn write_cells(out: &mut impl Write, summary: &ReplaySummary) -> io::Result<()> 
         "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x"
     )?;
     for cell in summary.cells.iter().take(MAX_SHOWN_CELLS) {
-        let usable = cell.usable_capacity_ah.zip(cell.usable_capacity_std_ah);
+        let learned = |quantity, digits| match cell.values.pair(quantity) {
+            Some((value, std)) => with_std(value, std, digits),
+            None => "unknown".to_owned(),
+        };
         writeln!(
             out,
             "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}",
             cell.cell + 1,
             with_std(100.0 * cell.soc, 100.0 * cell.soc_std, 2),
-            with_std(cell.capacity_ah, cell.capacity_std_ah, 3),
-            usable.map_or_else(|| "unknown".to_owned(), |(value, std)| with_std(value, std, 3)),
-            with_std(cell.resistance_ratio, cell.resistance_ratio_std, 2),
+            learned(Quantity::Capacity, 3),
+            learned(Quantity::UsableCapacity, 3),
+            learned(Quantity::ResistanceRatio, 2),
         )?;
     }
     let more = summary.cells.len().saturating_sub(MAX_SHOWN_CELLS);

@@ -43,8 +43,8 @@ pub use config::{
 };
 pub use message::{
     BusEvent, CellView, Command, Downtime, DowntimeParseError, Estimate, Event, EventKind, LearnedCell,
-    MERGE_TOLERANCE_NS, MeasuredValues, ModelState, Outputs, PackView, Record, RecordKind, Secured,
-    Source, TICK_PERIOD_MS, Transmit, Validity,
+    MERGE_TOLERANCE_NS, MeasuredValues, ModelState, Outputs, PackView, Record, RecordKind, Secured, Source,
+    TICK_PERIOD_MS, Transmit, Validity,
 };
 pub use snapshot::{RestoreError, Snapshot};
 pub use stage::intake::ControllerCount;

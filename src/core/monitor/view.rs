@@ -17,7 +17,7 @@ use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
 use crate::health::{InsufficientData, PackState, RemainingLife};
-use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, Values};
+use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 
@@ -233,9 +233,12 @@ impl Monitor {
         values.set(Quantity::Current, sampler.cell_current_a(now));
         values.set(Quantity::Temperature, sampler.temperature_c(cell, now));
         values.set(Quantity::Soc, soc);
-        values.set(Quantity::Capacity, has_learned.then(|| learning.capacity(cell.index())));
-        values.set(Quantity::UsableCapacity, learning.cells[cell.index()].usable.filter(|_| has_learned));
-        values.set(Quantity::ResistanceRatio, soc.map(|_| estimation.resistance(cell.index())));
+        let resistance = estimation.resistance(cell.index());
+        let recorded = learning.cells[cell.index()].recorded(learning.capacity(cell.index()), resistance);
+        for quantity in RECORDED {
+            values.set(quantity, recorded.get(quantity).filter(|_| has_learned));
+        }
+        values.set(Quantity::ResistanceRatio, soc.map(|_| resistance));
         set_losses(&mut values, self.loss_modes(cell));
         set_remaining_life(&mut values, life.ok());
         CellView {

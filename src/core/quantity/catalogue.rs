@@ -19,6 +19,28 @@ pub struct Estimate {
     pub std: Option<f64>,
 }
 
+impl Estimate {
+    /// One of its numbers.
+    pub fn part(self, part: Part) -> Option<f64> {
+        match part {
+            Part::Mean => Some(self.mean),
+            Part::Std => self.std,
+        }
+    }
+
+    /// Without what is not finite; `None` = the mean.
+    fn known(self) -> Option<Self> {
+        let std = self.std.filter(|std| std.is_finite());
+        self.mean.is_finite().then_some(Self { std, ..self })
+    }
+}
+
+impl From<(f64, f64)> for Estimate {
+    fn from((mean, std): (f64, f64)) -> Self {
+        Self { mean, std: Some(std) }
+    }
+}
+
 impl From<f64> for Estimate {
     fn from(mean: f64) -> Self {
         Self { mean, std: None }
@@ -372,17 +394,12 @@ impl<const IS_PACK: bool> Values<IS_PACK> {
 
     /// Either of them.
     pub fn part(&self, quantity: Quantity, part: Part) -> Option<f64> {
-        match part {
-            Part::Mean => self.mean(quantity),
-            Part::Std => self.std(quantity),
-        }
+        self.get(quantity)?.part(part)
     }
 
     /// Sets a value. A mean that is not finite is unknown, and so is a standard deviation.
     pub fn set(&mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) {
-        let value = value.map(Into::into).filter(|value| value.mean.is_finite());
-        self.0[quantity as usize] =
-            value.map(|Estimate { mean, std }| Estimate { mean, std: std.filter(|std| std.is_finite()) });
+        self.0[quantity as usize] = value.map(Into::into).and_then(Estimate::known);
     }
 
     /// The same values with another one.
@@ -395,13 +412,7 @@ impl<const IS_PACK: bool> Values<IS_PACK> {
 
 impl<const IS_PACK: bool> Serialize for Values<IS_PACK> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(None)?;
-        for (row, _) in Self::rows() {
-            for (part, key) in row.parts() {
-                map.serialize_entry(key, &self.part(row.quantity, part))?;
-            }
-        }
-        map.end()
+        write(serializer, Self::rows().map(|(row, _)| (row, self.get(row.quantity))))
     }
 }
 
@@ -409,6 +420,72 @@ impl<'de, const IS_PACK: bool> Deserialize<'de> for Values<IS_PACK> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         deserializer.deserialize_map(ValuesVisitor)
     }
+}
+
+/// The quantities that are recorded after each half-cycle of a cell: in the event `capacity`, in the history and in exported tables.
+pub const RECORDED: [Quantity; 3] = [Quantity::Capacity, Quantity::UsableCapacity, Quantity::ResistanceRatio];
+
+/// Values of the [`RECORDED`] quantities of a cell. `None` = unknown.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RecordedValues([Option<Estimate>; RECORDED.len()]);
+
+impl RecordedValues {
+    /// A value; `None` also for a quantity that is not recorded.
+    pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
+        RECORDED.iter().zip(self.0).find(|(recorded, _)| **recorded == quantity)?.1
+    }
+
+    /// Its mean.
+    pub fn mean(&self, quantity: Quantity) -> Option<f64> {
+        self.get(quantity).map(|estimate| estimate.mean)
+    }
+
+    /// Its mean and standard deviation.
+    pub fn pair(&self, quantity: Quantity) -> Option<(f64, f64)> {
+        self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
+    }
+
+    /// The same values with another one of a recorded quantity.
+    #[must_use]
+    pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
+        let value = value.map(Into::into).and_then(Estimate::known);
+        for (place, _) in self.0.iter_mut().zip(RECORDED).filter(|(_, recorded)| *recorded == quantity) {
+            *place = value;
+        }
+        self
+    }
+
+    /// The names of the values in order, means before their standard deviations.
+    pub fn keys() -> impl Iterator<Item = &'static str> {
+        RECORDED.into_iter().flat_map(|quantity| quantity.row().parts().map(|(_, key)| key))
+    }
+}
+
+impl Serialize for RecordedValues {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        write(serializer, RECORDED.into_iter().zip(self.0).map(|(quantity, value)| (quantity.row(), value)))
+    }
+}
+
+impl<'de> Deserialize<'de> for RecordedValues {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let values = CellValues::deserialize(deserializer)?;
+        Ok(Self(RECORDED.map(|quantity| values.get(quantity))))
+    }
+}
+
+/// Writes values by their keys.
+fn write<S: Serializer>(
+    serializer: S,
+    values: impl Iterator<Item = (&'static QuantityRow, Option<Estimate>)>,
+) -> Result<S::Ok, S::Error> {
+    let mut map = serializer.serialize_map(None)?;
+    for (row, value) in values {
+        for (part, key) in row.parts() {
+            map.serialize_entry(key, &value.and_then(|value| value.part(part)))?;
+        }
+    }
+    map.end()
 }
 
 /// Reads the keys of the catalogue and ignores all others.

@@ -18,6 +18,7 @@ use crate::cell::Chemistry;
 use crate::cell_faults::CellFault;
 use crate::config::VehicleIdentity;
 use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
+use crate::quantity::catalogue::Quantity;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
@@ -307,22 +308,15 @@ fn log_learned(kind: &EventKind) {
             let (swing, swing_std) = (known(swing), known(swing_std));
             tracing::info!(cell = number(cell), ?mode, charge_ah, swing, swing_std, duration_s, "half-cycle");
         }
-        EventKind::Capacity {
-            cell,
-            measured_ah,
-            capacity_ah,
-            capacity_std_ah,
-            usable_capacity_ah,
-            resistance_ratio,
-            ..
-        } => {
+        EventKind::Capacity { cell, measured_ah, values, .. } => {
+            let mean = |quantity| known(values.mean(quantity));
             tracing::info!(
                 cell = number(cell),
                 measured_ah = known(measured_ah),
-                capacity_ah = rounded(capacity_ah),
-                capacity_std_ah = rounded(capacity_std_ah),
-                usable_capacity_ah = known(usable_capacity_ah),
-                resistance_ratio = rounded(resistance_ratio),
+                capacity_ah = mean(Quantity::Capacity),
+                capacity_std_ah = known(values.pair(Quantity::Capacity).map(|(_, std)| std)),
+                usable_capacity_ah = mean(Quantity::UsableCapacity),
+                resistance_ratio = mean(Quantity::ResistanceRatio),
                 "capacity"
             );
         }
@@ -350,6 +344,7 @@ mod tests {
     use crate::cell_faults::CellFaultKind;
     use crate::filter::ScalarGaussian;
     use crate::quantity::Mode;
+    use crate::quantity::catalogue::{RECORDED, RecordedValues};
 
     #[test]
     fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
@@ -420,12 +415,9 @@ mod tests {
                 cell,
                 measured_ah: known,
                 measured_std_ah: known,
-                capacity_ah: x,
-                capacity_std_ah: x,
-                usable_capacity_ah: known,
-                usable_capacity_std_ah: known,
-                resistance_ratio: x,
-                resistance_ratio_std: x,
+                values: RECORDED
+                    .into_iter()
+                    .fold(RecordedValues::default(), |values, it| values.with(it, Some((x, x)))),
             },
             EventKind::LossModes { cell, lli: x, lli_std: x, lam_ne: x, lam_ne_std: x, lam_pe: x, lam_pe_std: x },
             EventKind::RemainingLife {

@@ -10,6 +10,7 @@ use crate::alarm::Change;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::CellIndex;
+use crate::quantity::catalogue::RecordedValues;
 use crate::status::document::{ControllerStatus, MessageFlood};
 
 /// Raised alarms listed one by one; all are counted.
@@ -67,16 +68,16 @@ pub struct ReplaySummary {
     pub notes: Vec<String>,
 }
 
-/// Counts an event; lists it if it is an alarm raised, and keeps the usable capacities.
+/// Counts an event; lists it if it is an alarm raised, and keeps what was learned last of each cell.
 pub(super) fn note_event(
     summary: &mut ReplaySummary,
-    usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    learned: &mut BTreeMap<CellIndex, RecordedValues>,
     event: &Event,
 ) {
     let name = event.kind.name();
     let name = match event.kind {
-        EventKind::Capacity { cell, usable_capacity_ah, usable_capacity_std_ah, .. } => {
-            usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
+        EventKind::Capacity { cell, values, .. } => {
+            learned.insert(cell, values);
             name.to_owned()
         }
         EventKind::Alarm { change, .. } => {

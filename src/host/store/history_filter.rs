@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use super::rows::{EventSubject, HistoryRow};
 use crate::alarm::Change;
 use crate::monitor::{Event, EventKind};
+use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
@@ -149,12 +150,11 @@ impl HistoryFilter {
                 now,
             );
         }
-        let EventKind::Capacity {
-            cell, measured_ah, capacity_ah, capacity_std_ah, usable_capacity_ah: usable_ah, ..
-        } = *kind
-        else {
+        let EventKind::Capacity { cell, measured_ah, values, .. } = *kind else {
             return !matches!(kind, EventKind::RechargePeriod { .. });
         };
+        let Some((capacity_ah, capacity_std_ah)) = values.pair(Quantity::Capacity) else { return false };
+        let usable_ah = values.mean(Quantity::UsableCapacity);
         let new = WrittenCapacity { capacity_ah, usable_ah, token_bucket: TokenBucket::new(CAPACITIES) };
         let before = self.written.get(&cell).copied();
         if measured_ah.is_none() && before.is_none_or(|before| before.usable_ah == usable_ah) {

@@ -9,6 +9,7 @@ use super::segments;
 use crate::filter::ScalarGaussian;
 use crate::monitor::LearnedCell;
 use crate::quantity::CellIndex;
+use crate::quantity::catalogue::Quantity;
 
 /// Segments read, the newest: days of use.
 const MAX_SEGMENTS: usize = 16;
@@ -33,15 +34,16 @@ pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<L
 
 /// The contents of a row of `capacity`; `None` = it has no capacity.
 fn learned(row: &Row<'_>) -> rusqlite::Result<Option<LearnedCell>> {
-    let belief = |mean: &str, std: &str| -> rusqlite::Result<Option<ScalarGaussian>> {
-        let (mean, std): (Option<f64>, Option<f64>) = (row.get(mean)?, row.get(std)?);
+    let belief = |quantity: Quantity| -> rusqlite::Result<Option<ScalarGaussian>> {
+        let Some(std_key) = quantity.row().std_key else { return Ok(None) };
+        let (mean, std): (Option<f64>, Option<f64>) = (row.get(quantity.row().key)?, row.get(std_key)?);
         Ok(mean.zip(std).map(|(mean, std)| ScalarGaussian::from_std(mean, std)))
     };
-    let Some(capacity) = belief("capacity_ah", "capacity_std_ah")? else { return Ok(None) };
+    let Some(capacity) = belief(Quantity::Capacity)? else { return Ok(None) };
     Ok(Some(LearnedCell {
         cell: CellIndex(row.get("cell")?),
         capacity,
-        usable: belief("usable_capacity_ah", "usable_capacity_std_ah")?,
-        resistance: belief("resistance_ratio", "resistance_ratio_std")?,
+        usable: belief(Quantity::UsableCapacity)?,
+        resistance: belief(Quantity::ResistanceRatio)?,
     }))
 }

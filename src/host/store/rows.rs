@@ -3,12 +3,15 @@
 //! A column of the same name as a field of the event holds that field. Cells count from 0; units are in the names. A
 //! number that is not finite is stored as NULL.
 
+use std::sync::LazyLock;
+
 use rusqlite::types::Value;
 
 use super::stamp::Stamp;
 use crate::alarm::{Rule, Severity};
 use crate::monitor::EventKind;
 use crate::quantity::CellIndex;
+use crate::quantity::catalogue::RecordedValues;
 
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,7 +82,10 @@ impl HistoryTable {
     }
 
     /// Its columns, the cell (from 0) first, without the moment and the number.
-    pub const fn columns(self) -> &'static [&'static str] {
+    pub fn columns(self) -> &'static [&'static str] {
+        static CAPACITY: LazyLock<Vec<&str>> = LazyLock::new(|| {
+            ["cell", "measured_ah", "measured_std_ah"].into_iter().chain(RecordedValues::keys()).collect()
+        });
         match self {
             Self::HalfCycle => &[
                 "cell",
@@ -91,17 +97,7 @@ impl HistoryTable {
                 "mean_current_a",
                 "mean_temperature_c",
             ],
-            Self::Capacity => &[
-                "cell",
-                "measured_ah",
-                "measured_std_ah",
-                "capacity_ah",
-                "capacity_std_ah",
-                "usable_capacity_ah",
-                "usable_capacity_std_ah",
-                "resistance_ratio",
-                "resistance_ratio_std",
-            ],
+            Self::Capacity => &CAPACITY,
             Self::LossModes => &["cell", "lli", "lli_std", "lam_ne", "lam_ne_std", "lam_pe", "lam_pe_std"],
             Self::RemainingLife => &["cell", "cycles", "cycles_low", "cycles_high", "days", "days_low", "days_high"],
             Self::Model => {

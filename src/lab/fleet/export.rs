@@ -252,7 +252,7 @@ impl LogTables {
                 .period_s
                 .map(|_| TableFile::create(&path("estimates"), form, columns::ESTIMATES))
                 .transpose()?,
-            half_cycles: TableFile::create(&path("half_cycles"), form, columns::HALF_CYCLES)?,
+            half_cycles: TableFile::create(&path("half_cycles"), form, &columns::HALF_CYCLES)?,
             alarms: TableFile::create(&path("alarms"), form, columns::ALARMS)?,
             period_ns: (settings.period_s.unwrap_or(0.0) * 1e9) as i64,
             first: None,

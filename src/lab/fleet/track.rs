@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 
 use super::truth::EndOfLifeSource;
 use crate::monitor::{Event, EventKind};
+use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 
 /// Charge moved and capacities learned up to now.
@@ -33,9 +34,10 @@ impl Track {
         for event in events {
             match event.kind {
                 EventKind::HalfCycle { cell, charge_ah, .. } => self.move_charge(event.time, cell, charge_ah),
-                EventKind::Capacity { cell, capacity_ah, usable_capacity_ah, .. } => {
+                EventKind::Capacity { cell, values, .. } => {
                     let is_usable = self.learned == EndOfLifeSource::LearnedUsable;
-                    self.learn(event.time, cell, if is_usable { usable_capacity_ah } else { Some(capacity_ah) });
+                    let quantity = if is_usable { Quantity::UsableCapacity } else { Quantity::Capacity };
+                    self.learn(event.time, cell, values.mean(quantity));
                 }
                 EventKind::PackReplaced { .. } => self.capacity_ah.clear(),
                 _ => {}
@@ -102,6 +104,7 @@ impl Track {
 mod tests {
     use super::*;
     use crate::quantity::Mode;
+    use crate::quantity::catalogue::RecordedValues;
 
     fn half_cycle(time_s: f64, cell: u16, charge_ah: f64) -> Event {
         let kind = EventKind::HalfCycle {
@@ -122,12 +125,10 @@ mod tests {
             cell: CellIndex(cell),
             measured_ah: None,
             measured_std_ah: None,
-            capacity_ah,
-            capacity_std_ah: 0.1,
-            usable_capacity_ah: Some(capacity_ah - 0.1),
-            usable_capacity_std_ah: Some(0.1),
-            resistance_ratio: 1.0,
-            resistance_ratio_std: 0.1,
+            values: RecordedValues::default()
+                .with(Quantity::Capacity, Some((capacity_ah, 0.1)))
+                .with(Quantity::UsableCapacity, Some((capacity_ah - 0.1, 0.1)))
+                .with(Quantity::ResistanceRatio, Some((1.0, 0.1))),
         };
         Event { time: Timestamp::from_secs(time_s), kind }
     }

@@ -7,6 +7,7 @@
 use super::losses::{Losses, ReadingLimits, is_too_much};
 use crate::fields::Fields;
 use crate::monitor::{Estimate, Event, EventKind, Outputs, Snapshot, Throughput};
+use crate::quantity::catalogue::Quantity;
 use crate::quantity::{Mode, Timestamp};
 use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, HistoryTable};
 
@@ -229,12 +230,12 @@ impl Record {
     }
 
     fn take_capacity(&mut self, at_ns: i64, fields: &Fields) {
-        let capacity = fields.pair("capacity_ah", "capacity_std_ah");
-        let resistance = fields.pair("resistance_ratio", "resistance_ratio_std");
+        let capacity = fields.quantity(Quantity::Capacity);
+        let resistance = fields.quantity(Quantity::ResistanceRatio);
         let (Some(cell), Some(capacity), Some(resistance)) = (fields.whole("cell"), capacity, resistance) else {
             return;
         };
-        let usable = fields.pair("usable_capacity_ah", "usable_capacity_std_ah").map(|value| (at_ns, value));
+        let usable = fields.quantity(Quantity::UsableCapacity).map(|value| (at_ns, value));
         let cell = self.cell(cell as usize);
         let usable = usable.or(cell.learned.and_then(|learned| learned.usable));
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });

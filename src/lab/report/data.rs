@@ -8,6 +8,7 @@ use super::trace::Trace;
 
 use crate::fields::Fields;
 use crate::monitor::{Estimate, Event, EventKind};
+use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Mode};
 use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
@@ -224,10 +225,10 @@ impl Data {
             cell,
             measured_ah: fields.number("measured_ah"),
             measured_std_ah: fields.number("measured_std_ah"),
-            capacity_ah: fields.pair("capacity_ah", "capacity_std_ah").unwrap_or(unknown),
-            usable_ah: fields.pair("usable_capacity_ah", "usable_capacity_std_ah"),
+            capacity_ah: fields.quantity(Quantity::Capacity).unwrap_or(unknown),
+            usable_ah: fields.quantity(Quantity::UsableCapacity),
             losses: None,
-            resistance: fields.pair("resistance_ratio", "resistance_ratio_std").unwrap_or(unknown),
+            resistance: fields.quantity(Quantity::ResistanceRatio).unwrap_or(unknown),
         });
     }
 
@@ -235,7 +236,7 @@ impl Data {
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =
-            [("lli", "lli_std"), ("lam_ne", "lam_ne_std"), ("lam_pe", "lam_pe_std")].map(|(m, s)| fields.pair(m, s));
+            [Quantity::LithiumLoss, Quantity::NegativeLoss, Quantity::PositiveLoss].map(|loss| fields.quantity(loss));
         let losses =
             lithium.zip(negative).zip(positive).map(|((lithium, negative), positive)| [lithium, negative, positive]);
         let mut of_this_time = self.learned.iter_mut().rev().take_while(|row| row.time_s == time_s);

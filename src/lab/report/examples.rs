@@ -8,6 +8,7 @@ use std::path::Path;
 use super::data::{Data, Origin};
 use crate::config::{self, Config};
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
+use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
 /// Half-cycles of the worn pack: enough for the remaining life of every cell.
@@ -115,12 +116,16 @@ fn capacity(half: u16, cell: u16) -> EventKind {
         cell: CellIndex(cell),
         measured_ah: Some(capacity_ah(half, cell)),
         measured_std_ah: Some(0.01),
-        capacity_ah: capacity_ah(half, cell),
-        capacity_std_ah: stds.capacity_ah,
-        usable_capacity_ah: Some(2.4 - 0.005 * f64::from(half) + 0.001 * f64::from(cell)),
-        usable_capacity_std_ah: Some(stds.usable_ah),
-        resistance_ratio: 1.0 + 0.01 * f64::from(half) - 0.001 * f64::from(cell),
-        resistance_ratio_std: stds.resistance,
+        values: RecordedValues::default()
+            .with(Quantity::Capacity, Some((capacity_ah(half, cell), stds.capacity_ah)))
+            .with(
+                Quantity::UsableCapacity,
+                Some((2.4 - 0.005 * f64::from(half) + 0.001 * f64::from(cell), stds.usable_ah)),
+            )
+            .with(
+                Quantity::ResistanceRatio,
+                Some((1.0 + 0.01 * f64::from(half) - 0.001 * f64::from(cell), stds.resistance)),
+            ),
     }
 }
 

@@ -8,6 +8,7 @@ use super::soc::{largest, mean};
 use crate::OF_95;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::Mode;
+use crate::quantity::catalogue::Quantity;
 
 /// Estimates after one discharge.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -71,15 +72,13 @@ impl LifeRecorder {
     pub(super) fn observe(&mut self, event: &Event, table: &CycleTable) {
         match event.kind {
             EventKind::HalfCycle { mode, .. } => self.mode = Some(mode),
-            EventKind::Capacity {
-                capacity_ah,
-                capacity_std_ah,
-                usable_capacity_ah: Some(usable_ah),
-                usable_capacity_std_ah: Some(usable_std_ah),
-                resistance_ratio,
-                resistance_ratio_std,
-                ..
-            } if self.mode == Some(Mode::Discharge) => {
+            EventKind::Capacity { values, .. } if self.mode == Some(Mode::Discharge) => {
+                let [Some((capacity_ah, capacity_std_ah)), Some((usable_ah, usable_std_ah)), Some(resistance)] =
+                    [Quantity::Capacity, Quantity::UsableCapacity, Quantity::ResistanceRatio]
+                        .map(|quantity| values.pair(quantity))
+                else {
+                    return;
+                };
                 let number = table.number_at(event.time);
                 let Some(discharge) = number.checked_sub(1).and_then(|index| table.discharges.get(index)) else {
                     return;
@@ -93,8 +92,8 @@ impl LifeRecorder {
                     usable_std_ah,
                     capacity_ah,
                     capacity_std_ah,
-                    resistance_ratio,
-                    resistance_ratio_std,
+                    resistance_ratio: resistance.0,
+                    resistance_ratio_std: resistance.1,
                 });
             }
             _ => {}
@@ -130,6 +129,7 @@ fn score(each: Vec<DischargeScore>, table: &CycleTable, threshold_ah: f64, skip:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::quantity::catalogue::RecordedValues;
     use crate::quantity::{CellIndex, Timestamp};
     use crate::score::cycles::CycleTable;
 
@@ -147,12 +147,10 @@ mod tests {
             cell: CellIndex(0),
             measured_ah: None,
             measured_std_ah: None,
-            capacity_ah: 2.0,
-            capacity_std_ah: 0.1,
-            usable_capacity_ah: Some(usable_ah),
-            usable_capacity_std_ah: Some(0.01),
-            resistance_ratio: 1.0,
-            resistance_ratio_std: 0.1,
+            values: RecordedValues::default()
+                .with(Quantity::Capacity, Some((2.0, 0.1)))
+                .with(Quantity::UsableCapacity, Some((usable_ah, 0.01)))
+                .with(Quantity::ResistanceRatio, Some((1.0, 0.1))),
         };
         Event { time: Timestamp::from_secs(time_s), kind }
     }

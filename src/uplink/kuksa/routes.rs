@@ -14,10 +14,6 @@ use super::messages::{Datapoint, Metadata, ProvideSignalRequest, SampleInterval,
 use super::signals::{self, Signal};
 use super::value::{Limits, limit, type_name};
 
-/// Period of the values, ms: that of the daemon's documents.
-const PERIOD_MS: u32 = 1000;
-const NANOS_PER_SECOND: i64 = 1_000_000_000;
-
 /// One signal and where its value goes.
 #[derive(Debug)]
 struct Route {
@@ -85,7 +81,8 @@ impl Routes {
 
     /// Claims every signal.
     pub(crate) fn claim(&self) -> ProvideSignalRequest {
-        let interval = SampleInterval { interval_ms: PERIOD_MS };
+        // The daemon reports once a second.
+        let interval = SampleInterval { interval_ms: 1000 };
         ProvideSignalRequest { signals: self.by_id.keys().map(|id| (*id, interval)).collect() }
     }
 
@@ -135,8 +132,8 @@ fn check(signal: &'static Signal, entry: &Metadata, uses: &HashMap<i32, usize>) 
 
 fn timestamp(time: StatusTime) -> Timestamp {
     let nanos = time.nanos();
-    let rest = i32::try_from(nanos.rem_euclid(NANOS_PER_SECOND)).unwrap_or_default();
-    Timestamp { seconds: nanos.div_euclid(NANOS_PER_SECOND), nanos: rest }
+    let rest = i32::try_from(nanos.rem_euclid(1_000_000_000)).unwrap_or_default();
+    Timestamp { seconds: nanos.div_euclid(1_000_000_000), nanos: rest }
 }
 
 fn now() -> Timestamp {

@@ -11,6 +11,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CellModel;
 use packwatch::config::{self, ConfigFiles};
 use packwatch::monitor::{EventKind, Monitor, MonitorConfig, Outputs, Record};
+use packwatch::quantity::catalogue::Quantity;
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
 
@@ -388,7 +389,8 @@ impl Rig {
     fn listen(&mut self) {
         for event in &self.out.events {
             match event.kind {
-                EventKind::Capacity { measured_ah, capacity_ah, capacity_std_ah, .. } => {
+                EventKind::Capacity { measured_ah, values, .. } => {
+                    let (capacity_ah, capacity_std_ah) = values.pair(Quantity::Capacity).expect("an event has it");
                     let (place, true_ah) = (self.place(), self.truth().capacity_ah);
                     self.life.looks.push(Look {
                         time: event.time,

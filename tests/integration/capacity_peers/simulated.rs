@@ -84,7 +84,9 @@ impl Life {
                 let swing = Swing { x, x_variance: x_std * x_std, y_ah: charge_ah, y_variance };
                 self.filter.push((time_s - duration_s, Source::Filter(swing)));
             }
-            EventKind::Capacity { capacity_ah, capacity_std_ah, .. } => {
+            EventKind::Capacity { values, .. } => {
+                let (capacity_ah, capacity_std_ah) =
+                    values.pair(packwatch::quantity::catalogue::Quantity::Capacity).expect("an event has it");
                 let ours = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
                 self.reported.push(CapacityReport { time_s, true_ah, ours });
             }

@@ -17,6 +17,7 @@ use crate::can::rate::SenderChange;
 use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
 use crate::cell_faults::CellFault;
+use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
@@ -58,18 +59,9 @@ pub enum EventKind {
         measured_ah: Option<f64>,
         /// Its standard deviation, Ah.
         measured_std_ah: Option<f64>,
-        /// Estimate after the update, Ah.
-        capacity_ah: f64,
-        /// Its standard deviation, Ah.
-        capacity_std_ah: f64,
-        /// Usable capacity at the configured load, Ah.
-        usable_capacity_ah: Option<f64>,
-        /// Its standard deviation, Ah.
-        usable_capacity_std_ah: Option<f64>,
-        /// Resistance relative to new.
-        resistance_ratio: f64,
-        /// Its standard deviation.
-        resistance_ratio_std: f64,
+        /// The estimates after it.
+        #[serde(flatten)]
+        values: RecordedValues,
     },
     /// What a cell has lost, after a half-cycle, once its capacity was measured; parts of the model's new cell.
     LossModes {

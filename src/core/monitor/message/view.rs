@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::outputs::{ModelState, Validity};
+use super::event::ModelState;
+use super::outputs::Validity;
 use crate::cell::Chemistry;
 use crate::quantity::catalogue::{CellValues, PackValues};
 use crate::quantity::{CellIndex, Mode};

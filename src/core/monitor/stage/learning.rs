@@ -24,6 +24,7 @@ use crate::health::{
 };
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::EventKind;
+use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
@@ -282,7 +283,7 @@ impl Learning {
         }
         let (cell, usable) = (CellIndex(u16::try_from(index).unwrap_or(u16::MAX)), health.usable);
         to.event(half_cycle_event(cell, half_cycle));
-        to.event(capacity_event(cell, usable, resistance, &update));
+        to.event(capacity_event(cell, health.recorded(update.capacity, resistance), &update));
         if self.state.learner.has_learned(index) {
             bank.model(index)
                 .loss_modes(update.capacity)
@@ -461,22 +462,22 @@ fn losses_event(cell: CellIndex, losses: &LossModes) -> EventKind {
     }
 }
 
-fn capacity_event(
-    cell: CellIndex,
-    usable: Option<ScalarGaussian>,
-    resistance: ScalarGaussian,
-    update: &CapacityUpdate,
-) -> EventKind {
+fn capacity_event(cell: CellIndex, values: RecordedValues, update: &CapacityUpdate) -> EventKind {
     EventKind::Capacity {
         cell,
         measured_ah: update.measurement.map(|z| z.value),
         measured_std_ah: update.measurement.map(|z| z.variance.sqrt()),
-        capacity_ah: update.capacity.mean,
-        capacity_std_ah: update.capacity.std(),
-        usable_capacity_ah: usable.map(|usable| usable.mean),
-        usable_capacity_std_ah: usable.as_ref().map(ScalarGaussian::std),
-        resistance_ratio: resistance.mean,
-        resistance_ratio_std: resistance.std(),
+        values,
+    }
+}
+
+impl CellHealth {
+    /// The values that the history records and readers see.
+    pub(crate) fn recorded(&self, capacity: ScalarGaussian, resistance: ScalarGaussian) -> RecordedValues {
+        RecordedValues::default()
+            .with(Quantity::Capacity, Some(capacity))
+            .with(Quantity::UsableCapacity, self.usable)
+            .with(Quantity::ResistanceRatio, Some(resistance))
     }
 }
 

@@ -4,6 +4,7 @@ use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::Chemistry;
 use crate::monitor::ModelState;
+use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode};
 
 /// A capacity of a cell, measured or not.
@@ -12,12 +13,10 @@ pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah:
         cell: CellIndex(cell),
         measured_ah,
         measured_std_ah: measured_ah.map(|_| 0.1),
-        capacity_ah: 2.5,
-        capacity_std_ah: 0.05,
-        usable_capacity_ah: Some(usable_ah),
-        usable_capacity_std_ah: Some(0.06),
-        resistance_ratio: 1.1,
-        resistance_ratio_std: 0.02,
+        values: RecordedValues::default()
+            .with(Quantity::Capacity, Some((2.5, 0.05)))
+            .with(Quantity::UsableCapacity, Some((usable_ah, 0.06)))
+            .with(Quantity::ResistanceRatio, Some((1.1, 0.02))),
     }
 }
 

@@ -5,13 +5,16 @@
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
+use std::sync::LazyLock;
 
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use crate::fleet::vehicles::VehicleRecord;
 
 use crate::cell::LossModes;
+use crate::fields::Fields;
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
+use crate::quantity::catalogue::{Part, Quantity, RECORDED};
 
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,19 +72,36 @@ pub(super) struct Column<R> {
     /// Whether it may be null.
     pub(super) optional: bool,
     pub(super) about: &'static str,
-    pub(super) get: for<'r> fn(&'r R) -> FieldValue<'r>,
+    source: ColumnSource<R>,
+}
+
+/// Where the value of a column comes from.
+enum ColumnSource<R> {
+    Value(for<'r> fn(&'r R) -> FieldValue<'r>),
+    /// The number of the column's name in an event.
+    Field(fn(&R) -> &Fields),
+}
+
+impl<R> Column<R> {
+    /// Its value in a row.
+    pub(super) fn value<'r>(&self, row: &'r R) -> FieldValue<'r> {
+        match self.source {
+            ColumnSource::Value(value) => value(row),
+            ColumnSource::Field(fields) => FieldValue::Real(fields(row).number(self.name)),
+        }
+    }
 }
 
 /// Columns: name, kind, unit, `null` where it may be, meaning, value.
 macro_rules! columns {
     ($row:ty; $( $name:literal $kind:ident $unit:literal $($null:ident)?, $about:literal, $get:expr; )+) => {
-        &[$( Column::<$row> {
+        [$( Column::<$row> {
             name: $name,
             unit: $unit,
             kind: ColumnType::$kind,
             optional: columns!(@ $($null)?),
             about: $about,
-            get: $get,
+            source: ColumnSource::Value($get),
         }, )+]
     };
     (@ null) => { true };
@@ -89,7 +109,7 @@ macro_rules! columns {
 }
 
 /// Of `estimates`.
-pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
+pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
     "time" Time "UTC", "when the voltage was read", |row| FieldValue::Time(row.estimate.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
@@ -111,44 +131,57 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
-/// Of `half_cycles`.
-pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
-    "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when it was over", |row| FieldValue::Time(row.time);
-    "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
-    "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
-    "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
-    "charge_ah" Real "Ah", "charge moved", |row| FieldValue::Real(row.half.number("charge_ah"));
-    "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| FieldValue::Real(row.half.number("swing"));
-    "swing_std" Real "fraction" null, "its standard deviation", |row| FieldValue::Real(row.half.number("swing_std"));
-    "duration_s" Real "s", "duration", |row| FieldValue::Real(row.half.number("duration_s"));
-    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| FieldValue::Real(row.half.number("mean_current_a"));
-    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| FieldValue::Real(row.half.number("mean_temperature_c"));
-    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| FieldValue::Real(row.capacity.number("measured_ah"));
-    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("measured_std_ah"));
-    "capacity_ah" Real "Ah", "learned capacity after it", |row| FieldValue::Real(row.capacity.number("capacity_ah"));
-    "capacity_std_ah" Real "Ah", "its standard deviation", |row| FieldValue::Real(row.capacity.number("capacity_std_ah"));
-    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| FieldValue::Real(row.capacity.number("usable_capacity_ah"));
-    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("usable_capacity_std_ah"));
-    "resistance_ratio" Real "", "resistance relative to new", |row| FieldValue::Real(row.capacity.number("resistance_ratio"));
-    "resistance_ratio_std" Real "", "its standard deviation", |row| FieldValue::Real(row.capacity.number("resistance_ratio_std"));
-    "lli" Real "fraction" null, "loss of lithium inventory, part of the model's new cell; null = not learned, or a model without electrodes", |row| loss(row, |it| it.lithium.mean);
-    "lli_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.lithium.std());
-    "lam_ne" Real "fraction" null, "loss of active material of the negative electrode", |row| loss(row, |it| it.negative.mean);
-    "lam_ne_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.negative.std());
-    "lam_pe" Real "fraction" null, "loss of active material of the positive electrode", |row| loss(row, |it| it.positive.mean);
-    "lam_pe_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.positive.std());
-    "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little is known", |row| cycles(row, |left| left.median);
-    "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
-    "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
-    "remaining_days" Real "days" null, "days until the cell's end of life at the recent rate of use: median", |row| days(row, |left| left.median);
-    "remaining_days_low" Real "days" null, "its 5 % quantile", |row| days(row, |left| left.low);
-    "remaining_days_high" Real "days" null, "its 95 % quantile", |row| days(row, |left| left.high);
-};
+/// Of `half_cycles`: the half-cycle, the recorded quantities after it, what the cell has lost, its remaining life.
+pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
+    let half_cycle = columns! { HalfCycleRow;
+        "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
+        "time" Time "UTC", "when it was over", |row| FieldValue::Time(row.time);
+        "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
+        "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
+        "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
+        "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
+        "charge_ah" Real "Ah", "charge moved", |row| number(&row.half, "charge_ah");
+        "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| number(&row.half, "swing");
+        "swing_std" Real "fraction" null, "its standard deviation", |row| number(&row.half, "swing_std");
+        "duration_s" Real "s", "duration", |row| number(&row.half, "duration_s");
+        "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| number(&row.half, "mean_current_a");
+        "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| number(&row.half, "mean_temperature_c");
+        "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| number(&row.capacity, "measured_ah");
+        "measured_std_ah" Real "Ah" null, "its standard deviation", |row| number(&row.capacity, "measured_std_ah");
+    };
+    let forecast = columns! { HalfCycleRow;
+        "lli" Real "fraction" null, "loss of lithium inventory, part of the model's new cell; null = not learned, or a model without electrodes", |row| loss(row, |it| it.lithium.mean);
+        "lli_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.lithium.std());
+        "lam_ne" Real "fraction" null, "loss of active material of the negative electrode", |row| loss(row, |it| it.negative.mean);
+        "lam_ne_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.negative.std());
+        "lam_pe" Real "fraction" null, "loss of active material of the positive electrode", |row| loss(row, |it| it.positive.mean);
+        "lam_pe_std" Real "fraction" null, "its standard deviation", |row| loss(row, |it| it.positive.std());
+        "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little is known", |row| cycles(row, |left| left.median);
+        "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
+        "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
+        "remaining_days" Real "days" null, "days until the cell's end of life at the recent rate of use: median", |row| days(row, |left| left.median);
+        "remaining_days_low" Real "days" null, "its 5 % quantile", |row| days(row, |left| left.low);
+        "remaining_days_high" Real "days" null, "its 95 % quantile", |row| days(row, |left| left.high);
+    };
+    half_cycle.into_iter().chain(RECORDED.into_iter().flat_map(recorded)).chain(forecast).collect()
+});
+
+/// The columns of a recorded quantity.
+fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
+    let row = quantity.row();
+    let about = row.cell.map_or("", |it| it.about);
+    row.parts().map(move |(part, name)| Column {
+        name,
+        unit: row.unit.symbol(),
+        kind: ColumnType::Real,
+        optional: true,
+        about: if part == Part::Std { "its standard deviation" } else { about },
+        source: ColumnSource::Field(|row: &HalfCycleRow| &row.capacity),
+    })
+}
 
 /// Of `alarms`.
-pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
+pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
     "time" Time "UTC", "when", |row| FieldValue::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
@@ -167,7 +200,7 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
 };
 
 /// Of `vehicles`, which [`merge`](super::merge) writes.
-pub(super) const VEHICLES: &[Column<VehicleRecord>] = columns! { VehicleRecord;
+pub(super) const VEHICLES: &[Column<VehicleRecord>] = &columns! { VehicleRecord;
     "log" Word "", "name of the vehicle, as in the other tables", |row| text(&row.line.vehicle);
     "logs" Whole "", "its logs", |row| FieldValue::Whole(u32::try_from(row.line.logs.len()).ok());
     "bytes" Real "bytes", "their size", |row| real(row.line.bytes as f64);
@@ -193,6 +226,10 @@ fn real<'r>(value: f64) -> FieldValue<'r> {
 
 fn maybe<'r>(value: Option<f64>) -> FieldValue<'r> {
     FieldValue::Real(value.filter(|value| value.is_finite()))
+}
+
+fn number<'r>(fields: &Fields, name: &str) -> FieldValue<'r> {
+    FieldValue::Real(fields.number(name))
 }
 
 fn whole<'r>(value: u16) -> FieldValue<'r> {
@@ -233,7 +270,7 @@ pub fn reference() -> String {
     page += &section(
         "half_cycles",
         "A charge or discharge of a cell, what was learned from it, and the cell's remaining life after it.",
-        HALF_CYCLES,
+        &HALF_CYCLES,
     );
     page += &section("alarms", "A change of an alarm.", ALARMS);
     page += &section("vehicles", "A vehicle of a fleet, written by `packwatch fleet merge`.", VEHICLES);
@@ -269,7 +306,7 @@ mod tests {
 
     #[test]
     fn every_column_has_a_name_of_its_own_and_the_unit_its_name_says() {
-        for names in [names(ESTIMATES), names(HALF_CYCLES), names(ALARMS)] {
+        for names in [names(ESTIMATES), names(&HALF_CYCLES), names(ALARMS)] {
             assert!(names.iter().enumerate().all(|(index, name)| !names[..index].contains(name)));
         }
         let units = ESTIMATES.iter().map(|c| (c.name, c.unit)).chain(HALF_CYCLES.iter().map(|c| (c.name, c.unit)));

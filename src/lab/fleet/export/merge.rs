@@ -50,7 +50,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
         let is_wanted = table != "estimates" || vehicles.values().any(|found| found.record.period_s.is_some());
         if is_wanted {
             let rows = match table {
-                "half_cycles" => concatenate(&path, &parts, HALF_CYCLES, &metadata)?,
+                "half_cycles" => concatenate(&path, &parts, &HALF_CYCLES, &metadata)?,
                 "alarms" => concatenate(&path, &parts, ALARMS, &metadata)?,
                 _ => concatenate(&path, &parts, ESTIMATES, &metadata)?,
             };

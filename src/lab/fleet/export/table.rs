@@ -88,12 +88,12 @@ impl<R> TableFile<R> {
         match &mut self.writer {
             TableWriter::Csv { out, record } => {
                 record.clear();
-                self.columns.iter().for_each(|column| record.push_field(&csv_field(&(column.get)(row))));
+                self.columns.iter().for_each(|column| record.push_field(&csv_field(&column.value(row))));
                 Ok(out.write_record(&*record)?)
             }
             TableWriter::Parquet { out, group, rows } => {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
-                    if !values.push((column.get)(row), column.optional) {
+                    if !values.push(column.value(row), column.optional) {
                         let (file, name) = (self.path.display(), column.name);
                         return Err(LabError::Data(format!("{file}: {name} has no value, or one of another type")));
                     }

@@ -6,6 +6,7 @@ use crate::cell::{Chemistry, Label};
 use crate::cell_faults::{CellFaultDetector, UnknownImbalance};
 use crate::health::InsufficientData;
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
+use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::report::examples::{self, HALVES, end_s};
 
@@ -98,12 +99,10 @@ fn capacity(half: u16, cell: u16) -> EventKind {
         cell: CellIndex(cell),
         measured_ah: Some(capacity_ah(half, cell) + 0.01 * noise(half, cell)),
         measured_std_ah: Some(0.01),
-        capacity_ah: capacity_ah(half, cell),
-        capacity_std_ah: 0.02,
-        usable_capacity_ah: Some(0.9 * capacity_ah(half, cell)),
-        usable_capacity_std_ah: Some(0.02),
-        resistance_ratio: 1.0 + 0.001 * f64::from(half) + 0.02 * noise(half, cell),
-        resistance_ratio_std: 0.05,
+        values: RecordedValues::default()
+            .with(Quantity::Capacity, Some((capacity_ah(half, cell), 0.02)))
+            .with(Quantity::UsableCapacity, Some((0.9 * capacity_ah(half, cell), 0.02)))
+            .with(Quantity::ResistanceRatio, Some((1.0 + 0.001 * f64::from(half) + 0.02 * noise(half, cell), 0.05))),
     }
 }
 
