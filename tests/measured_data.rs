@@ -2,6 +2,7 @@
 //! ignored (and counted as skipped) when they are not.
 //!
 //! The folder is the one that `PACKWATCH_DATA` names, or `../shared/data` next to the project.
+#![expect(clippy::print_stdout, reason = "Cargo reads the output of a build script")]
 
 use std::path::{Path, PathBuf};
 

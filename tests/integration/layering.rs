@@ -13,14 +13,14 @@ use std::path::{Path, PathBuf};
 /// The crates under `src` re-export the modules of the crates below them, so a module has one name everywhere.
 const TABLE: &[(&str, &[&str], Core)] = &[
     ("quantity", &[], Core::Pure),
-    ("filter", &[], Core::Pure),
+    ("filter", &["quantity"], Core::Pure),
     ("regress", &[], Core::Pure),
     ("can", &["quantity"], Core::Pure),
     ("sample", &["quantity"], Core::Pure),
     ("cell", &["quantity", "filter", "sample"], Core::Pure),
     ("health", &["quantity", "filter", "sample", "cell"], Core::Pure),
     ("cell_faults", &["quantity", "filter", "cell"], Core::Pure),
-    ("alarm", &["quantity"], Core::Pure),
+    ("alarm", &["quantity", "filter"], Core::Pure),
     ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "cell_faults", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
     ("wiring", &["quantity", "filter", "can", "sample", "cell", "monitor"], Core::Pure),
