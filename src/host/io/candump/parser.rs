@@ -66,7 +66,8 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface, if the parser knows the name; always `None` for names of more than seven bytes.
+    /// Number of the interface, if the parser knows the name; always `None` for names of more than seven bytes and after more than
+    /// one space.
     pub bus: Option<BusIndex>,
     /// The place behind it.
     pub rest: Cursor<'a>,
