@@ -199,8 +199,8 @@ RAISED = ("active", "latched", "suppressed")  # the last without its input
 
 def learned_of(snapshot: dict) -> tuple[list, list]:
     """Capacities and raised alarms: what must come back after a restart."""
-    capacities = [round(cell["mean"], 9) for cell in snapshot["learner"]["capacity"]]
-    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarms"]["alarms"]
+    capacities = [round(cell["mean"], 9) for cell in snapshot["learning"]["learner"]["capacity"]]
+    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarming"]["alarms"]["alarms"]
               if a["machine"]["state"] in RAISED and a["rule"] not in OF_NOW]
     return capacities, sorted(alarms, key=str)
 
