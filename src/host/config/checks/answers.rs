@@ -82,7 +82,7 @@ impl AnswerPlace<'_> {
 
 /// The answers of all tables; those with a fault are noted and left out.
 pub(crate) fn definitions(raw: &RawTables) -> Vec<AnswerDefinition> {
-    raw.diagnostics.iter().filter_map(|keys| definition(keys)).collect()
+    raw.diagnostics.iter().filter_map(definition).collect()
 }
 
 fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {

@@ -36,7 +36,7 @@ fn percent_outside_and_current_positive_while_charging() {
 #[test]
 fn what_is_not_known_is_null_everywhere() {
     let mut document = document();
-    let pack: Map<_, _> = serde_json::to_value(&document.pack).unwrap().as_object().unwrap().clone();
+    let pack: Map<_, _> = serde_json::to_value(document.pack).unwrap().as_object().unwrap().clone();
     let without = |(key, value): (String, Value)| {
         let is_number = value.is_number();
         (key, if is_number { Value::Null } else { value })
