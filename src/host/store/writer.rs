@@ -268,7 +268,7 @@ impl Writer {
             batches.clear();
             self.write_queue.lock().backlog.commit();
         } else if !self.knows_state {
-            // The folder may hold a state that nobody has read.
+            // The existing state has not been read yet: do not overwrite it.
             return rows.map(|()| 0);
         }
         let mut document = document.clone();
