@@ -59,7 +59,7 @@ fn means_and_covariances_survive_a_power_cut() {
         assert_eq!(back.stamp, late.stamp);
         let [before, after] = [&late, &back].map(|document| serde_json::to_value(&document.snapshot).unwrap());
         let filter = |state: &Value| state["cells"][0]["estimator"].clone();
-        let drift = |state: &Value| state["learner"]["drift"][0].clone();
+        let drift = |state: &Value| state["learning"]["learner"]["drift"][0].clone();
         let [a, b] = [filter(&before), filter(&after)];
         compare((&a["mean"], &a["covariance"]), (&b["mean"], &b["covariance"]), &format!("filter at {seconds} s"));
         let [a, b] = [drift(&before), drift(&after)];
