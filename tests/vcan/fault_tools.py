@@ -216,7 +216,8 @@ def same(args) -> None:
     before, after = (json.loads(path.read_text()) for path in (args.before, args.after))
     if not comes_back(before, after):
         sys.exit(f"not what was learned:\n{learned_of(before)}\n{learned_of(after)}")
-    socs = [f"{100 * s['pack']['soc']:.1f} +/- {100 * s['pack']['soc_std']:.1f} %" if s["pack"] else "unknown" for s in (before, after)]
+    packs = [state["learning"]["pack"] for state in (before, after)]
+    socs = [f"{100 * pack['soc']:.1f} +/- {100 * pack['soc_std']:.1f} %" if pack else "unknown" for pack in packs]
     print(f"{len(learned_of(after)[0])} capacities and {len(learned_of(after)[1])} alarms as before, SOC {socs[0]} before, {socs[1]} after")
 
 
