@@ -11,12 +11,14 @@
 //! | `messages` | the protocol |
 //! | `routes` | ids of one connection |
 //! | `outgoing` | what waits to be sent: the newest only |
+//! | `questions` | values that the broker asks for, and when not to answer |
 //! | `session` | one connection |
 //! | `journal` | counts and log lines |
 
 mod journal;
 mod messages;
 mod outgoing;
+mod questions;
 mod routes;
 mod session;
 pub(crate) mod settings;

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use packwatch_host::status::document::StatusDocument;
 use tokio::sync::watch;
-use tokio::time::{Instant, timeout};
+use tokio::time::{Instant, sleep_until, timeout};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint};
 use tonic::{Code, Status, Streaming};
@@ -18,6 +18,7 @@ use tonic::{Code, Status, Streaming};
 use super::journal::Journal;
 use super::messages::{Client, Event, FromBroker, GetProviderValueResponse, PublishValuesRequest};
 use super::outgoing::Outbox;
+use super::questions::Questions;
 use super::routes::Routes;
 use super::settings::KuksaSettings;
 use super::signals::STANDARD_BRANCH;
@@ -30,6 +31,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
+/// Longest time for which the broker reads none of the batches: then its readers take old values for present ones.
+const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
 
@@ -53,8 +56,10 @@ pub(crate) async fn run(
             changed = documents.changed() => {
                 if changed.is_err() { break }
                 let document = documents.borrow_and_update();
-                session.publish(document.as_deref(), journal)?;
+                session.publish(document.as_deref(), journal);
+                session.receipts.check(Instant::now())?;
             }
+            () = wait_until(session.questions.due()) => session.handle_time()?,
             message = session.incoming.message() => match message.map_err(|status| words(&status))? {
                 None => return Err("the broker ended the stream".to_owned()),
                 Some(message) => session.handle(message, documents.borrow().as_deref(), journal),
@@ -70,7 +75,36 @@ struct Session {
     routes: Routes,
     outbox: Outbox,
     incoming: Streaming<FromBroker>,
+    questions: Questions,
     request_id: u32,
+    receipts: Receipts,
+}
+
+/// Since when the broker owes a receipt.
+#[derive(Debug, Default)]
+struct Receipts {
+    owed_since: Option<Instant>,
+}
+
+impl Receipts {
+    fn note_sent(&mut self, now: Instant) {
+        self.owed_since.get_or_insert(now);
+    }
+
+    /// The broker has read: what it has not read yet, the next batch begins to count.
+    fn note_read(&mut self) {
+        self.owed_since = None;
+    }
+
+    /// Ends a connection whose broker keeps it and reads nothing, or gives no receipts. One to which nothing was sent owes none.
+    fn check(&self, now: Instant) -> Result<(), String> {
+        match self.owed_since {
+            Some(since) if now.duration_since(since) > UNREAD_LIMIT => {
+                Err(format!("the broker has confirmed no value for {} s", UNREAD_LIMIT.as_secs()))
+            }
+            _ => Ok(()),
+        }
+    }
 }
 
 impl Session {
@@ -91,42 +125,73 @@ impl Session {
         let mut incoming = call("OpenProviderStream", client.open_provider_stream(messages)).await?;
         call("ProvideSignalRequest", accepted(&mut incoming)).await?;
         journal.note_connected(&settings.address, routes.len());
-        Ok(Self { routes, outbox, incoming, request_id: 0 })
+        Ok(Self {
+            routes,
+            outbox,
+            incoming,
+            questions: Questions::default(),
+            request_id: 0,
+            receipts: Receipts::default(),
+        })
     }
 
     /// Sends a value of every signal; without a document, that there is none.
-    fn publish(&mut self, document: Option<&StatusDocument>, journal: &mut Journal) -> Result<(), String> {
+    fn publish(&mut self, document: Option<&StatusDocument>, journal: &mut Journal) {
         let points = self.routes.points(document);
         journal.note_published(&points);
         self.request_id = self.request_id.wrapping_add(1);
-        let batch = PublishValuesRequest { request_id: self.request_id, data_points: points.by_id };
-        self.outbox.publish(batch, Instant::now())
+        self.questions.note_batch(self.request_id);
+        self.receipts.note_sent(Instant::now());
+        self.outbox.publish(PublishValuesRequest { request_id: self.request_id, data_points: points.by_id });
     }
 
     fn handle(&mut self, message: FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
+        let now = Instant::now();
         match message.event {
-            Some(Event::Asked(question)) => {
-                let entries = self.routes.points_of(&question.signal_ids, document).by_id;
-                let answer = GetProviderValueResponse { request_id: question.request_id, entries };
-                journal.note_unanswered(u64::from(!self.outbox.answer(answer)));
+            Some(Event::Asked(question)) => journal.note_unanswered(u64::from(!self.questions.ask(question, now))),
+            Some(Event::Provided(_)) => {
+                self.receipts.note_read();
+                self.questions.note_read(self.outbox.acknowledge());
             }
             Some(Event::Rejected(rejected)) => {
                 for (id, rejection) in &rejected.status {
                     journal.note_rejected(self.routes.name(*id).unwrap_or("an unknown id"), &rejection.message);
                 }
             }
-            Some(Event::Provided(_)) | None => {}
+            None => {}
         }
+        let (questions, expired) = self.questions.take(now);
+        journal.note_unanswered(expired);
+        for (_, question) in questions {
+            let entries = self.routes.points_of(&question.signal_ids, document).by_id;
+            let answer = GetProviderValueResponse { request_id: question.request_id, entries };
+            journal.note_unanswered(u64::from(!self.outbox.answer(answer)));
+        }
+    }
+
+    /// Asks for the receipt of an answer when that is due.
+    fn handle_time(&mut self) -> Result<(), String> {
+        if self.questions.handle_time(Instant::now())? && !self.outbox.check() {
+            return Err("the broker reads no answers".to_owned());
+        }
+        Ok(())
     }
 
     /// Withdraws every value, and waits until the broker has had time to read that.
     async fn withdraw(mut self, journal: &mut Journal) {
-        // The connection ends either way.
-        let _ = self.publish(None, journal);
+        self.publish(None, journal);
         drop(self.outbox);
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
         // A broker that keeps its side open has read everything by then.
         let _ = timeout(FAREWELL, until_end).await;
+    }
+}
+
+/// Waits until then; for ever without a time.
+async fn wait_until(time: Option<Instant>) {
+    match time {
+        Some(time) => sleep_until(time).await,
+        None => std::future::pending().await,
     }
 }
 
@@ -211,4 +276,24 @@ fn token(file: Option<&Path>) -> Result<Option<MetadataValue<Ascii>>, String> {
         .map_err(|_| format!("{at}: the token has characters that a header cannot hold"))?;
     header.set_sensitive(true);
     Ok(Some(header))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_broker_that_confirms_nothing_loses_the_connection_and_an_idle_one_does_not() {
+        let begin = Instant::now();
+        let at = |seconds: u64| begin + Duration::from_secs(seconds);
+        let mut receipts = Receipts::default();
+        // No daemon, nothing to send, for an hour; then a batch.
+        receipts.note_sent(at(3600));
+        assert_eq!(receipts.check(at(3600)), Ok(()));
+        receipts.note_read();
+        assert_eq!(receipts.check(at(7200)), Ok(()));
+        (7200..=7230).for_each(|second| receipts.note_sent(at(second)));
+        assert_eq!(receipts.check(at(7230)), Ok(()));
+        assert_eq!(receipts.check(at(7231)), Err("the broker has confirmed no value for 30 s".to_owned()));
+    }
 }
