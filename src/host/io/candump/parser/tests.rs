@@ -1,3 +1,5 @@
+//! Tests of the candump parser: every form of a line, every byte at every place, and random lines.
+
 use proptest::prelude::*;
 
 use super::*;
