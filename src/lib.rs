@@ -87,8 +87,8 @@
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs`; its headline and cards: `lab/report/summary.rs` |
 //! | a value of a battery passport, its place in a standard; what a standard requires | `lab/passport/field.rs`, `lab/passport/condition.rs`; `lab/passport/standards.rs` |
 //! | a door that is fuzzed, an invariant of it | `/fuzz/src/doors`; seeds and past failures: `/fuzz/seeds` |
-//! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/systemd/debian/sbom`; `/systemd/debian/build` |
-//! | a package: its files; its program and processor; all of them | `/systemd/tree`; `/systemd/program`, `/systemd/architectures`; `/systemd/packages` |
+//! | what dependencies may be; the bill of materials; the same bytes | `/deny.toml`; `/packaging/debian/sbom`; `/packaging/debian/build` |
+//! | a package: its files; its program and processor; all of them | `/packaging/tree`; `/packaging/program`, `/packaging/architectures`; `/packaging/packages` |
 //! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //! | what a score is asked for, its tables and document | `lab/score/request.rs`, `lab/score/report.rs`; the cell's configuration: `lab/single_cell.rs` |
 //! | a column of a CSV log or measured file, the Battery Data Format | `host/io/csv_log.rs` (`SampleColumns`) |

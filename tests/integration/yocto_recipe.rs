@@ -1,11 +1,11 @@
-//! The Yocto recipe (`systemd/yocto`) against the sources: what it names exists, and its version, licence texts and Rust are those of the
+//! The Yocto recipe (`packaging/yocto`) against the sources: what it names exists, and its version, licence texts and Rust are those of the
 //! repository. That bitbake accepts it is checked by hand, see the manual, page Install.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const LAYER: &str = "systemd/yocto/meta-packwatch";
+const LAYER: &str = "packaging/yocto/meta-packwatch";
 
 fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -85,7 +85,7 @@ fn the_licence_texts_have_the_sums_of_the_recipe() {
 #[test]
 fn the_recipe_builds_what_the_debian_package_builds() {
     let (_, text) = recipe();
-    let script = fs::read_to_string(repository().join("systemd/program")).unwrap();
+    let script = fs::read_to_string(repository().join("packaging/program")).unwrap();
     assert_eq!(words(&text, "CARGO_PROFILE"), ["vehicle"]);
     assert!(script.contains("profile=vehicle"));
     let flags = words(&text, "CARGO_BUILD_FLAGS:append");

@@ -231,7 +231,7 @@ impl SegmentWriter {
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
     // Compression level of zstd. The frames of a pack of 96 cells become 8.0 times smaller; with level 3, which takes 2 MB more
-    // memory, 7.2 times. The vehicle's package (`systemd/debian/build`) leaves out the compressors of the other levels.
+    // memory, 7.2 times. The vehicle's package (`packaging/debian/build`) leaves out the compressors of the other levels.
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
