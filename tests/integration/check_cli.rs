@@ -197,7 +197,7 @@ fn a_file_that_is_not_there_is_a_bad_configuration() {
 
 #[test]
 fn the_reference_page_is_printed() {
-    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/REFERENCE.md")).unwrap();
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/src/reference/keys.md")).unwrap();
     assert_eq!(good(&["check", "--reference"]), page);
 }
 

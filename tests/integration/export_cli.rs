@@ -182,11 +182,11 @@ fn a_log_that_fails_leaves_no_table_and_the_others_go_on() {
 fn the_page_about_the_columns_is_the_one_in_the_repository() {
     let output = Command::cargo_bin("packwatch").unwrap().args(["export", "--columns-page"]).assert().success();
     let page = String::from_utf8(output.get_output().stdout.clone()).unwrap();
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/EXPORT.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/src/reference/export.md");
     assert_eq!(
         fs::read_to_string(path).unwrap(),
         page,
-        "write it again: packwatch export --columns-page > config/EXPORT.md"
+        "write it again: packwatch export --columns-page > docs/src/reference/export.md"
     );
 }
 

@@ -3,7 +3,7 @@
 replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number a line
 
 The filter is the one of src/cell/estimator.rs: states [SOC, U1, ln rho, C], the same tables, circuit, process and measurement noises
-(defaults of config/REFERENCE.md), sigma points by filterpy's own class, redrawn before the update. Left out, to the peer's
+(defaults of docs/src/reference/keys.md), sigma points by filterpy's own class, redrawn before the update. Left out, to the peer's
 advantage: gate, consistency, gaps in the current (an error here), learning at transitions, alarms, frames to send.
 """
 import bisect
@@ -18,7 +18,7 @@ import cantools
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-# [estimator] of config/REFERENCE.md
+# [estimator] of docs/src/reference/keys.md
 ALPHA, BETA, KAPPA = 1.0, 2.0, 0.0
 INITIAL_SOC_STD, INITIAL_BRANCH_STD_V, INITIAL_LOG_RESISTANCE_STD = 0.3, 0.05, 0.2
 INITIAL_CAPACITY_STD = 0.1

@@ -7,7 +7,7 @@ use super::core::records;
 use super::source::Source;
 use super::world::{self, CELL, DBC, PACK};
 
-const REFERENCE: &str = include_str!("../../../config/REFERENCE.md");
+const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
 /// Tables and keys that the reference page lists with a number.
 fn keys() -> &'static [(&'static str, &'static str)] {

@@ -19,7 +19,7 @@
 //!    the parameters of an algorithm it fills the field of the same name; another field, or one that needs other values,
 //!    stands behind `=>` on the same line.
 //! 2. In the algorithm, that field.
-//! 3. `packwatch check --reference > config/REFERENCE.md`; a test compares the two.
+//! 3. `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
 //!
 //! Reading, default, range check, fault texts, reference and manual page follow from the line. A check that concerns
 //! several keys goes into `checks/cross`. A new table needs a line in `schema/tables` too.

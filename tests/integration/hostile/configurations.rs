@@ -2,7 +2,7 @@
 
 use super::*;
 
-const REFERENCE: &str = include_str!("../../../config/REFERENCE.md");
+const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
 /// Tables whose numbers are drawn.
 const TABLES: [&str; 9] = [

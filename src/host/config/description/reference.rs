@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use crate::config::cell_model;
 use crate::config::schema::{Key, Presence, SECTIONS, SectionInfo};
 
-/// The page, as Markdown; `config/REFERENCE.md` is exactly this.
+/// The page, as Markdown; `docs/src/reference/keys.md` is exactly this.
 pub fn reference() -> String {
     let mut page = String::from(
         "# Reference of keys\n\n\

@@ -1,6 +1,6 @@
 //! Every key of the configuration file: meaning, type, unit, range and default, once.
 //!
-//! From these lines come the reading, every fault's "must be", the reference page (`config/REFERENCE.md`), the manual page
+//! From these lines come the reading, every fault's "must be", the reference page (`docs/src/reference/keys.md`), the manual page
 //! and, in a table that `gives` the parameters of an algorithm, those parameters. How a key is added: see
 //! [`config`](super::super).
 

@@ -1,6 +1,6 @@
 //! The columns of the exported tables: name, type, unit, meaning and value.
 //!
-//! The writers, the schema of the Parquet files and the page `config/EXPORT.md` all come from these lines. A value that is
+//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` all come from these lines. A value that is
 //! not known is null (an empty field in CSV), never NaN. Cells count from 0, current is positive for discharge.
 
 use std::borrow::Cow;
