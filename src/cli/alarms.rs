@@ -13,10 +13,10 @@ use packwatch_host::failure::Failure;
 /// Arguments of `alarms`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The daemon's answer, a line of JSON (cells from 0, times in ns since 1970)
+    /// Print the daemon's answer as a line of JSON (cells from 0, times in ns since 1970)
     #[arg(long)]
     json: bool,
-    /// Lists also alarms at rest and unknown ones
+    /// Also list inactive and unknown alarms
     #[arg(long)]
     all: bool,
     #[command(flatten)]
@@ -52,18 +52,18 @@ fn table(list: &AlarmList) -> String {
         text.push_str(&output::table(&HEAD, grouped(&list.alarms).iter().map(row), HEAD.len()));
     }
     if list.omitted > 0 {
-        let _ = writeln!(text, "and {} more, beyond the length of an answer", list.omitted);
+        let _ = writeln!(text, "and {} more, which do not fit in an answer", list.omitted);
     }
     let _ = write!(text, "{} thresholds", list.thresholds);
     if list.unknown.is_empty() {
-        text.push_str(", all of them judged\n");
+        text.push_str(", all known\n");
     } else {
         let names = list
             .unknown
             .iter()
             .map(|unknown| format!("{} {} ({})", unknown.rule.name(), unknown.severity.name(), unknown.alarms));
         let names: Vec<String> = names.collect();
-        let _ = writeln!(text, ", not known for {} of them (alarms): {}", names.len(), names.join(", "));
+        let _ = writeln!(text, ", {} of them unknown (number of alarms): {}", names.len(), names.join(", "));
     }
     text
 }
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_counts_cells_from_1_and_names_unknown_thresholds() {
+    fn table_counts_cells_from_1_and_names_unknown_thresholds() {
         let missing = Alarm {
             rule: Rule::InputMissing,
             cell: Some(CellIndex(0)),
@@ -146,14 +146,14 @@ mod tests {
                 "rule severity cell state value threshold probability raised first last acknowledged",
                 "input_missing warning 1 suppressed unknown 2.0 s - 2 1970-01-01T00:00:00Z 1970-01-02T00:00:00Z yes",
                 "soc_low warning pack active 8.4 % 10.0 % 97.3 % 2 1970-01-01T00:00:00Z 1970-01-02T00:00:00Z no",
-                "3 thresholds, not known for 1 of them (alarms): capacity_low severe (96)",
+                "3 thresholds, 1 of them unknown (number of alarms): capacity_low severe (96)",
             ]
         );
     }
 
     #[test]
-    fn an_empty_list_is_reported_as_no_alarm() {
+    fn empty_list_prints_no_alarm() {
         let list = AlarmList { time: Timestamp::ZERO, thresholds: 2, unknown: vec![], alarms: vec![], omitted: 0 };
-        assert_eq!(table(&list), "no alarm\n2 thresholds, all of them judged\n");
+        assert_eq!(table(&list), "no alarm\n2 thresholds, all known\n");
     }
 }

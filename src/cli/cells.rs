@@ -1,6 +1,6 @@
-//! `packwatch cells`: the cell models that are there, and the chemistries that a label may name.
+//! `packwatch cells`: lists the installed cell models, and the chemistries for use without a model.
 //!
-//! A file that is no cell model is reported on standard error, after the list of the others; exit code 1.
+//! A file that is not a cell model is reported on standard error, after the list; exit code 1.
 
 use std::path::PathBuf;
 
@@ -15,10 +15,11 @@ use packwatch_host::failure::Failure;
 /// Arguments of `cells`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders to list [default: config/cells and cells here, /etc/packwatch/cells, and share/packwatch/cells of the installation]
+    /// Folders to list [default: config/cells and cells in the current folder, /etc/packwatch/cells, and share/packwatch/cells
+    /// of the installation]
     #[arg(value_name = "DIR")]
     folders: Vec<PathBuf>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -49,12 +50,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn page(models: &[(PathBuf, SourcedModel)], folders: &[PathBuf]) -> String {
     let names: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
     let mut page = match (names.is_empty(), models.is_empty()) {
-        (true, _) => "no folder of cell models is there; name one: packwatch cells DIR\n".to_owned(),
-        (false, true) => format!("no cell model in {}\n", names.join(", ")),
+        (true, _) => "no cell model folder found; name one: packwatch cells DIR\n".to_owned(),
+        (false, true) => format!("no cell models in {}\n", names.join(", ")),
         (false, false) => listed(models),
     };
-    page.push_str("\nLabels: pack.chemistry with pack.rated_capacity_ah, without a model file.\n");
-    let heads = ["chemistry", "usual voltages, V", "SOC error at first, points"];
+    page.push_str("\nWithout a model file, set pack.chemistry (below) and pack.rated_capacity_ah:\n");
+    let heads = ["chemistry", "typical voltages, V", "initial SOC error, points"];
     page.push_str(&output::table(&heads, Chemistry::ALL.into_iter().map(|(chemistry, _)| label_row(chemistry)), 1));
     page
 }
@@ -75,7 +76,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
         ]
     };
     let mut page = output::table(&heads, models.iter().map(row), 2);
-    page.push_str("\nWhere the data come from, and their licence\n");
+    page.push_str("\nData sources and licences\n");
     for (_, SourcedModel { model, source }) in models {
         let (data, licence) = (source.citation().unwrap_or("not stated"), source.licence().unwrap_or("not stated"));
         page.push_str(&format!("  {}\n    data: {data}\n    licence: {licence}\n", model.name));
@@ -83,7 +84,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
     page
 }
 
-/// The model's own error, or the residuals of its fit.
+/// The stated error of the model, else the residuals of its fit.
 fn error(sourced: &SourcedModel) -> String {
     match (sourced.error_v(), sourced.source.residual_v()) {
         (Some(error_v), _) => format!("{:.0}", 1e3 * error_v),
@@ -98,9 +99,9 @@ fn label_row(chemistry: Chemistry) -> Vec<String> {
     vec![chemistry.name().to_owned(), format!("{low} to {high}"), points]
 }
 
-/// Expected error of the SOC by a label alone, points.
+/// Expected initial SOC error with a label alone, points.
 fn first_points(chemistry: Chemistry) -> Option<f64> {
-    // The error does not depend on the capacity.
+    // The error does not depend on the capacity, so 1 Ah will do.
     let model = Label::usual(chemistry, 1.0).model()?;
     advise(&ModelBands::new(&model)).map(|(points, _)| points)
 }

@@ -1,7 +1,7 @@
 //! `packwatch check`: checks a configuration and describes it.
 //!
-//! Opens everything the configuration names. Good: the meaning on standard output, after the warnings, exit 0. Bad: every
-//! fault, one a line, on standard error, exit 78.
+//! Opens every file that the configuration names. If it is valid: warnings, then its description on standard output; exit
+//! code 0. If not: every fault in a line on standard error; exit code 78.
 
 use std::path::PathBuf;
 
@@ -16,14 +16,14 @@ pub(crate) struct Args {
     /// Configuration file
     #[arg(required_unless_present = "reference")]
     file: Option<PathBuf>,
-    /// Print the meaning as JSON
+    /// Print the description as JSON
     #[arg(long)]
     json: bool,
-    /// Print the configuration and its drop-ins FILE.d/*.toml as one TOML text, each part with its file and line; then
-    /// report the faults, if there are any
+    /// Print the configuration merged with its drop-ins FILE.d/*.toml as TOML, with file and line of each part; then report
+    /// faults, if any
     #[arg(long, conflicts_with = "json")]
     merged: bool,
-    /// Print the reference of all keys and do nothing else
+    /// Print the reference of all configuration keys as Markdown
     #[arg(long, conflicts_with_all = ["file", "json", "merged"])]
     reference: bool,
 }
@@ -66,7 +66,7 @@ fn show(description: &Description, page: &mut String) {
     for interface in &description.interfaces {
         let kind = if interface.fd { "classic and FD" } else { "classic" };
         let mut ids = match interface.filter_ids.len() {
-            0 => "nothing is read".to_owned(),
+            0 => "no message read".to_owned(),
             _ => format!("kernel filter {}", interface.filter_ids.join(" ")),
         };
         if !interface.own_ids.is_empty() {
@@ -77,15 +77,15 @@ fn show(description: &Description, page: &mut String) {
     list("signals", &table(description.signals.iter().map(signal)), "", page);
     list("plausible readings", &description.limits, "", page);
     list("checks of frames", &description.intake, "", page);
-    list("diagnostic requests", &description.polling, "none is sent", page);
-    list("outputs", &table(description.outputs.iter().map(sent)), "nothing is sent", page);
+    list("diagnostic requests", &description.polling, "none sent", page);
+    list("outputs", &table(description.outputs.iter().map(sent)), "none sent", page);
     list("alarms", &description.alarms, "none", page);
     if !description.j1939.is_empty() {
         list("j1939", &description.j1939, "", page);
     }
 }
 
-/// The first line's words.
+/// Verdict of the first line.
 fn verdict(warnings: usize) -> String {
     match warnings {
         0 => "good".to_owned(),
@@ -94,7 +94,7 @@ fn verdict(warnings: usize) -> String {
     }
 }
 
-/// A heading and indented lines, or the word for none of them.
+/// A heading and indented lines; `none` stands for an empty list.
 fn list(heading: &str, lines: &[String], none: &str, page: &mut String) {
     page.push_str(&format!("\n{heading}\n"));
     for line in lines.iter().map(String::as_str).chain(Some(none).filter(|none| lines.is_empty() && !none.is_empty())) {

@@ -1,6 +1,6 @@
 //! `packwatch acknowledge`, `clear`, `pack-replaced` and `poll`: commands to the running daemon.
 //!
-//! They succeed when something changed or there was nothing to change; a failure names every refused alarm and the reason.
+//! They succeed if something changed or nothing had to change. An error names every refused alarm and the reason.
 
 use std::fmt::Write as _;
 
@@ -26,7 +26,7 @@ pub(crate) struct AlarmArgs {
 /// Arguments of `pack-replaced`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ReplacedArgs {
-    /// Confirms it: everything learned about the old pack is forgotten
+    /// Confirm that everything learned about the old pack is discarded
     #[arg(long)]
     yes: bool,
     #[command(flatten)]
@@ -36,18 +36,18 @@ pub(crate) struct ReplacedArgs {
 /// Arguments of `poll`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct PollArgs {
-    /// What the daemon shall do
+    /// `standby` suspends the requests, `resume` sends them again
     action: PollAction,
     #[command(flatten)]
     control: ControlArgs,
 }
 
-/// What the daemon shall do with its diagnostic requests.
+/// Action on the daemon's diagnostic requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum PollAction {
-    /// Send none, until `resume` or a restart: while the car is in a workshop, or another tester is at work
+    /// Send no requests until `resume` or a restart, for example while another tester is connected
     Standby,
-    /// Send them again
+    /// Send requests again
     Resume,
 }
 
@@ -57,11 +57,11 @@ pub(crate) fn poll(args: &PollArgs) -> Result<(), Failure> {
     let request = Request::Command(Command::Poll { standby });
     let done: CommandOutcome = args.control.client().ask(request).map_err(Failure::new)?;
     match (done.refused, standby) {
-        (0, true) => print("no diagnostic requests are sent until `packwatch poll resume`\n"),
-        (0, false) => print("diagnostic requests are sent when nothing else speaks against it (`packwatch status`)\n"),
-        _ => Err(Failure::new(
-            "the daemon sends no diagnostic requests: its configuration has no [poll] with enabled = true",
-        )),
+        (0, true) => print("diagnostic requests are suspended until `packwatch poll resume`\n"),
+        (0, false) => {
+            print("diagnostic requests are no longer suspended; `packwatch status` shows whether they are sent\n")
+        }
+        _ => Err(Failure::new("diagnostic requests are off: set [poll] enabled = true in the daemon's configuration")),
     }
 }
 
@@ -84,7 +84,7 @@ fn send(client: &ControlClient, command: Command, word: &str) -> Result<(), Fail
     let done: CommandOutcome = client.ask(Request::Command(command)).map_err(Failure::new)?;
     if done.changed > 0 || done.refused == 0 {
         print(&match done.changed {
-            0 => format!("no alarm to be {word}\n"),
+            0 => format!("0 alarms {word}\n"),
             1 => format!("1 alarm {word}\n"),
             changed => format!("{changed} alarms {word}\n"),
         })?;

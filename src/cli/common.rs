@@ -1,4 +1,4 @@
-//! What several commands share: their arguments, the logs they read, and what they print. No command is named here.
+//! Arguments, log reading and output shared by several commands.
 
 pub(crate) mod alarms;
 #[cfg(feature = "lab")]
@@ -10,9 +10,9 @@ pub(crate) mod label;
 pub(crate) mod logs;
 #[cfg(feature = "lab")]
 pub(crate) mod many_logs;
-#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
+#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "used by the offline commands"))]
 pub(crate) mod numbers;
-#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
+#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "used by the offline commands"))]
 pub(crate) mod output;
 pub(crate) mod progress;
 #[cfg(feature = "lab")]

@@ -1,8 +1,8 @@
 //! `packwatch dbc`: writes the DBC of the configured frames for their receivers.
 //!
-//! The DBC is the layout from which the encoder is made: identifiers, frame formats, end-to-end protection, cycle times,
-//! value tables. An output file appears under its name only when it is complete. Exit code 78: the configuration is
-//! invalid, or it has no frames to send.
+//! The DBC is generated from the layout that the encoder uses: identifiers, frame formats, end-to-end protection, cycle times,
+//! value tables. The output file appears under its name only when it is complete. Exit code 78: the configuration is
+//! invalid or has no frames to send.
 
 use std::path::PathBuf;
 
@@ -17,7 +17,7 @@ pub(crate) struct Args {
     /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// File to write instead of standard output; an existing file is replaced
+    /// File to write, replacing an existing one [default: standard output]
     #[arg(short, long, value_name = "FILE", default_value = "-", hide_default_value = true)]
     output: PathBuf,
 }
@@ -26,7 +26,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let Some(layout) = config.output_layout else {
-        let message = format!("{}: nothing is sent, must have a table [output] that is enabled", args.config.display());
+        let message = format!("{}: nothing is sent; add a table [output] that is enabled", args.config.display());
         return Err(Failure { message, code: EXIT_CONFIG });
     };
     unless_closed(write_file(&args.output, &layout.to_dbc_bytes()))

@@ -1,8 +1,8 @@
-//! `packwatch demo`: a short ageing life on an in-process bus, ending in alarms. Needs no CAN, no root, no file.
+//! `packwatch demo`: a short battery life on an in-process bus, ending in alarms. Needs no CAN interface, root or files.
 //!
-//! A simulated cell loses 0.1 Ah per cycle. Its sensors' readings become frames of `config/measured.dbc`; the frames go
-//! through the same core as live ones; a consumer that has only `config/packwatch.dbc` decodes the frames that the core
-//! sends. Exit code 0 when both a capacity and a recharge-period alarm were raised, else 1.
+//! A simulated cell loses 0.1 Ah per cycle. Its readings become frames of `config/measured.dbc` and go through the same core as
+//! live frames. A consumer that has only `config/packwatch.dbc` decodes the frames that the core sends. Exit code 0 if both a
+//! capacity and a recharge-period alarm were raised, else 1.
 
 mod consumer;
 mod table;
@@ -24,29 +24,29 @@ use consumer::Consumer;
 use packwatch_host::failure::Failure;
 use table::Table;
 
-/// Files built into the binary, by the path the configuration calls them.
+/// Files built into the binary, by the path used in the configuration.
 const FILES: [(&str, &str); 3] = [
     ("demo.toml", include_str!("../../config/demo.toml")),
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// Loss of capacity per cycle, Ah: both alarms come within some ten cycles.
+/// Loss of capacity per cycle, Ah; raises both alarms within about ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
-/// SOC range of the cycling; wider than the recharge window, so that every charge covers it.
+/// SOC range of the cycling; wider than the recharge window, so that every charge covers the window.
 const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
-/// The demo gives up after this many cycles: at 1.2 Ah both alarms are overdue.
+/// Cycles until the demo gives up; the cell then has 1.2 Ah, far below both thresholds.
 const MAX_CYCLES: u32 = 14;
 /// Samples between two updates of the live row.
 const LIVE_SAMPLES: u64 = 400;
-/// Time of the bus when the demo starts: a Unix time, as in any log.
+/// Bus time at the start of the demo (Unix time, as in a log).
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
-/// Longer holes between frames are time asleep, s; the demo has none.
+/// Gaps between frames longer than this count as sleep, s; the demo has none.
 const SLEEP_GAP_S: f64 = 30.0;
 
 /// Arguments of `demo`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Seed of sensor noise
+    /// Seed of the sensor noise
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
@@ -64,7 +64,7 @@ fn read_built_in(path: &Path) -> io::Result<Vec<u8>> {
     found.map(|(_, text)| text.as_bytes().to_vec()).ok_or_else(|| io::ErrorKind::NotFound.into())
 }
 
-/// An alarm that was raised, as it was at that moment.
+/// An alarm at the moment it was raised.
 struct RaisedAlarm {
     rule: Rule,
     cycle: u32,
@@ -82,7 +82,7 @@ struct Demo {
     consumer: Consumer,
     interfaces: Vec<String>,
     rated_ah: f64,
-    /// Capacity in the present cycle; a completed one has already cost the pack its loss.
+    /// True capacity in the present cycle. The simulation subtracts the loss when a cycle completes.
     true_capacity_ah: f64,
     out: Outputs,
     table: Table,
@@ -117,7 +117,7 @@ impl Demo {
         })
     }
 
-    /// Runs the demo on standard output, without its last line.
+    /// Runs the demo on standard output, except for its last line.
     fn run(&mut self) -> io::Result<()> {
         let chain = "cell -> frames -> monitor -> frames -> consumer";
         writeln!(io::stdout(), "one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; {chain}")?;
@@ -125,7 +125,7 @@ impl Demo {
         self.show_alarm_frames()
     }
 
-    /// The cell's life, until a little after both alarms or [`MAX_CYCLES`].
+    /// Simulates until one cycle after both alarms, or for [`MAX_CYCLES`].
     fn live(&mut self) -> io::Result<()> {
         let (mut samples, mut cycles) = (0_u64, 0);
         let mut frames = Vec::new();
@@ -151,7 +151,7 @@ impl Demo {
         self.table.close()
     }
 
-    /// One frame from the bus, after the ticks before it.
+    /// Handles one frame from the bus, after the ticks due before it.
     fn feed(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.ticks.advance(time);
         while let Some(tick) = self.ticks.pop(self.monitor.next_due()) {
@@ -162,7 +162,7 @@ impl Demo {
         self.collect();
     }
 
-    /// Passes every sent frame to the consumer, and keeps the frames of newly raised alarms.
+    /// Passes every sent frame to the consumer and keeps the frames of newly raised alarms.
     fn collect(&mut self) {
         let (cycle, true_capacity_ah) = (self.sim.pack().cycles() + 1, self.true_capacity_ah);
         for sent in &self.out.frames {
@@ -186,11 +186,11 @@ impl Demo {
 
     fn is_complete(&self) -> bool {
         let last = self.first(Rule::CapacityLow).zip(self.first(Rule::RechargePeriodLow));
-        // One cycle is shown after the last alarm.
+        // Show one cycle after the last alarm.
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + 1)
     }
 
-    /// A row of the table: estimate and truth at this moment.
+    /// A table row with the present estimate and truth.
     fn row(&self, moment: &Moment, cycles: u32) -> String {
         let soc = match self.monitor.latest().next().flatten() {
             Some(e) => format!("{:6.1} +-{:5.1}", 100.0 * e.soc, 100.0 * e.soc_std),
@@ -212,12 +212,12 @@ impl Demo {
         )
     }
 
-    /// The alarm frames as an ECU receives them.
+    /// Prints the alarm frames as an ECU receives them.
     fn show_alarm_frames(&self) -> io::Result<()> {
         let mut out = io::stdout();
         let (frames_in, frames_out, unknown) = (self.frames_in, self.frames_out, self.consumer.unknown_frames());
-        writeln!(out, "\n{frames_in} frames in, {frames_out} out, {unknown} of them unknown to config/packwatch.dbc")?;
-        writeln!(out, "alarms as they went out, decoded with that file:")?;
+        writeln!(out, "\n{frames_in} frames in, {frames_out} out, {unknown} of them not in config/packwatch.dbc")?;
+        writeln!(out, "alarm frames, decoded with that file:")?;
         for raised in &self.raised {
             let interface = self.interfaces.get(raised.bus.index()).map_or("?", String::as_str);
             candump::write_line(&mut out, raised.time, StampDigits::Micros, interface, &raised.frame)?;
@@ -226,7 +226,7 @@ impl Demo {
         Ok(())
     }
 
-    /// Prints the result in one line; an error when an alarm is missing or a frame is not in the DBC.
+    /// Prints the result in one line. Fails if an alarm is missing or a frame is not in the DBC.
     fn conclude(&self) -> Result<(), Failure> {
         let unknown = self.consumer.unknown_frames();
         match (self.first(Rule::CapacityLow), self.first(Rule::RechargePeriodLow)) {
@@ -241,7 +241,7 @@ impl Demo {
                 let word = |found: Option<&RaisedAlarm>| if found.is_some() { "raised" } else { "missing" };
                 let (capacity, recharge) = (word(capacity), word(recharge));
                 Err(Failure::new(format!(
-                    "capacity alarm {capacity}, recharge-period alarm {recharge}, {unknown} frames unknown to their DBC"
+                    "capacity alarm {capacity}, recharge-period alarm {recharge}, {unknown} frames not in config/packwatch.dbc"
                 )))
             }
         }

@@ -1,6 +1,6 @@
-//! `packwatch diagnose`: which cell is failing, and how. Findings with what to do, and each cell's difference from its pack.
+//! `packwatch diagnose`: finds failing cells. Reports findings with advice, and each cell's difference from its pack.
 //!
-//! In: logs, which are replayed, or the stored state of a vehicle. Every "±" is one standard deviation.
+//! Input: logs, which are replayed, or the stored state of a vehicle. Every "±" is one standard deviation.
 
 mod pack;
 
@@ -28,18 +28,18 @@ use packwatch_host::failure::Failure;
 /// Arguments of `diagnose`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Journals, candump logs or CSV files of one pack, also .gz or .zst, read one after another as one record
+    /// Journals, candump logs or CSV files of one pack, also .gz or .zst; read in this order as one record
     #[arg(required_unless_present = "state", value_name = "LOG")]
     logs: Vec<PathBuf>,
-    /// Configuration, for logs
+    /// Configuration file; required with logs
     #[arg(short, long, value_name = "FILE", required_unless_present = "state")]
     config: Option<PathBuf>,
-    /// What a vehicle has found: its state folder, or a copy of it
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["logs", "config"])]
+    /// State folder of a vehicle, or a copy of it, to diagnose instead of logs
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["logs", "config"])]
     state: Option<PathBuf>,
     #[command(flatten)]
     input: InputArgs,
-    /// Write a picture of every difference as SVG into this folder
+    /// Write an SVG plot of every difference into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// Print JSON
@@ -47,7 +47,7 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// All that is printed.
+/// The printed document.
 #[derive(Debug, Serialize)]
 struct Page {
     version: u32,
@@ -56,7 +56,7 @@ struct Page {
     cells: Vec<CellRow>,
 }
 
-/// A finding, cells counted from 1.
+/// A finding; cells count from 1.
 #[derive(Debug, Serialize)]
 struct FindingRow {
     kind: CellFaultKind,
@@ -71,7 +71,7 @@ struct FindingRow {
     advice: &'static str,
 }
 
-/// A cell's difference from the middle of the pack; what is not known is `null`.
+/// Difference of a cell from the pack's median; unknown values are `null`.
 #[derive(Debug, Serialize)]
 struct CellRow {
     cell: u16,
@@ -102,12 +102,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let snapshot = match (&args.state, &config) {
         (Some(folder), _) => stored(folder)?,
         (None, Some(config)) => replayed(args, config)?,
-        (None, None) => return Err(Failure::new("neither --state nor --config, one must be given")),
+        (None, None) => return Err(Failure::new("give --state DIR, or --config FILE and logs")),
     };
     let Some(diagnosis) = snapshot.diagnosis() else {
         return Err(Failure::new(
-            "no cell can be compared with others: the pack has fewer than three, or the state is of an \
-                                 earlier program",
+            "no cell can be compared: the pack has fewer than three cells, or an older version of packwatch stored the \
+            state",
         ));
     };
     if let Some(folder) = &args.plots {
@@ -126,12 +126,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn stored(folder: &std::path::Path) -> Result<Snapshot, Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let snapshot = reader.snapshot();
-    snapshot.ok_or_else(|| Failure::new(format!("{}: no state is stored there", folder.display())))
+    snapshot.ok_or_else(|| Failure::new(format!("{}: contains no stored state", folder.display())))
 }
 
 fn replayed(args: &Args, config: &Config) -> Result<Snapshot, Failure> {
     let replayed = replaying::replay(&args.logs, &args.input, config, Sinks::default())?;
-    replayed.snapshot.ok_or_else(|| Failure::new("the logs have no reading"))
+    replayed
+        .snapshot
+        .ok_or_else(|| Failure::new("the logs have no readings; check the configuration with `packwatch doctor`"))
 }
 
 fn page(diagnosis: &CellFaultDetector, pack: PackPage) -> Page {
@@ -193,7 +195,7 @@ fn text(diagnosis: &CellFaultDetector, pack: Vec<(String, String)>, page: &Page)
     text + &table(&heads, rows, 0)
 }
 
-/// With its sign and deviation; a zero is positive.
+/// Formats value and deviation with a sign; zero gets a plus sign.
 fn with_deviation(mean: f64, std: f64, digits: usize) -> String {
     let scale = 10f64.powi(i32::try_from(digits).unwrap_or(0));
     format!("{:+.digits$} ± {std:.digits$}", (mean * scale).round() / scale + 0.0)

@@ -1,7 +1,6 @@
-//! `packwatch doctor`: listens to a pack or replays a record of one, and reports what is probably wrong.
+//! `packwatch doctor`: listens to a pack or replays a record, and reports probable faults.
 //!
-//! Exit code: 0 = no error and no warning, 1 = findings, 78 = the configuration itself is invalid (the parts that can be
-//! read are diagnosed anyway).
+//! Exit codes: 0 no error and no warning, 1 findings, 78 invalid configuration (its readable parts are diagnosed anyway).
 
 mod page;
 
@@ -22,29 +21,29 @@ use crate::wiring_check::{self, Interrupt, Survey};
 /// Arguments of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Configuration; it may be wrong
+    /// Configuration file; may contain faults
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Interface in place of the configured one; repeat it for several, in their order. Other CAN interfaces of this
-    /// computer are listened to as well
+    /// Listen on this interface instead of the configured one; repeat for several interfaces, in the order of the configuration.
+    /// All other CAN interfaces of this computer are listened to as well
     #[arg(short, long = "interface", value_name = "IFACE")]
     interfaces: Vec<String>,
-    /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - is standard input
+    /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - reads standard input
     #[arg(value_name = "LOG")]
     logs: Vec<PathBuf>,
-    /// How long to listen, s [default: 60; logs: all of them]
+    /// Time to listen, or time to read from the logs, s [default: 60; with logs, all of them]
     #[arg(long = "for", value_name = "S", value_parser = above_0_to(86_400.0, "seconds, "))]
     seconds: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
-    /// CSV column, as for `replay`
+    /// Name a CSV column, as for `replay`
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     columns: Vec<(String, String)>,
-    /// Sign of a CSV's current
+    /// Direction of positive current in a CSV
     #[arg(long, value_enum, default_value = "discharge")]
     csv_sign: CsvSign,
-    /// CSV table with the section's column and `start`
+    /// CSV table with the section column and a column `start`, as for `replay`
     #[arg(long, value_name = "TABLE.csv")]
     start_times: Option<PathBuf>,
 }
@@ -54,7 +53,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut survey = wiring_check::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
-    let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;
+    let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("cannot handle Ctrl-C: {error}")))?;
     let mut report =
         if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
     complete(&mut report, &survey);
@@ -77,7 +76,9 @@ fn rename_interfaces(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
     if args.interfaces.len() > configured {
         let found = args.interfaces.len();
         let file = args.config.display();
-        return Err(Failure::new(format!("--interface given {found} times, {file} has {configured}")));
+        return Err(Failure::new(format!(
+            "--interface is given {found} times, but {file} has {configured} interfaces"
+        )));
     }
     for (interface, name) in survey.plan.interfaces.iter_mut().zip(&args.interfaces) {
         interface.name.clone_from(name);
@@ -115,7 +116,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
     let (mut report, counts) = result.map_err(failure)?;
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();
-        let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has bad lines");
+        let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has malformed lines");
         finding.seen = format!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
         report.add(finding);
     }
@@ -133,7 +134,7 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringR
     result.map_err(failure)
 }
 
-/// The faults of the configuration as one finding; `None` = there is none.
+/// Combines the faults of the configuration in one finding; `None` if it has none.
 fn invalid(faults: &[String]) -> Option<WiringFinding> {
     let (first, others) = faults.split_first()?;
     let title = match others.len() {
@@ -142,17 +143,17 @@ fn invalid(faults: &[String]) -> Option<WiringFinding> {
     };
     let mut finding = WiringFinding::new(Severity::Error, Topic::Configuration, title);
     finding.seen.clone_from(first);
-    finding.why = "packwatch run does not start with it; the parts that can be read are judged below".to_owned();
+    finding.why = "packwatch run does not start with it; its readable parts are checked below".to_owned();
     finding.advice = Some("packwatch check shows every fault".to_owned()).filter(|_| !others.is_empty());
     finding.consequences = others.to_vec();
     Some(finding)
 }
 
-/// Adds the configuration's own faults and warnings, and to every change its line.
+/// Adds the configuration's faults and warnings, and the line of every change.
 fn complete(report: &mut WiringReport, survey: &Survey) {
     if let Some(finding) = invalid(&survey.faults) {
         report.add(finding);
-        // A wrong layout in the DBC is the cause of faults, not their effect.
+        // A wrong layout in the DBC causes other faults; list it first.
         if let Some(layout) =
             report.findings.iter().position(|f| (f.severity, f.topic) == (Severity::Error, Topic::Layout))
         {
@@ -160,7 +161,7 @@ fn complete(report: &mut WiringReport, survey: &Survey) {
         }
     }
     for warning in survey.config.iter().flat_map(|config| &config.warnings) {
-        let mut finding = WiringFinding::new(Severity::Warning, Topic::Configuration, "the configuration is unlikely");
+        let mut finding = WiringFinding::new(Severity::Warning, Topic::Configuration, "the configuration looks wrong");
         finding.seen.clone_from(warning);
         finding.why = "packwatch run starts with it; packwatch check reports it too".to_owned();
         report.add(finding);

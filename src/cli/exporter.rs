@@ -1,4 +1,4 @@
-//! `packwatch exporter`: the status of the running daemon as metrics over HTTP.
+//! `packwatch exporter`: serves the status of the running daemon as metrics over HTTP.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -10,13 +10,13 @@ use packwatch_host::failure::Failure;
 /// Arguments of `exporter`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Address to listen on; the default can be reached only from this computer
+    /// Address to listen on; the default accepts connections from this computer only
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9558")]
     listen: SocketAddr,
-    /// Status socket of the daemon (default: where `packwatch run` creates it)
+    /// Status socket of the daemon [default: where `packwatch run` creates it]
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
-    /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
+    /// Log level or filter: error, warn, info, debug, trace [default: $PACKWATCH_LOG, else info]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
 }

@@ -1,6 +1,6 @@
-//! `packwatch fit`: measured data to a cell model.
+//! `packwatch fit`: fits a cell model to measured data.
 //!
-//! Prints a table of files with their residuals, warnings, a verdict, and how the fit went; writes the model when it is complete.
+//! Prints a table of files with residuals, warnings, a verdict, and the result of the fit. Writes the model only when it is complete.
 
 mod report;
 
@@ -21,51 +21,51 @@ use packwatch_host::failure::Failure;
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Measured files: CSV, plain or compressed, with time_s, current_a (positive = discharge), voltage_v, and where there
-    /// are temperature_c, discharged_ah, cycle and type. Each begins with a full cell; with --log, any logs of a pack
-    #[arg(required = true, value_name = "FILES")]
+    /// Measured files: CSV, plain or compressed, with the columns time_s, current_a (positive = discharge), voltage_v, and
+    /// optionally temperature_c, discharged_ah, cycle and type. Each file starts with a full cell. With --log: logs of a pack
+    #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The files are logs as `replay` reads them, of drives and charges that begin anywhere: the fit starts from the cell model of
-    /// --config, or from --chemistry and --rated, and changes it where the logs show something else. The store of a service is no
-    /// log: it has no readings of voltage and current
+    /// Read the files as logs, as `replay` does; drives and charges may start at any SOC. The fit starts from the cell model of
+    /// --config, or from --chemistry and --rated, and changes what the logs contradict. The store of a service does not work: it
+    /// has no voltage and current readings
     #[arg(long, requires = "start", conflicts_with_all = ["capacity", "ageing_shift", "ocv", "first_cycles", "GridArgs"])]
     log: bool,
     #[command(flatten)]
     start: StartArgs,
     #[command(flatten)]
     input: InputArgs,
-    /// Cell model to write
+    /// Cell model file to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// Name of the cell for display [default with --log: that of the configured model]
+    /// Display name of the cell [default with --log: name of the configured model]
     #[arg(long, required_unless_present = "log")]
     name: Option<String>,
-    /// Capacity that defines SOC, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
+    /// Capacity that defines SOC, Ah [default: from the slow test nearest 25 degrees C, else the deepest discharge]
     #[arg(long, value_name = "AH", value_parser = finite)]
     capacity: Option<f64>,
-    /// Capacity on the label, Ah [default: the capacity]
+    /// Capacity on the label, Ah [default: --capacity]
     #[arg(long, value_name = "AH", value_parser = finite)]
     rated: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
-    /// of a new cell determines it [default: the electrodes found in the slow test say it; without them 0, for an ageing cell 0.5,
-    /// chosen on two whole lives]
+    /// How the open-circuit curve changes with lost capacity: 0 = it shrinks evenly, 1 = it shifts by pure lithium loss. This is
+    /// a prior that a fit of a new cell cannot determine [default: from the electrodes found in the slow test; without them 0.5 for
+    /// an ageing cell, chosen on two whole lives, else 0]
     #[arg(long, value_name = "SHARE", value_parser = finite)]
     ageing_shift: Option<f64>,
-    /// Lowest voltage under load [default: where discharges end; pulses do not count]
+    /// Lowest voltage under load [default: where discharges end, pulses excluded]
     #[arg(long, value_name = "V", value_parser = finite)]
     voltage_min: Option<f64>,
-    /// Highest voltage under charge [default: where charges end; pulses do not count]
+    /// Highest voltage under charge [default: where charges end, pulses excluded]
     #[arg(long, value_name = "V", value_parser = finite)]
     voltage_max: Option<f64>,
-    /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
+    /// Slow discharge from full (about C/20), one per temperature. The OCV is its discharge branch with a smooth correction
     #[arg(long, value_name = "FILE")]
     ocv: Vec<PathBuf>,
     #[command(flatten)]
     grid: GridArgs,
-    /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
+    /// Fit an ageing cell: use parts up to this number only, anchored at full charges and at the knees of discharges
     #[arg(long, value_name = "N", conflicts_with_all = ["ocv", "capacity"])]
     first_cycles: Option<usize>,
-    /// Plot of the residuals to write
+    /// Write a plot of the residuals
     #[arg(long, value_name = "FILE.svg")]
     plot: Option<PathBuf>,
     /// Print JSON
@@ -73,15 +73,15 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Where a fit to logs starts from.
+/// Start of a fit to logs.
 #[derive(Debug, clap::Args)]
 #[group(id = "start")]
 #[command(next_help_heading = "Logs")]
 struct StartArgs {
-    /// Configuration of the pack
+    /// Configuration file of the pack
     #[arg(short, long, value_name = "FILE.toml", requires = "log")]
     config: Option<PathBuf>,
-    /// Chemistry on the label of a single measured cell, with --rated, and --voltage-min and --voltage-max where they are unusual
+    /// Chemistry on the label of a single cell; needs --rated. Add --voltage-min and --voltage-max if they are not typical
     #[arg(long, value_parser = one_of_chemistries(), requires_all = ["log", "rated"], conflicts_with = "config")]
     chemistry: Option<String>,
 }
@@ -92,18 +92,18 @@ struct GridArgs {
     /// RC branches [default: 2, for an ageing cell 1]
     #[arg(long, value_name = "N")]
     branches: Option<usize>,
-    /// Starting time constants, s, rising
+    /// Initial time constants, s, ascending
     #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = finite)]
     tau: Option<Vec<f64>>,
-    /// Temperature nodes, degrees C, rising [default: from the data]
+    /// Temperature nodes, degrees C, ascending [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
-    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 to 31 with a slow test, closer where its curve bends; 25 for an ageing cell, else 24, closer near both ends]
+    /// SOC nodes: a number (evenly spaced) or an ascending list from 0 to 1 [default: 15 to 31 with a slow test, denser where its curve bends; 25 for an ageing cell; else 24, denser at both ends]
     #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
 }
 
-/// SOC breakpoints, which the request checks.
+/// SOC breakpoints; the request validates them.
 #[derive(Debug, Clone)]
 struct SocNodes(Vec<f64>);
 
@@ -140,7 +140,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(report::table(&outcome, seconds, &args.out))
 }
 
-/// Fits to logs; completes the request by what the configuration says.
+/// Fits to logs; takes missing parts of the request from the configuration.
 fn fit_logs(
     args: &Args,
     request: &mut FitRequest,

@@ -1,5 +1,5 @@
-//! `packwatch generate`: manual pages and shell completions, from the definition of the command line. Hidden: it is for
-//! building a package.
+//! `packwatch generate`: writes manual pages and shell completions from the definition of the command line. Hidden: only package
+//! builds use it.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use clap_mangen::Man;
 use super::common::output::print;
 use packwatch_host::failure::Failure;
 
-/// Text of the main page besides the definition of the command line.
+/// Text of the main page in addition to the definition of the command line.
 const MAIN_PAGE: &str = "\
 .SH EXIT STATUS
 0: success. 1: failure. 2: wrong command line. 78: wrong configuration. A command with further codes lists them.
@@ -42,18 +42,18 @@ pub(crate) struct Args {
 enum GenerateCommand {
     /// Write the manual pages of every command and of the configuration into a folder, which is created
     Man {
-        /// The folder
+        /// Folder to write to
         #[arg(value_name = "DIR")]
         folder: PathBuf,
     },
-    /// Print the completions of a shell
+    /// Print the completions for a shell
     Completions {
-        /// The shell
+        /// Shell to complete for
         shell: Shell,
     },
 }
 
-/// Shells of Linux: the generators of others would be code in the vehicle for nothing.
+/// Shells of Linux; other generators would only add code to the vehicle's program.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Shell {
     Bash,
@@ -82,7 +82,7 @@ fn visible(all: &clap::Command) -> clap::Command {
     command
 }
 
-/// File name and text of each page.
+/// Returns file name and text of each page.
 fn manual_pages(all: &clap::Command) -> Vec<(String, Vec<u8>)> {
     let command = visible(all);
     let mut pages = vec![("packwatch.toml.5".to_owned(), crate::config::manual().into_bytes())];

@@ -1,7 +1,7 @@
-//! `packwatch import`: descriptions of a car's signals or of a cell from elsewhere, converted to parts of a configuration.
+//! `packwatch import`: converts signal lists of a car, or a BPX cell, to configuration files.
 //!
-//! Standard error gets a count per reason of what was left out; the written file lists each with its place. Exit code 1:
-//! the file cannot be read, is of another kind, or nothing in it can be converted.
+//! Standard error shows how many items were left out for each reason; the written file lists them with their place. Exit code
+//! 1: the file cannot be read, has another format, or nothing in it can be converted.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ pub(crate) struct Args {
 enum ImportCommand {
     /// Convert an OBDb signal set (JSON) to [[input.diagnostic]] tables
     Obdb(ObdbArgs),
-    /// Write the likely battery signals of a DBC as the [input] part of a configuration, by name, unit and range
+    /// Write the [input] tables for the likely battery signals of a DBC, chosen by name, unit and range
     Dbc(DbcArgs),
     /// Derive a cell model from the physical parameters of a BPX file (JSON)
     Bpx(BpxArgs),
@@ -34,16 +34,16 @@ enum ImportCommand {
 /// Arguments of `import bpx`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The open-circuit voltage follows from the two potentials, resistances from the parameters for small currents; nothing is fitted, and \
-[provenance] states what was derived how. SOC is 1 at the upper voltage cut-off and 0 at the lower one. A fit to measured data is better.")]
+The open-circuit voltage follows from the two electrode potentials, the resistances from the parameters at small currents. Nothing is \
+fitted; [provenance] states how each value was derived. SOC is 1 at the upper voltage cut-off and 0 at the lower. A fit to measured data is better.")]
 struct BpxArgs {
     /// BPX file of version 0.x or 1.x; model SPM, SPMe or DFN
     #[arg(value_name = "FILE.json")]
     file: PathBuf,
-    /// Name of the cell [default: the title of the file]
+    /// Name of the cell [default: title of the file]
     #[arg(long)]
     name: Option<String>,
-    /// Cell model to write instead of standard output; an existing file is replaced
+    /// File to write, replacing an existing one [default: standard output]
     #[arg(
         short,
         long,
@@ -68,18 +68,18 @@ struct DbcArgs {
 /// Arguments of `import obdb`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The written tables carry the source's licence, CC BY-SA 4.0. Signals are named NAME.SIGNAL in [input.*]; NAME is the word that all ids \
-of the file begin with, or --name. Numbered signals of one answer become one line with {n}. A signal is left out, and listed at the \
-end of the file, when its values are names or texts, when a field is invalid, or when its bits belong to another signal; a command, \
-when it is of other model years, or its service is not 0x01, 0x21 or 0x22.")]
+The written tables carry the source's licence, CC BY-SA 4.0. Signals are named NAME.SIGNAL in [input.*]. NAME is --name or the common \
+prefix of all ids in the file. Numbered signals of one answer become one line with {n}. Signals are left out, and listed at the end \
+of the file, if their values are names or texts, a field is invalid, or their bits belong to another signal. Commands are left out if \
+they belong to other model years, or their service is not 0x01, 0x21 or 0x22.")]
 struct ObdbArgs {
     /// signalset.json of a car model
     #[arg(value_name = "FILE.json")]
     file: PathBuf,
-    /// Model year: leave out commands of other years [default: commands of all years]
+    /// Convert only commands of this model year [default: all years]
     #[arg(long, value_name = "YEAR", value_parser = clap::value_parser!(i64).range(1980..=2100))]
     year: Option<i64>,
-    /// Name before the dot of every signal [default: the word that all ids begin with]
+    /// Name before the dot of every signal [default: common prefix of all ids]
     #[arg(long)]
     name: Option<String>,
     #[command(flatten)]
@@ -89,7 +89,7 @@ struct ObdbArgs {
 /// Where the result is written.
 #[derive(Debug, clap::Args)]
 struct OutputArgs {
-    /// File to write instead of standard output; an existing file is replaced
+    /// File to write, replacing an existing one [default: standard output]
     #[arg(short, long, value_name = "FILE", default_value = "-", hide_default_value = true)]
     output: PathBuf,
 }

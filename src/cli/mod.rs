@@ -1,5 +1,5 @@
-//! The command line: one file per command, above what they share in `common`; here only parsing, dispatch and exit codes.
-#![expect(clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
+//! The command line: parsing, dispatch and exit codes. Each command has its own file; `common` holds what commands share.
+#![expect(clippy::print_stderr, reason = "this layer writes to the terminal")]
 
 mod alarms;
 mod cells;
@@ -65,49 +65,49 @@ enum Command {
     Status(status::Args),
     /// Serve the status of the running daemon as metrics for Prometheus
     Exporter(exporter::Args),
-    /// Send the status of the running daemon to an MQTT broker (program packwatch-uplink)
+    /// Send the status of the running daemon to an MQTT broker (needs packwatch-uplink)
     #[command(disable_help_flag = true)]
     Mqtt(uplink::Args),
-    /// Send the status of the running daemon to a KUKSA databroker (program packwatch-uplink)
+    /// Send the status of the running daemon to a KUKSA databroker (needs packwatch-uplink)
     #[command(disable_help_flag = true)]
     Kuksa(uplink::Args),
-    /// Write the overlay of the vehicle signal specification for KUKSA (program packwatch-uplink)
+    /// Write the VSS overlay for KUKSA (needs packwatch-uplink)
     #[command(disable_help_flag = true)]
     Vss(uplink::Args),
     /// Show the alarms of the running daemon
     Alarms(alarms::Args),
     /// Acknowledge alarms of the running daemon
     Acknowledge(command::AlarmArgs),
-    /// End latched alarms of the running daemon whose value is healthy again; no learned value is lost
+    /// Clear latched alarms of the running daemon whose value is healthy again; keep all learned values
     Clear(command::AlarmArgs),
-    /// Inform the running daemon that another pack is connected
+    /// Tell the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
-    /// Stop the diagnostic requests of the running daemon, or let it send them again
+    /// Suspend or resume the diagnostic requests of the running daemon
     Poll(command::PollArgs),
-    /// Forget the learned values, with or without a running daemon
+    /// Discard the learned values, with or without a running daemon
     Reset(reset::Args),
-    /// Show, export or verify the history in the store
+    /// List, export or verify the stored history
     History(Box<history::Args>),
-    /// Send a rule's alarm frame, marked as a test, and report the frames seen on every interface
+    /// Send the alarm frame of a rule, marked as a test, and report the frames seen on every interface
     TestAlarm(test_alarm::Args),
-    /// Replay journals, candump logs or CSV files through the same core
+    /// Replay journals, candump logs or CSV files through the same core as `run`
     Replay(Box<replay::Args>),
-    /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
+    /// Simulate an ageing pack as a candump log or as frames on an interface
     Simulate(Box<simulate::Args>),
-    /// Run a short ageing life on an in-process bus, ending in alarms; needs no files or interfaces
+    /// Simulate a short battery life that ends in alarms; needs no files or interfaces
     Demo(demo::Args),
-    /// Check a configuration and show what each configured signal resolves to
+    /// Check a configuration and show the DBC signal behind each configured signal
     Check(check::Args),
-    /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
+    /// Listen to a pack or replay a log, and report probable wiring and configuration faults
     Doctor(Box<doctor::Args>),
-    /// Name the cells of a pack that are failing, and how: leaks, contacts, weak cells, sensors
+    /// Find failing cells of a pack and their faults: leaks, contacts, weak cells, sensors
     #[cfg(feature = "lab")]
     Diagnose(Box<diagnose::Args>),
-    /// List the cell models that are there, and the chemistries that a label may name
+    /// List the installed cell models, and the chemistries for use without a model
     Cells(cells::Args),
-    /// Show, plot, export or compare cell models: curve, resistances, and how well they are known
+    /// Show, plot, export or compare cell models
     Model(Box<model::Args>),
-    /// Write the DBC of the configured frames, for their receivers
+    /// Write a DBC of the configured output frames, for receivers
     Dbc(dbc::Args),
     /// Write manual pages and shell completions
     #[command(hide = true)]
@@ -118,31 +118,31 @@ enum Command {
     /// Find the signals of the traction battery in a log
     #[cfg(feature = "lab")]
     Discover(discover::Args),
-    /// Convert descriptions of a car's signals to parts of a configuration
+    /// Convert signal lists of a car, or a BPX cell, to configuration files
     #[cfg(feature = "lab")]
     Import(import::Args),
-    /// Replay measured files and compare the estimates with the truth
+    /// Replay measured files and compare the estimates with the true values
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
-    /// Forecast the remaining useful life of measured capacity histories, and score forecasts made during the life
+    /// Forecast the remaining useful life from measured capacity histories
     #[cfg(feature = "lab")]
     Rul(rul::Args),
-    /// Gaussian process regression on CSV files: cross-validate, train, predict, forecast
+    /// Fit and use Gaussian process regression on CSV files
     #[cfg(feature = "lab")]
     Gpr(Box<gpr::Args>),
-    /// Report when the alarms would have come with other settings, over many logs
+    /// Compare alarm settings across recorded logs
     #[cfg(feature = "lab")]
     Whatif(Box<whatif::Args>),
-    /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
+    /// Write the estimates, half-cycles and alarms of many logs as Parquet or CSV
     #[cfg(feature = "lab")]
     Export(Box<export::Args>),
-    /// Replay the vehicles of a fleet in parts, on any machines, and merge their tables
+    /// Replay the vehicles of a fleet in shards, on any machines, and merge their tables
     #[cfg(feature = "lab")]
     Fleet(fleet::Args),
-    /// Write a page about the state and the past of a battery, from a history or a replay
+    /// Write an HTML report on the condition and history of a battery
     #[cfg(feature = "lab")]
     Report(Box<report::Args>),
-    /// Write the measured part of a battery passport, merged with the manufacturer's part and checked
+    /// Write a battery passport: measured values merged with the manufacturer's data
     #[cfg(feature = "lab")]
     Passport(Box<passport::Args>),
 }

@@ -1,4 +1,4 @@
-//! `packwatch reset`: forgets the learned values, through the running daemon or, without one, in its store.
+//! `packwatch reset`: discards the learned values through the running daemon or, if none runs, directly in the store.
 
 use std::path::PathBuf;
 
@@ -10,13 +10,14 @@ use packwatch_host::failure::Failure;
 /// Arguments of `reset`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Another pack is connected: starts its history and forgets the learned values of the old one
+    /// Discard the learned values and close the history of the old pack, because another pack is connected
     #[arg(long, required = true)]
     pack_replaced: bool,
-    /// Confirms it
+    /// Confirm that the learned values are discarded
     #[arg(long)]
     yes: bool,
-    /// Folder of state and history, for when no daemon runs (default: $STATE_DIRECTORY, else /var/lib/packwatch, or where there is none, that of a daemon from a shell)
+    /// Folder of state and history, used if no daemon runs [default: $STATE_DIRECTORY, else /var/lib/packwatch, else the
+    /// user's folder that `packwatch run` uses]
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     #[command(flatten)]
@@ -32,8 +33,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let pack = store::replace_pack(&folder).map_err(Failure::new)?;
     print(&format!(
-        "no daemon runs: in {} the history of pack {} is closed, that of pack {pack} starts; the stored state, with its \
-         alarms, is forgotten\n",
+        "no daemon runs. {}: closed the history of pack {}, started the history of pack {pack}; discarded the stored \
+        state with its alarms\n",
         folder.display(),
         pack - 1
     ))

@@ -20,62 +20,62 @@ use packwatch_host::failure::Failure;
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Configuration
+    /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Journal every input, for `packwatch replay`; an existing file of that name becomes FILE.1
+    /// Record every input in this journal, for `packwatch replay`; rename an existing FILE to FILE.1
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Journal in compressed segments FILE.000001.zst, FILE.000002.zst and so on, and delete the oldest when they and those
-    /// of the run before exceed this size, as 2GiB
+    /// Record in compressed segments FILE.000001.zst, FILE.000002.zst and so on. When the segments of this run and the
+    /// previous one exceed SIZE (for example 2GiB), delete the oldest
     #[arg(long, value_name = "SIZE", requires = "record", value_parser = bytes)]
     record_limit: Option<u64>,
-    /// Size of a segment (default: 64MiB)
+    /// Size of a segment [default: 64MiB]
     #[arg(long, value_name = "SIZE", requires = "record_limit", value_parser = bytes, default_value_t = DEFAULT_SEGMENT_BYTES, hide_default_value = true)]
     record_segment: u64,
-    /// Log the frames sent to the interfaces, in candump's form, with the time of the input that caused each
+    /// Log the sent frames in candump format, each with the time of the input that caused it
     #[arg(long, value_name = "FILE")]
     frames: Option<PathBuf>,
-    /// Write events as JSON, a line each, as `packwatch replay --events` does
+    /// Write events as JSON lines, as `packwatch replay --events` does
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
-    /// Start from a stored state
+    /// Start from this stored state
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state, if its stamp does not give it (the state came from a log), or unknown
+    /// Age of the stored state. Needed only if the state came from a log, so that its time stamp does not give the age
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
-    /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
-    /// $XDG_STATE_HOME/packwatch or ~/.local/state/packwatch: never the service's). Its state is restored, unless --restore names another
+    /// Folder for state and history; `none` keeps nothing [default: $STATE_DIRECTORY under systemd, else
+    /// $XDG_STATE_HOME/packwatch or ~/.local/state/packwatch]. The state found there is restored, unless --restore is given
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
-    /// Store the state here on stopping
+    /// Write the state to this file on stopping
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
     /// Stop after this time
     #[arg(long = "for", value_name = "SECONDS", value_parser = between(0.0, MAX_SECONDS, "seconds, "))]
     duration: Option<f64>,
-    /// Wait this long for the first usable frame before reporting readiness to the service manager
+    /// Wait at most this long for the first usable frame before reporting readiness to the service manager
     #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = between(0.0, MAX_READY_TIMEOUT_S, "seconds, "))]
     ready_timeout: f64,
-    /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
+    /// Log level or filter: error, warn, info, debug, trace [default: $PACKWATCH_LOG, else info]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
-    /// Receive buffer to request from the kernel, per interface
+    /// Receive buffer to request from the kernel for each interface
     #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = whole::<0, MAX_BUFFER_BYTES>)]
     receive_buffer: usize,
-    /// Socket for `packwatch alarms` and other commands, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock
-    /// under systemd, else in /run/packwatch for root and in $XDG_RUNTIME_DIR/packwatch for others)
+    /// Socket for `packwatch alarms` and other commands; `none` creates no socket [default: $RUNTIME_DIRECTORY/control.sock
+    /// under systemd, else in /run/packwatch for root and in $XDG_RUNTIME_DIR/packwatch for others]
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
-    /// Socket for `packwatch status` and the exporter, or none for no socket; the stream of `--watch` is next to it
-    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else in /run/packwatch for root and in
-    /// $XDG_RUNTIME_DIR/packwatch for others)
+    /// Socket for `packwatch status` and the exporter; `none` creates no socket. The socket for `status --watch` is next to
+    /// it [default: $RUNTIME_DIRECTORY/status.sock under systemd, else in /run/packwatch for root and in
+    /// $XDG_RUNTIME_DIR/packwatch for others]
     #[arg(long, value_name = "PATH")]
     status: Option<PathBuf>,
 }
 
-/// Largest receive buffer, bytes: the kernel's own limit on the option, halved as it doubles it.
+/// Largest receive buffer, bytes: half the kernel's limit, because the kernel doubles the requested size.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 
 /// Runs the command.

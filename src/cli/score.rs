@@ -1,4 +1,4 @@
-//! `packwatch score`: measured files against truth.
+//! `packwatch score`: compares estimates with the truth of measured files.
 
 mod args;
 mod bar;

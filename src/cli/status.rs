@@ -1,4 +1,4 @@
-//! `packwatch status`: the status of the running daemon as a table, as JSON, as metrics, or live on the screen.
+//! `packwatch status`: shows the status of the running daemon as a table, JSON, metrics, or a live screen.
 
 #[cfg(test)]
 #[path = "../host/status/tests/sample.rs"]
@@ -18,31 +18,31 @@ use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
 use packwatch_host::failure::Failure;
 
-/// Exit code when no daemon reports its status.
+/// Exit code if no daemon reports its status.
 const EXIT_UNREACHABLE: u8 = 3;
-/// Exit code when an alarm is raised.
+/// Exit code if an alarm is raised.
 const EXIT_ALARM: u8 = 4;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Exit codes: 0 no alarm is raised, 3 no daemon reports its status, 4 an alarm is raised, 1 any \
-    other failure, 2 wrong usage. With --watch: 0 after quitting."
+    after_help = "Exit codes: 0 no alarm is raised; 1 other failure; 2 wrong usage; 3 no daemon reports its status; 4 an \
+    alarm is raised. With --watch: 0 after quitting."
 )]
 pub(crate) struct Args {
-    /// Lists every cell; without it, of more than 16 cells, their range and the outliers
+    /// List every cell; without it, a pack of more than 16 cells shows their range and the outliers
     #[arg(long)]
     cells: bool,
-    /// The daemon's document, a line of JSON (cells from 0, times in ns since 1970)
+    /// Print the status document as a line of JSON (cells from 0, times in ns since 1970)
     #[arg(long, conflicts_with_all = ["cells", "prometheus", "watch"])]
     json: bool,
-    /// Metrics, as OpenMetrics text (see `packwatch exporter`)
+    /// Print metrics as OpenMetrics text (see `packwatch exporter`)
     #[arg(long, conflicts_with_all = ["cells", "watch"])]
     prometheus: bool,
-    /// Full screen, live: q quits, tab changes the page, arrows move
+    /// Show a live screen: q quits, tab changes the page, arrow keys move
     #[arg(short, long, conflicts_with = "cells")]
     watch: bool,
-    /// Status socket of the daemon (default: where `packwatch run` creates it)
+    /// Status socket of the daemon [default: where `packwatch run` creates it]
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
 }
@@ -64,7 +64,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         print(&table::table(&document, args.cells))?;
     }
     if raised > 0 {
-        // The output reports it.
+        // The output already shows the alarm.
         return Err(Failure { message: String::new(), code: EXIT_ALARM });
     }
     Ok(())
@@ -75,17 +75,17 @@ fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
 }
 
-/// ` (cell 3)`, or nothing.
+/// Returns ` (cell 3)`, or nothing.
 fn in_brackets(cell: Option<CellIndex>) -> String {
     cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)))
 }
 
-/// A number with its unit, or a dash.
+/// Formats a number with its unit, or a dash.
 fn shown(value: Option<f64>, decimals: usize, unit: &str) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}{unit}"))
 }
 
-/// A value, with its standard deviation if it has one, or a dash.
+/// Formats a value with its standard deviation, if known, or a dash.
 fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
     match values.get(quantity) {
@@ -96,13 +96,13 @@ fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, d
     }
 }
 
-/// A value without its standard deviation, or a dash.
+/// Formats a value without its standard deviation, or a dash.
 fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
     shown(values.mean(quantity).map(|mean| factor * mean), decimals, unit)
 }
 
-/// The unit on the screen, after a number, and its factor.
+/// Unit on the screen, and the factor to it.
 const fn screen_unit(unit: Unit) -> (&'static str, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (" %", 100.0),
@@ -117,15 +117,15 @@ const fn screen_unit(unit: Unit) -> (&'static str, f64) {
     }
 }
 
-/// `95 %: 60.8 to 65.6 %`; `None` = the state of charge is not known.
+/// Returns `95 %: 60.8 to 65.6 %`; `None` if the state of charge is unknown.
 fn soc_band(pack: &PackView) -> Option<String> {
     let [low, high] = [Quantity::SocLow, Quantity::SocHigh].map(|edge| pack.values.mean(edge));
     Some(format!("95 %: {:.1} to {:.1} %", 100.0 * low?, 100.0 * high?))
 }
 
-/// A duration in its two largest units.
+/// Formats a duration in its two largest units.
 fn duration(seconds: f64) -> String {
-    // Saturates; negative times are 0.
+    // The cast saturates; negative times become 0.
     let seconds = seconds.max(0.0) as u64;
     let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
     match (days, hours, minutes) {
@@ -136,11 +136,11 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-/// The store in a line.
+/// Describes the store in a line.
 fn store(document: &StatusDocument) -> String {
     let Some(store) = &document.store else { return "none".to_owned() };
     let works = match store.works {
-        None => "not tried yet",
+        None => "not written yet",
         Some(true) => "works",
         Some(false) => "CANNOT BE WRITTEN",
     };
@@ -156,7 +156,7 @@ fn store(document: &StatusDocument) -> String {
     text
 }
 
-/// The configuration: its name and the start of its fingerprint.
+/// Describes the configuration: its name and the start of its hash.
 fn config(document: &StatusDocument) -> String {
     let file = |config: &crate::status::document::ConfigFile| {
         let drop_ins = match config.drop_ins.len() {

@@ -19,10 +19,10 @@ use packwatch_host::failure::Failure;
 /// Arguments of `test-alarm`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The rule of the frame that is sent; no alarm is raised
+    /// Rule whose frame is sent; raises no alarm
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true)]
     rule: Rule,
-    /// Configuration of the daemon
+    /// Configuration file of the daemon
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     /// Duration of the test
@@ -45,13 +45,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let path = args.config.display();
     Err(Failure::new(format!(
-        "the test was not seen on {}; is the interface up, and does the daemon run with {path}?",
+        "no test frame seen on {}; check that the interface is up and that the daemon runs with {path}",
         bad.join(", ")
     )))
 }
 
 fn table(rule: Rule, reports: &[ChannelReport]) -> String {
-    let mut text = format!("test of {}, as seen on the interfaces:\n", rule.name());
+    let mut text = format!("test frames of {} seen on the interfaces:\n", rule.name());
     let _ = writeln!(
         text,
         "{:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} end-to-end",
@@ -72,7 +72,7 @@ fn table(rule: Rule, reports: &[ChannelReport]) -> String {
         );
         push_notes(&mut text, report);
     }
-    text.push_str("every frame counted had the test marker\n");
+    text.push_str("all counted frames had the test marker\n");
     text
 }
 
@@ -86,7 +86,7 @@ fn protection(report: &ChannelReport) -> String {
     format!("BROKEN: {}", found.collect::<Vec<_>>().join(", "))
 }
 
-/// States with a code of their own on the wire.
+/// States that have a wire code.
 const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Inactive,
     AlarmState::Active,
@@ -101,18 +101,18 @@ const ON_THE_WIRE: [AlarmState; 7] = [
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let observed = &report.observed;
     for (&(rule, state), count) in &observed.genuine {
-        let _ = writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state));
+        let _ = writeln!(text, "  also seen: {}, {count} frames", alarm_words(rule, state));
     }
     let others = [
         (observed.foreign, "test frames of other rules"),
-        (observed.unreadable, "frames that could not be read"),
-        (report.dropped, "frames lost by this computer before they were seen"),
+        (observed.unreadable, "undecodable frames"),
+        (report.dropped, "frames dropped by this computer"),
     ];
     for (count, what) in others.into_iter().filter(|(count, _)| *count > 0) {
-        let _ = writeln!(text, "  meanwhile {count} {what}");
+        let _ = writeln!(text, "  also seen: {count} {what}");
     }
     if let Some(error) = &report.error {
-        let _ = writeln!(text, "  listening ended early: {error}");
+        let _ = writeln!(text, "  listening stopped early: {error}");
     }
 }
 
@@ -120,5 +120,5 @@ fn alarm_words(rule: u8, state: u8) -> String {
     let name = Rule::from_number(rule).map_or("unknown rule", Rule::name);
     let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == state);
     let kind = if found.is_some_and(AlarmState::is_raised) { "REAL, " } else { "" };
-    format!("{kind}without the marker: {name} {}", found.map_or_else(|| "in an unknown state".to_owned(), word))
+    format!("{kind}without test marker: {name} {}", found.map_or_else(|| "in an unknown state".to_owned(), word))
 }

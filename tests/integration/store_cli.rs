@@ -170,7 +170,7 @@ fn another_pack_without_a_daemon_begins_a_new_history() {
     let reset = ["reset", "--pack-replaced", "--state", &state, "--control", &socket];
     assert!(bad(&reset).contains("--yes"));
     let printed = good(&[&reset[..], &["--yes"]].concat());
-    assert!(printed.contains("the history of pack 1 is closed, that of pack 2 starts"), "{printed}");
+    assert!(printed.contains("closed the history of pack 1, started the history of pack 2"), "{printed}");
     let mut resets = place.rows(&["--kind", "reset"]);
     resets.retain(|row| row["reason"] != "filter_reset");
     assert_eq!(resets.len(), 1);

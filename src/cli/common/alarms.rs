@@ -1,19 +1,19 @@
-//! Alarms as lines of a table: those that many cells share as one, with a count, a list of the cells, and the worst value.
+//! Alarms as table rows. An alarm shared by many cells is one row with a count, the list of cells and the worst value.
 
 use crate::alarm::{Alarm, Direction, Rule, Unit};
 use crate::quantity::CellIndex;
 
-/// Cells from which on equal alarms are one line.
+/// Number of cells from which equal alarms share a row.
 const MANY: usize = 4;
-/// Longest list of cells, characters; a longer one is cut.
+/// Longest list of cells, characters; longer lists are cut.
 const MAX_LIST: usize = 24;
 
-/// One line of a list of alarms.
+/// One row of the alarm table.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct AlarmGroup {
-    /// The alarm, or the worst of those that are alike.
+    /// The alarm; in a row of several cells, the worst of them.
     pub(crate) alarm: Alarm,
-    /// Their cells, ascending; empty = one alarm.
+    /// Cells of the row, ascending; empty for a single alarm.
     cells: Vec<CellIndex>,
 }
 
@@ -39,7 +39,7 @@ impl AlarmGroup {
     }
 }
 
-/// The alarms in their order, those of many cells that differ in nothing but their values as one.
+/// Groups alarms of many cells that differ only in their values; keeps the order.
 pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     let is_alike = |a: &Alarm, b: &Alarm| {
         let kind = |alarm: &Alarm| (alarm.rule, alarm.severity, alarm.state, alarm.is_acknowledged);
@@ -59,7 +59,7 @@ pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     groups
 }
 
-/// The alarm whose value is farthest on the bad side; one without a value only where none has one.
+/// The alarm with the worst value; alarms without a value rank last.
 fn worst(alarms: &[&Alarm]) -> Alarm {
     let badness = |alarm: &Alarm| match (alarm.value, alarm.rule.spec().direction) {
         (None, _) => f64::NEG_INFINITY,
@@ -70,7 +70,7 @@ fn worst(alarms: &[&Alarm]) -> Alarm {
     alarms.iter().fold(first, |worst, alarm| if badness(alarm) > badness(&worst) { **alarm } else { worst })
 }
 
-/// `1-3, 7` from rising numbers, cut where it gets long.
+/// Formats ascending numbers as `1-3, 7`; cuts a long list.
 pub(crate) fn ranges(numbers: impl Iterator<Item = usize>) -> String {
     let mut runs: Vec<(usize, usize)> = Vec::new();
     for number in numbers {
@@ -90,12 +90,12 @@ pub(crate) fn ranges(numbers: impl Iterator<Item = usize>) -> String {
     text
 }
 
-/// A cell's number, from 1, or `pack`.
+/// Cell number from 1, or `pack`.
 pub(crate) fn cell(cell: Option<CellIndex>) -> String {
     cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
 }
 
-/// A value of a rule with its unit; fractions as percent.
+/// A rule's value with its unit; fractions as percent.
 pub(crate) fn with_unit(rule: Rule, value: f64) -> String {
     let unit = rule.spec().unit;
     match unit {
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn many_cells_with_one_alarm_are_one_line_with_the_worst_value() {
+    fn equal_alarms_share_row_with_worst_value() {
         let missing = |cell| alarm(Rule::InputMissing, Some(cell), f64::from(cell));
         let mut alarms = vec![alarm(Rule::SocLow, None, 0.1)];
         alarms.extend((0..96).map(missing));
@@ -139,7 +139,7 @@ mod tests {
         let owners: Vec<String> = groups.iter().map(AlarmGroup::owner).collect();
         assert_eq!(owners, ["pack", "96 cells (1-96)", "cell 4", "cell 6"]);
         assert_eq!((groups[1].alarm.value, groups[1].cells()), (Some(95.0), "96: 1-96".to_owned()));
-        // Another state is another line; of a limit from below the smallest value is the worst.
+        // Alarms in another state get their own row. With a lower limit, the smallest value is the worst.
         let mut low: Vec<Alarm> =
             (0..8).map(|cell| alarm(Rule::CapacityLow, Some(cell), 2.0 - f64::from(cell))).collect();
         low[1].state = AlarmState::Clearing;
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_list_is_cut() {
+    fn long_cell_list_is_cut() {
         assert_eq!(ranges((1..40).step_by(2)), "1, 3, 5, 7, 9, 11, 13, 15, ...");
     }
 }

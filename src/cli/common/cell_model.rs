@@ -1,4 +1,4 @@
-//! The cell model of a record: what was learned, else the configured one.
+//! The cell model of a record: the learned one, else the configured one.
 
 use packwatch_host::failure::Failure;
 
@@ -7,7 +7,7 @@ use crate::config::cell_model::SourcedModel;
 use crate::config::{self, Config};
 use crate::monitor::Snapshot;
 
-/// The cells' model at the end: learned, else that of the configuration.
+/// Returns the cell model at the end of the record: learned, else configured.
 pub(crate) fn cell_model(
     snapshot: Option<&Snapshot>,
     config: Option<&Config>,

@@ -1,4 +1,4 @@
-//! What the commands to a running daemon share: its socket, the selection of alarms, the exchange of the pack.
+//! Shared by the commands to a running daemon: its socket, the selection of alarms, the replacement of the pack.
 
 use std::path::PathBuf;
 
@@ -16,13 +16,13 @@ use crate::quantity::{CellIndex, MAX_CELLS};
 /// The socket of the daemon.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ControlArgs {
-    /// Control socket of the daemon (default: where `packwatch run` creates it)
+    /// Control socket of the daemon [default: where `packwatch run` creates it]
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
 }
 
 impl ControlArgs {
-    /// A client of that socket.
+    /// Returns a client of the socket.
     pub(crate) fn client(&self) -> ControlClient {
         ControlClient::new(self.control.as_deref())
     }
@@ -32,67 +32,64 @@ impl ControlArgs {
 #[derive(Debug, clap::Args)]
 #[group(id = "which", required = true, multiple = true)]
 pub(crate) struct SelectorArgs {
-    /// Alarms of this rule
+    /// Select the alarms of this rule
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true, group = "which")]
     rule: Option<Rule>,
-    /// Alarms of this severity
+    /// Select the alarms of this severity
     #[arg(long, value_parser = severity_parser(), group = "which")]
     severity: Option<Severity>,
-    /// Alarms of this cell, the first is 1
+    /// Select the alarms of this cell, counted from 1
     #[arg(long, value_name = "N", value_parser = cell, group = "which")]
     cell: Option<CellIndex>,
-    /// All alarms
+    /// Select all alarms
     #[arg(long, conflicts_with_all = ["rule", "severity", "cell"], group = "which")]
     all: bool,
 }
 
 impl SelectorArgs {
-    /// The selection, for the daemon.
+    /// Returns the selection for the daemon.
     pub(crate) fn selector(&self) -> Selector {
         Selector { rule: self.rule, severity: self.severity, cell: self.cell }
     }
 }
 
-/// Informs the running daemon that another pack is connected.
+/// Tells the running daemon that another pack is connected.
 pub(crate) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Failure> {
     if !yes {
         return Err(Failure::new(
-            "another pack is connected? then add --yes: the daemon forgets the capacity, the resistance and the other \
-             values it has learned, and the alarms about them, and starts again from the configuration; it writes the \
-             last values of the old pack to its log and events",
+            "not confirmed: add --yes if another pack is connected. The daemon then discards the learned values (capacity, resistance \
+            and others) and the alarms about them, and restarts from the configuration. It writes the last values of the old pack \
+            to its log and events",
         ));
     }
     let done: CommandOutcome = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
-    print(&format!(
-        "the learned values of the old pack are forgotten; alarms about it that ended: {}\n",
-        done.changed
-    ))?;
+    print(&format!("discarded the learned values of the old pack; alarms ended: {}\n", done.changed))?;
     check_stored(&done)
 }
 
-/// A failure when what the command has changed is not on the disk.
+/// Fails if the change is not yet on disk.
 pub(crate) fn check_stored(done: &CommandOutcome) -> Result<(), Failure> {
     if done.is_stored != Some(false) {
         return Ok(());
     }
     Err(Failure::new(
-        "done, but not on the disk yet: a power cut now would undo it; the daemon stores it when the disk answers again \
-         (`packwatch status`)",
+        "changed, but not stored yet: a power cut now would undo the change. The daemon stores it when the disk works again; \
+        see `packwatch status`",
     ))
 }
 
-/// Parses a rule's name; an unknown one gets the list of names and the nearest.
+/// Parses a rule's name; the error for an unknown name lists all names and the nearest.
 pub(crate) fn rule_parser() -> impl TypedValueParser<Value = Rule> {
-    let find = |name: String| Rule::ALL.into_iter().find(|rule| rule.name() == name).ok_or("no such rule");
+    let find = |name: String| Rule::ALL.into_iter().find(|rule| rule.name() == name).ok_or("unknown rule");
     PossibleValuesParser::new(Rule::ALL.map(Rule::name)).try_map(find)
 }
 
 fn severity_parser() -> impl TypedValueParser<Value = Severity> {
-    let find = |name: String| Severity::ALL.into_iter().find(|known| known.name() == name).ok_or("no such one");
+    let find = |name: String| Severity::ALL.into_iter().find(|known| known.name() == name).ok_or("unknown severity");
     PossibleValuesParser::new(Severity::ALL.map(Severity::name)).try_map(find)
 }
 
 fn cell(text: &str) -> Result<CellIndex, String> {
     let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
-    number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell's number, 1 to {MAX_CELLS}"))
+    number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell number, 1 to {MAX_CELLS}"))
 }

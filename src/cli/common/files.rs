@@ -1,4 +1,4 @@
-//! Files that describe signals: read, and named in a configuration.
+//! Reads files that describe signals, and names them in a configuration.
 
 use std::path::Path;
 
@@ -7,20 +7,20 @@ use packwatch_host::failure::Failure;
 use super::output::named;
 use crate::can::dbc::Database;
 
-/// Largest file read; the largest known signal set has 0.5 MB.
+/// Largest file read, bytes; the largest known signal set has 0.5 MB.
 const MAX_BYTES: u64 = 64 << 20;
 
-/// A DBC file, read.
+/// Reads a DBC file.
 pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     let bytes = std::fs::read(file).map_err(|error| unreadable(file, &error))?;
     Database::parse_bytes(&bytes).map_err(|error| named(file, error))
 }
 
-/// The text of a file of reasonable size.
+/// Reads a text file of at most [`MAX_BYTES`].
 pub(crate) fn read(file: &Path) -> Result<String, Failure> {
     let bytes = std::fs::metadata(file).map_err(|error| unreadable(file, &error))?.len();
     if bytes > MAX_BYTES {
-        return Err(named(file, format!("has {bytes} bytes, must be at most {MAX_BYTES}")));
+        return Err(named(file, format!("{bytes} bytes, must be at most {MAX_BYTES}")));
     }
     std::fs::read_to_string(file).map_err(|error| unreadable(file, &error))
 }
@@ -29,7 +29,7 @@ fn unreadable(file: &Path, error: &std::io::Error) -> Failure {
     named(file, format!("cannot be read: {error}"))
 }
 
-/// A file as a configuration beside it names it: by its name in the same folder, otherwise by its whole path.
+/// Returns how a configuration names a file: by its file name if both share a folder, else by its full path.
 pub(crate) fn named_from(config: &Path, file: &Path) -> Result<String, Failure> {
     let whole = |path: &Path| std::path::absolute(path).map_err(|error| named(path, error));
     let (config, file) = (whole(config)?, whole(file)?);

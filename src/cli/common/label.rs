@@ -1,30 +1,30 @@
-//! A cell by what is on its label, on the command line.
+//! Arguments that describe a cell by the data on its label.
 
 use super::numbers::above_0;
 use crate::cell::{Chemistry, Label};
 #[cfg(feature = "lab")]
 use crate::lab::single_cell::LabelKeys;
 
-/// A cell without a model.
+/// A cell without a model file.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Label, instead of a cell model")]
+#[command(next_help_heading = "Cell label (instead of a cell model)")]
 pub(crate) struct LabelArgs {
-    /// Chemistry on the label, as in [pack] chemistry
+    /// Chemistry on the label, as in `pack.chemistry`
     #[arg(long, value_parser = one_of_chemistries(), requires = "rated", conflicts_with = "config")]
     pub(crate) chemistry: Option<String>,
     /// Capacity on the label, Ah
     #[arg(long, value_name = "AH", value_parser = above_0, requires = "chemistry")]
     pub(crate) rated: Option<f64>,
-    /// Lowest voltage [default: usual of the chemistry]
+    /// Lowest voltage [default: typical of the chemistry]
     #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
     pub(crate) voltage_min: Option<f64>,
-    /// Highest voltage [default: usual of the chemistry]
+    /// Highest voltage [default: typical of the chemistry]
     #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
     pub(crate) voltage_max: Option<f64>,
 }
 
 impl LabelArgs {
-    /// The label; `None` without a chemistry.
+    /// Returns the label; `None` without a chemistry.
     pub(crate) fn label(&self) -> Option<Label> {
         let name = self.chemistry.as_ref()?;
         let (chemistry, _) = Chemistry::ALL.into_iter().find(|(_, known)| known == name)?;
@@ -39,7 +39,7 @@ impl LabelArgs {
 
 #[cfg(feature = "lab")]
 impl LabelArgs {
-    /// The keys of [pack] that they stand for; `None` without a chemistry.
+    /// Returns the keys of `[pack]` with the same meaning; `None` without a chemistry.
     pub(crate) fn keys(&self) -> Option<LabelKeys> {
         Some(LabelKeys {
             chemistry: self.chemistry.clone()?,
@@ -50,7 +50,7 @@ impl LabelArgs {
     }
 }
 
-/// The names of chemistries.
+/// Accepts the names of chemistries.
 pub(crate) fn one_of_chemistries() -> clap::builder::PossibleValuesParser {
     Chemistry::ALL.map(|(_, name)| name).into()
 }

@@ -1,4 +1,4 @@
-//! Arguments shared by the commands that read logs: how to read them.
+//! Arguments shared by the commands that read logs.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::io::log::LogOptions;
 use crate::replay::{LogReading, SLEEP_GAP_S};
 
-/// Which way a CSV's positive current flows.
+/// Direction of positive current in a CSV.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum CsvSign {
     /// Positive is discharge
@@ -16,28 +16,28 @@ pub(crate) enum CsvSign {
     Charge,
 }
 
-/// How logs are read.
+/// Options for reading logs.
 #[derive(Debug, clap::Args)]
 pub(crate) struct InputArgs {
-    /// End at the first malformed line
+    /// Stop with an error at the first malformed line
     #[arg(long)]
     pub(crate) strict: bool,
-    /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
+    /// Treat a gap longer than this as sleep of the recorder: no ticks, no frames
     #[arg(long, value_name = "S", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
-    /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
-    /// the letter n in braces in the names stands for the number of the cell or sensor, from 1
+    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section; an empty NAME
+    /// means that the column does not exist. {n} in both stands for the number of the cell or sensor, from 1
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
-    /// Sign of a CSV's current
+    /// Direction of positive current in a CSV
     #[arg(long, value_enum, default_value = "discharge")]
     pub(crate) csv_sign: CsvSign,
-    /// CSV table with the section's column and `start`, which makes stamps absolute
+    /// CSV table with the section column and a column `start`, which makes the times absolute
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) start_times: Option<PathBuf>,
 }
 
-/// How logs are read with a configuration.
+/// Returns the options for reading logs with a configuration.
 pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let reading = LogReading {
         strict: args.strict,
@@ -50,12 +50,12 @@ pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
 
 pub(crate) fn column(text: &str) -> Result<(String, String), String> {
     const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
-    let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
+    let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME, for example current=Current(A)")?;
     if !ROLES.contains(&role) {
         return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));
     }
     if role.ends_with("{n}") != name.contains("{n}") {
-        return Err("{n} must be in role and column, or in neither".to_owned());
+        return Err("{n} must be in both ROLE and NAME, or in neither".to_owned());
     }
     Ok((role.to_owned(), name.to_owned()))
 }

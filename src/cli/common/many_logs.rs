@@ -1,4 +1,4 @@
-//! Arguments shared by the commands over many logs: the logs, how to read them, progress.
+//! Arguments shared by the commands over many logs: the logs, reading options, progress.
 
 use std::path::{Path, PathBuf};
 
@@ -12,28 +12,28 @@ use crate::config::Config;
 use crate::io::log::LogSource;
 use crate::lab::fleet::{OpenedLog, truth};
 
-/// The logs and how they are read.
+/// Logs and reading options.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Logs")]
 pub(crate) struct LogArgs {
-    /// Journals, candump logs or CSV files, also .gz or .zst; each is a life or a trip of its own
+    /// Journals, candump logs or CSV files, also .gz or .zst; each is a separate life or trip
     #[arg(required = true, value_name = "LOG")]
     pub(crate) logs: Vec<PathBuf>,
     #[command(flatten)]
     input: InputArgs,
-    /// Threads (default: one per core)
+    /// Number of threads [default: one per core]
     #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
 }
 
 impl LogArgs {
-    /// Checks the arguments that depend on each other.
+    /// Checks arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         check_distinct(&self.logs)?;
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
             return Err(Failure::new(format!(
-                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv next to each log works as well"
+                "--start-times: {found} logs given, must be 1; for several logs, place NAME_cycles.csv next to each"
             )));
         }
         if self.logs.len() > 1 && self.is_stdin() {
@@ -42,27 +42,27 @@ impl LogArgs {
         Ok(())
     }
 
-    /// Opens logs, one recording after the other, as they are read with a configuration.
+    /// Opens logs as one record, read with a configuration.
     pub(crate) fn open(&self, config: &Config, logs: &[PathBuf]) -> OpenedLog {
         open(&self.input, config, logs)
     }
 
-    /// A gap longer than this means that the recorder was asleep, s.
+    /// Gap that counts as sleep of the recorder, s.
     pub(crate) fn sleep_gap_s(&self) -> f64 {
         self.input.sleep_gap
     }
 
-    /// Whether the log is standard input, which is read once only.
+    /// Whether the log is standard input, which can be read only once.
     pub(crate) fn is_stdin(&self) -> bool {
         self.logs.iter().any(|log| log == Path::new("-"))
     }
 
-    /// Number of threads; `None` = one per core.
+    /// Number of threads; `None` means one per core.
     pub(crate) fn threads(&self) -> Option<usize> {
         self.jobs.map(usize::from)
     }
 
-    /// Progress in bytes, each log read `times`.
+    /// Creates a progress bar in bytes, for logs that are read `times` times.
     pub(crate) fn bar(&self, times: usize) -> ProgressBar {
         let size = |path: &PathBuf| std::fs::metadata(path).map_or(0, |meta| meta.len());
         let total = self.logs.iter().map(size).sum::<u64>() * times as u64;
@@ -70,10 +70,10 @@ impl LogArgs {
     }
 }
 
-/// Opens logs, one recording after the other, as they are read with a configuration.
+/// Opens logs as one record, read with a configuration.
 pub(crate) fn open(input: &InputArgs, config: &Config, logs: &[PathBuf]) -> OpenedLog {
     let mut options = log_options(input, config);
-    // A table of cycles dates one log.
+    // A table of cycles gives the times of a single log.
     let found = logs.first().filter(|_| options.csv.start_times.is_none() && logs.len() == 1);
     let found = found.and_then(|log| truth::cycles_next_to(log));
     let note = found.as_ref().map(|table| format!("dated by {}", table.display()));

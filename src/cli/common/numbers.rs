@@ -1,4 +1,4 @@
-//! Parsers of arguments: numbers, and names that stand for a value; each error names the allowed ones.
+//! Argument parsers for numbers and named values. Each error says what is allowed.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
@@ -7,12 +7,12 @@ use crate::monitor::Downtime;
 /// A name, its value, and its line in the help.
 pub(crate) type NamedValue<T> = (&'static str, T, &'static str);
 
-/// One of these values, by its name.
+/// Accepts the name of one of these values.
 pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [NamedValue<T>],
 ) -> impl TypedValueParser<Value = T> {
     let names = all.iter().map(|(name, _, help)| PossibleValue::new(*name).help(*help));
-    let find = |name: String| all.iter().find(|known| known.0 == name).map(|known| known.1).ok_or("no such name");
+    let find = |name: String| all.iter().find(|known| known.0 == name).map(|known| known.1).ok_or("unknown name");
     PossibleValuesParser::new(names).try_map(find)
 }
 
@@ -21,18 +21,18 @@ pub(crate) fn finite(text: &str) -> Result<f64, String> {
     within(text, |_| true, "a finite number")
 }
 
-/// A finite number that `is_allowed`; the error says `allowed`.
+/// A finite number accepted by `is_allowed`; the error says `allowed`.
 pub(crate) fn within(text: &str, is_allowed: impl Fn(f64) -> bool, allowed: &str) -> Result<f64, String> {
     let value = text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && is_allowed(*value));
     value.ok_or_else(|| format!("must be {allowed}"))
 }
 
-/// A number from `low` to `high`; the error begins with `what`.
+/// A number from `low` to `high`; `what` precedes the range in the error.
 pub(crate) fn between(low: f64, high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| within(text, |value| (low..=high).contains(&value), &format!("{what}{low} to {high}"))
 }
 
-/// A number above 0, at most `high`; the error begins with `what`.
+/// A number above 0 and at most `high`; `what` precedes the range in the error.
 pub(crate) fn above_0_to(high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| within(text, |value| value > 0.0 && value <= high, &format!("{what}above 0, at most {high}"))
 }
@@ -43,7 +43,7 @@ pub(crate) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<u
     number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }
 
-/// Longest time of an option, s: ten years.
+/// Longest duration of an option, s: ten years.
 pub(crate) const MAX_SECONDS: f64 = 315_576_000.0;
 
 /// Parses the age of a stored state.
@@ -56,16 +56,16 @@ pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     }
 }
 
-/// A size in bytes: a whole number, with B, KiB, MiB or GiB behind it where it is not bytes.
+/// A size in bytes: a whole number, optionally followed by B, KiB, MiB or GiB.
 pub(crate) fn bytes(text: &str) -> Result<u64, String> {
     let units = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("B", 0)];
     let unit = units.into_iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, shift)));
     let (number, shift) = unit.unwrap_or((text, 0));
     let size = number.trim_end().parse::<u64>().ok().and_then(|number| number.checked_mul(1 << shift));
-    size.ok_or_else(|| "must be a whole number of bytes, or one with KiB, MiB or GiB, as 64MiB".to_owned())
+    size.ok_or_else(|| "must be a whole number of bytes, or one with KiB, MiB or GiB, for example 64MiB".to_owned())
 }
 
-/// A number above 0, also without an end.
+/// A number above 0; infinity is allowed.
 pub(crate) fn positive(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|e| format!("{e}"))?;
     if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) }
@@ -86,10 +86,10 @@ pub(crate) fn share(text: &str) -> Result<f64, String> {
     within(text, |value| (0.0..=1.0).contains(&value), "0 to 1")
 }
 
-/// Per cent above 0, at most 100; a per cent sign may follow.
+/// A percentage above 0 and at most 100; a percent sign may follow.
 pub(crate) fn percent(text: &str) -> Result<f64, String> {
     let digits = text.trim().trim_end_matches('%');
-    within(digits, |value| value > 0.0 && value <= 100.0, "per cent above 0, at most 100")
+    within(digits, |value| value > 0.0 && value <= 100.0, "a percentage above 0, at most 100")
 }
 
 #[cfg(test)]
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_have_binary_units_and_others_are_refused() {
+    fn size_accepts_binary_units_only() {
         let sizes = ["4096", "64MiB", "2 GiB", "1KiB", "7B"].map(|text| bytes(text).expect("a size"));
         assert_eq!(sizes, [4096, 64 << 20, 2 << 30, 1024, 7]);
         for text in ["", "MiB", "1.5GiB", "-1", "2GB", "99999999999999GiB"] {

@@ -1,7 +1,7 @@
-//! Output shared by the offline commands: tables, JSON documents, result folders, failures.
+//! Output shared by the commands: tables, JSON documents, result folders, errors.
 //!
 //! Tables and documents go to the writer given or to standard output.
-//! A reader that closes standard output early (`| head`) is no failure.
+//! If the reader closes standard output early (`| head`), the command still succeeds.
 
 use std::fmt::Display;
 use std::io::{self, Write};
@@ -14,17 +14,17 @@ use packwatch_host::failure::Failure;
 
 pub(crate) use crate::io::text_table::text_table as table;
 
-/// A failure of the work with this error's text.
+/// Makes a general failure from an error.
 pub(crate) fn failure(error: impl Display) -> Failure {
     Failure::new(error.to_string())
 }
 
-/// A failure about a file or folder.
+/// Makes a failure about a file or folder.
 pub(crate) fn named(path: &Path, what: impl Display) -> Failure {
     Failure::new(format!("{}: {what}", path.display()))
 }
 
-/// Ignores that the output was closed.
+/// Ignores the error of a closed output.
 pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
@@ -35,11 +35,10 @@ pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
 /// Writes to standard output.
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
     let written = io::stdout().write_all(text.as_bytes());
-    unless_closed(written)
-        .map_err(|failure| Failure::new(format!("standard output cannot be written: {}", failure.message)))
+    unless_closed(written).map_err(|failure| Failure::new(format!("standard output: {}", failure.message)))
 }
 
-/// A value of an enumeration, as in JSON.
+/// Name of an enumeration value, as in JSON.
 pub(crate) fn word(value: impl serde::Serialize) -> String {
     match serde_json::to_value(value) {
         Ok(serde_json::Value::String(word)) => word,
@@ -54,7 +53,7 @@ pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     writeln!(out)
 }
 
-/// Writes such a [`table`].
+/// Writes a [`table`].
 pub(crate) fn write_table<H: AsRef<str>>(
     out: &mut impl Write,
     heads: &[H],

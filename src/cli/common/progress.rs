@@ -1,4 +1,4 @@
-//! Progress bars on standard error, when that is a terminal.
+//! Progress bars on standard error, if that is a terminal.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -7,12 +7,12 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::replay::ReplayProgress;
 
-/// Progress on standard error, when that is a terminal.
+/// Progress on standard error, if that is a terminal.
 #[derive(Debug)]
 pub(crate) struct Bar(ProgressBar);
 
 impl Bar {
-    /// A bar for logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
+    /// Creates a bar over the total size of the logs. If a size is unknown (standard input), the bar has no end.
     pub(crate) fn new(logs: &[PathBuf]) -> Self {
         Self(bar(logs))
     }
@@ -28,7 +28,7 @@ impl Bar {
         self.0.set_position(progress.bytes);
     }
 
-    /// Seconds since it was made, above 0.
+    /// Seconds since the bar was created, above 0.
     pub(crate) fn seconds(&self) -> f64 {
         self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64()
     }
@@ -39,7 +39,7 @@ impl Bar {
     }
 }
 
-/// A bar over the sizes of logs; without an end where one has no size.
+/// Creates a bar over the sizes of logs, without an end if a size is unknown.
 pub(crate) fn bar(logs: &[PathBuf]) -> ProgressBar {
     let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
     let total: Option<u64> = logs.iter().map(size).sum();
@@ -50,7 +50,7 @@ pub(crate) fn bar(logs: &[PathBuf]) -> ProgressBar {
     progress_bar(total, template)
 }
 
-/// A progress bar over `total` units, if they are known.
+/// Creates a progress bar over `total` units; `None` means unknown.
 pub(crate) fn progress_bar(total: impl Into<Option<u64>>, template: &str) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(total.into(), ProgressDrawTarget::stderr_with_hz(5));
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))

@@ -1,4 +1,4 @@
-//! Logs replayed for a page about them: what was seen, and the state at their end.
+//! Replays logs for a page about them: statistics, and the state at the end.
 
 use std::path::PathBuf;
 
@@ -12,15 +12,15 @@ use crate::io::log::LogSource;
 use crate::monitor::{Monitor, Snapshot};
 use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
 
-/// A record that was replayed.
+/// Result of a replay.
 pub(crate) struct Replayed {
     pub(crate) source: LogSource,
     pub(crate) summary: ReplaySummary,
-    /// The last state; `None` = the logs have no reading.
+    /// The last state; `None` if the logs have no readings.
     pub(crate) snapshot: Option<Snapshot>,
 }
 
-/// Replays logs as one record, as fast as possible, with progress.
+/// Replays logs as one record at full speed, with a progress bar.
 pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks: Sinks) -> Result<Replayed, Failure> {
     let mut source = LogSource::new(logs.to_owned(), log_options(input, config));
     let plain = ReplaySettings::plain(input.sleep_gap, config.interface_names());

@@ -1,11 +1,11 @@
-//! Another ECU: decodes received frames by their DBC alone.
+//! The receiving ECU: decodes frames with their DBC alone.
 
 use crate::alarm::Rule;
 use crate::can::Frame;
 use crate::can::dbc::{Database, Message, Signal};
 use packwatch_host::failure::Failure;
 
-/// Reads frames by a DBC.
+/// Decodes frames with a DBC.
 pub(super) struct Consumer {
     database: Database,
     unknown_frames: u64,
@@ -17,17 +17,17 @@ impl Consumer {
         Ok(Self { database, unknown_frames: 0 })
     }
 
-    /// Takes a frame; counts it if the DBC does not have it.
+    /// Handles a received frame; counts it if the DBC does not define it.
     pub(super) fn receive(&mut self, frame: &Frame) {
         self.unknown_frames += u64::from(self.message(frame).is_none());
     }
 
-    /// Number of frames that the DBC does not have.
+    /// Number of frames that the DBC does not define.
     pub(super) fn unknown_frames(&self) -> u64 {
         self.unknown_frames
     }
 
-    /// Whether the frame says that `rule` has raised an alarm.
+    /// Whether the frame reports a raised alarm of `rule`.
     pub(super) fn is_alarm(&self, frame: &Frame, rule: Rule) -> bool {
         let value = |name: &str| {
             let signal = self.message(frame)?.signal(name)?;
@@ -36,7 +36,7 @@ impl Consumer {
         value("Rule") == Some(f64::from(rule as u8)) && value("State") == Some(1.0)
     }
 
-    /// Every signal of the frame in words: `Message: Signal value unit, ...`.
+    /// Formats every signal of the frame: `Message: Signal value unit, ...`.
     pub(super) fn explain(&self, frame: &Frame) -> String {
         let Some(message) = self.message(frame) else { return "not in the DBC".to_owned() };
         let present = message.signals.iter().filter(|signal| is_present(message, signal, frame.data()));

@@ -1,9 +1,9 @@
-//! The demo's table: one row per cycle, and on a terminal a live row below them, redrawn in place.
+//! The demo's table: one row per cycle and, on a terminal, a live row redrawn below them.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
 
-/// Erases the line.
+/// Escape sequence that erases the line.
 const ERASE_LINE: &str = "\r\x1b[K";
 
 /// Writes rows to standard output.
@@ -22,14 +22,14 @@ impl Table {
         Self { live: io::stdout().is_terminal(), has_head: false }
     }
 
-    /// A row that stays.
+    /// Writes a permanent row.
     pub(super) fn keep(&mut self, row: &str) -> io::Result<()> {
         self.head()?;
         let start = if self.live { ERASE_LINE } else { "" };
         writeln!(io::stdout(), "{start}{}", row)
     }
 
-    /// The live row; nothing without a terminal.
+    /// Redraws the live row; does nothing if the output is not a terminal.
     pub(super) fn redraw(&mut self, row: &str) -> io::Result<()> {
         if !self.live {
             return Ok(());
@@ -37,12 +37,12 @@ impl Table {
         self.head()?;
         write!(io::stdout(), "{ERASE_LINE}{}", row)?;
         io::stdout().flush()?;
-        // So that a reader can follow.
+        // Slow enough to be read.
         std::thread::sleep(Duration::from_millis(20));
         Ok(())
     }
 
-    /// Removes the live row.
+    /// Erases the live row.
     pub(super) fn close(&self) -> io::Result<()> {
         if self.live { write!(io::stdout(), "{ERASE_LINE}") } else { Ok(()) }
     }

@@ -1,4 +1,4 @@
-//! What the differences between the cells cost the pack, as JSON: fractions of the mean cell's capacity, Ah and kWh of one string.
+//! Loss of pack capacity due to differences between cells, as JSON: fractions of the mean cell capacity, Ah and kWh of one string.
 
 use serde::Serialize;
 
@@ -10,7 +10,7 @@ use crate::filter::ScalarGaussian;
 use crate::io::stamp::format_utc;
 use crate::lab::pack_view::energy_kwh;
 
-/// The pack; what is not known is `null`, with the reason.
+/// The pack; unknown values are `null`, with the reason.
 #[derive(Debug, Serialize)]
 pub(super) struct PackPage {
     unknown: Option<String>,
@@ -18,7 +18,7 @@ pub(super) struct PackPage {
     known: Option<Known>,
 }
 
-/// Cells are counted from 1.
+/// Known values; cells count from 1.
 #[derive(Debug, Serialize)]
 struct Known {
     time: String,

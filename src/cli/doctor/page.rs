@@ -7,7 +7,7 @@ use crate::cli::common::output;
 use crate::wiring::{Change, Severity, WiringFinding, WiringReport};
 use packwatch_host::failure::Failure;
 
-/// Where the text of a finding begins.
+/// Column where the text of a finding begins.
 const INDENT: usize = 10;
 
 /// Whether text is coloured.
@@ -50,7 +50,7 @@ fn render(report: &WiringReport, config: &Path, source: &str, width: usize, pain
     page
 }
 
-/// The new line; a description where only a person can know the value.
+/// The proposed line; a description if only a person can know the value.
 fn proposal(change: &Change) -> String {
     let line = format!("{} = {}", change.key, change.proposed);
     if toml::from_str::<toml::Table>(&line).is_ok() {
@@ -64,10 +64,10 @@ fn proposal(change: &Change) -> String {
 fn summary(report: &WiringReport) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
     let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
-    const CONSEQUENCES: &str = "Begin with the first: the others may be its consequences.";
+    const CONSEQUENCES: &str = "Start with the first; it may cause the others.";
     match (count(Severity::Error), count(Severity::Warning)) {
-        (0, 0) if report.frames == 0 => "No frame was received.".to_owned(),
-        (0, 0) => "Nothing is wrong as far as this can be judged.".to_owned(),
+        (0, 0) if report.frames == 0 => "No frames were received.".to_owned(),
+        (0, 0) => "No faults found in what could be judged.".to_owned(),
         (errors, 0) => format!("{}. {CONSEQUENCES}", many(errors, "error")),
         (0, warnings) => format!("{}.", many(warnings, "warning")),
         (errors, warnings) => {
@@ -95,7 +95,7 @@ fn show(finding: &WiringFinding, width: usize, paint: Paint, page: &mut String) 
     consequences(&finding.consequences, width, paint, page);
 }
 
-/// Findings below a finding; of many the first few.
+/// Consequences of a finding; a long list is cut.
 fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     let shown = titles.iter().take(SHOWN).map(String::as_str).collect::<Vec<_>>().join("; ");
@@ -107,7 +107,7 @@ fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String
     page.push_str(&format!("{}{}\n", paint.dim(&format!("  {:8}", "below")), wrapped(&text, width, INDENT)));
 }
 
-/// Lines to change; of many the first few.
+/// Lines to change; a long list is cut.
 fn changes(changes: &[Change], paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     for change in changes.iter().take(SHOWN) {
@@ -135,7 +135,7 @@ fn list(heading: &str, lines: &[String], width: usize, paint: Paint, page: &mut 
     }
 }
 
-/// The text in lines of at most `width`, all but the first indented.
+/// Wraps text to at most `width`; indents all lines but the first.
 fn wrapped(text: &str, width: usize, indent: usize) -> String {
     let mut lines: Vec<String> = vec![String::new()];
     for word in text.split_whitespace() {
@@ -164,13 +164,13 @@ mod tests {
     }
 
     #[test]
-    fn a_line_to_paste_is_distinguished_from_one_that_needs_a_person() {
+    fn proposal_without_single_value_is_description() {
         assert_eq!(proposal(&change("90")), "+ cells = 90");
         assert_eq!(proposal(&change("85 to 131")), "+ cells = ... (85 to 131)");
     }
 
     #[test]
-    fn text_is_wrapped_with_its_indent_and_no_word_is_lost() {
+    fn wrapped_text_is_indented_and_complete() {
         let text = "one two three four five";
         let lines = wrapped(text, 14, 4);
         assert!(lines.lines().all(|line| line.chars().count() <= 14), "{lines}");
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_consequences_the_first_are_shown_and_the_rest_counted() {
+    fn long_list_of_consequences_is_cut_and_counted() {
         let mut report = WiringReport::default();
         let mut finding = WiringFinding::new(Severity::Error, Topic::Layout, "off");
         finding.consequences = (1..=30).map(|n| format!("cell {n} is odd")).collect();
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_changes_the_first_are_shown_and_the_rest_counted() {
+    fn long_list_of_changes_is_cut_and_counted() {
         let mut report = WiringReport::default();
         let mut finding = WiringFinding::new(Severity::Error, Topic::Unit, "off");
         finding.changes = vec![change("1"); 12];

@@ -17,7 +17,7 @@ pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
     bar.tick();
 }
 
-/// Prints residuals per file, notes, what the model is good for, and the end of the fit.
+/// Prints residuals per file, notes, the verdict on the model, and the result of the fit.
 pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Result<()> {
     let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
     let width = names.iter().map(String::len).max().unwrap_or(0).max(5);

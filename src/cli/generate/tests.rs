@@ -1,11 +1,11 @@
-//! Pages and completions against the command line.
+//! Checks manual pages and completions against the command line.
 
 use clap::CommandFactory as _;
 
 use super::*;
 use crate::cli::Cli;
 
-/// Names of all shown commands, each followed by its subcommands: `history`, `history-verify`.
+/// Names of all visible commands, each followed by its subcommands: `history`, `history-verify`.
 fn commands() -> Vec<String> {
     fn add(of: &clap::Command, before: &str, names: &mut Vec<String>) {
         for command in of.get_subcommands().filter(|command| !command.is_hide_set()) {
@@ -20,7 +20,7 @@ fn commands() -> Vec<String> {
 }
 
 #[test]
-fn every_command_has_a_page_and_hidden_ones_have_none() {
+fn visible_commands_have_page_and_hidden_have_none() {
     let names: Vec<String> = manual_pages(&Cli::command()).into_iter().map(|(name, _)| name).collect();
     let mut wanted = vec!["packwatch.toml.5".to_owned(), "packwatch.1".to_owned()];
     wanted.extend(commands().iter().map(|name| format!("packwatch-{name}.1")));
@@ -29,7 +29,7 @@ fn every_command_has_a_page_and_hidden_ones_have_none() {
 }
 
 #[test]
-fn pages_show_the_usage_of_a_command_and_name_the_others() {
+fn page_shows_usage_and_names_other_pages() {
     let pages = manual_pages(&Cli::command());
     let text = |name: &str| {
         let page = pages.iter().find(|(of, _)| of == name).map(|(_, text)| text.clone());
@@ -39,14 +39,14 @@ fn pages_show_the_usage_of_a_command_and_name_the_others() {
     assert!(run.contains("\\fBpackwatch run\\fR") && run.contains("\\-\\-config"), "{run}");
     let whole = text("packwatch.1");
     assert!(whole.contains("packwatch\\-alarms(1)") && !whole.contains("generate"), "{whole}");
-    // In the order of man-pages(7), and not of itself.
+    // In the order of man-pages(7); a page does not refer to itself.
     let files = whole.find(".SH FILES").unwrap_or(usize::MAX);
     assert!(whole.find(".SH SEE ALSO").is_some_and(|at| at > files) && !whole.contains(".BR packwatch (1)"), "{whole}");
     assert!(run.contains(".BR packwatch (1)"), "{run}");
 }
 
 #[test]
-fn completions_know_every_command_and_nothing_hidden() {
+fn completions_list_visible_commands_only() {
     for shell in Shell::value_variants().iter().copied() {
         let text = String::from_utf8(completions(shell, &Cli::command())).unwrap_or_default();
         for name in Cli::command().get_subcommands().filter(|c| !c.is_hide_set()).map(clap::Command::get_name) {

@@ -7,36 +7,36 @@ use crate::cli::common::numbers::{NamedValue, above_0, above_0_to, finite, fract
 use crate::lab::score::{ScoreRequest, Start};
 use crate::lab::single_cell::CellSource;
 
-/// Where in a file the estimator starts.
+/// Start of the estimator within a file.
 const STARTS: [NamedValue<Start>; 2] = [
-    ("full", Start::Full, "At the file's first row"),
-    ("middle", Start::Middle, "Where --remove has been taken out; the rows before are dropped"),
+    ("full", Start::Full, "At the first row of the file"),
+    ("middle", Start::Middle, "Where --remove has been discharged; earlier rows are skipped"),
 ];
 
-/// Error of the initial SOC, points; `None` = no initial SOC is given.
+/// Error of the initial SOC, points; `None` if no initial SOC is given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 
 /// Arguments of `score`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "The truth of the SOC is 1 - discharged_ah / C, with the cycler's own counter and one C for all \
-                        files (--truth-capacity). Every list makes more cases: each file is run in every combination. \
-                        Statistics count every sample after --settle once."
+    after_help = "The true SOC is 1 - discharged_ah / C, from the cycler's own counter, with one C for all files \
+    (--truth-capacity). Every list adds cases: each file runs in every combination. Statistics count every \
+    sample after --settle once."
 )]
 pub(crate) struct Args {
     /// Measured files: CSV (.gz, .zst) with time_s, current_a (positive = discharge), voltage_v, temperature_c, discharged_ah
     #[arg(required = true, value_name = "FILE")]
     pub(crate) files: Vec<PathBuf>,
-    /// Configuration of one cell, with the input signals of measured.dbc; a built-in one with every estimator key at its default when not given
+    /// Configuration of one cell with the input signals of measured.dbc [default: a built-in one with default estimator keys]
     #[arg(short, long, value_name = "FILE.toml", required_unless_present_any = ["cell", "chemistry"])]
     pub(crate) config: Option<PathBuf>,
-    /// Cell model, instead of the configuration's
+    /// Cell model to use instead of the configured one
     #[arg(long, value_name = "MODEL.toml")]
     pub(crate) cell: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) label: LabelArgs,
-    /// Measured files that the monitor has seen before, in this order: each scored file continues from what they have taught
+    /// Measured files that the monitor replays first, in this order; each scored file starts from the state learned there
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "cycles")]
     pub(crate) learn: Vec<PathBuf>,
     #[command(flatten)]
@@ -49,32 +49,32 @@ pub(crate) struct Args {
     pub(crate) output: OutputArgs,
 }
 
-/// Starts of the estimator.
+/// Initial values of the estimator.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Starts")]
 pub(crate) struct StartArgs {
-    /// Where in each file the estimator starts
+    /// Start of the estimator within each file
     #[arg(long, value_parser = one_of(&STARTS), value_delimiter = ',', default_value = "full")]
     pub(crate) start: Vec<Start>,
-    /// Part of the full charge already taken out where a start in the middle begins
+    /// Fraction of the full charge that is discharged before a start in the middle
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction)]
     pub(crate) remove: f64,
-    /// Error of the initial SOC given to the estimator, points (-20: 20 points below the truth); "none": no SOC is given and
-    /// it starts from its first voltage
+    /// Error of the initial SOC given to the estimator, points; -20 is 20 points below the truth. With none, no SOC is given and
+    /// the estimator starts from its first voltage
     #[arg(long = "told", value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
           allow_hyphen_values = true)]
     pub(crate) soc_error: Vec<InitialSocError>,
-    /// Standard deviation of the initial SOC, points; when not given, as large as the error and 5 at least
+    /// Standard deviation of the initial SOC, points [default: the size of the error, at least 5]
     #[arg(long, value_name = "POINTS", value_parser = above_0_to(100.0, ""))]
     pub(crate) soc_std: Option<f64>,
-    /// Error of the capacity the estimator starts with, percent of the model's
+    /// Error of the initial capacity, percent of the model's capacity
     #[arg(long, value_name = "PERCENT", value_delimiter = ',', default_value = "0", value_parser = capacity_error,
           allow_hyphen_values = true)]
     pub(crate) capacity_error: Vec<f64>,
-    /// Standard deviation that goes with it, percent of the model's; the configuration's when not given
+    /// Standard deviation of the initial capacity, percent of the model's capacity [default: from the configuration]
     #[arg(long, value_name = "PERCENT", value_parser = above_0_to(100.0, ""))]
     pub(crate) capacity_std: Option<f64>,
-    /// Offset of the current sensor, A: added to every measured current before the estimator sees it
+    /// Offset added to every current reading, A
     #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = finite,
           allow_hyphen_values = true)]
     pub(crate) current_offset: Vec<f64>,
@@ -84,13 +84,13 @@ pub(crate) struct StartArgs {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Truth and statistics")]
 pub(crate) struct StatisticsArgs {
-    /// Time after the start without statistics: 600, 600s, 10min or 1h
+    /// Time after the start that is left out of the statistics: 600, 600s, 10min or 1h
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration)]
     pub(crate) settle: f64,
-    /// Charge from full to empty that the truth is stated in, Ah; the cell model's capacity_ah when not given
+    /// Charge from full to empty that defines the true SOC, Ah [default: capacity_ah of the cell model]
     #[arg(long, value_name = "AH", value_parser = above_0)]
     pub(crate) truth_capacity: Option<f64>,
-    /// A gap in a file longer than this means that the recorder was asleep, s
+    /// Treat a gap longer than this as sleep of the recorder, s
     #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0)]
     pub(crate) sleep_gap: f64,
 }
@@ -99,21 +99,21 @@ pub(crate) struct StatisticsArgs {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Cell lives")]
 pub(crate) struct LifeArgs {
-    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the files' order; charge taken
-    /// at a held voltage after the load counts off
+    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the same order. The charge
+    /// delivered while the voltage is held at the end of a discharge is subtracted
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) cycles: Vec<PathBuf>,
-    /// Load at which the table's capacities were measured, A, degrees C, V: 2,24,2.7; the configuration's [usable] when not given
+    /// Load at which the published capacities were measured, in A, degrees C and V: 2,24,2.7 [default: [usable] of the configuration]
     #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load)]
     pub(crate) load: Option<[f64; 3]>,
-    /// Report the first discharge below this capacity, Ah
+    /// Report the first discharge with a capacity below this, Ah
     #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0)]
     pub(crate) threshold: f64,
-    /// Discharges before the statistics of the capacity begin
+    /// Discharges to leave out before the capacity statistics start
     #[arg(long, value_name = "N", default_value_t = 10)]
     pub(crate) skip_cycles: usize,
-    /// Each half-cycle is seen only in a random window of this part of its charge: 0.4,0.7
-    #[arg(long, value_name = "LEAST,MOST", value_parser = window)]
+    /// Use only a random window of each half-cycle, with this fraction of its charge: 0.4,0.7
+    #[arg(long, value_name = "MIN,MAX", value_parser = window)]
     pub(crate) window: Option<(f64, f64)>,
     /// Seeds of the windows
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1")]
@@ -127,13 +127,13 @@ pub(crate) struct OutputArgs {
     /// Print the scores as JSON
     #[arg(long)]
     pub(crate) json: bool,
-    /// Write an SVG per file and case into this folder
-    #[arg(long, value_name = "FOLDER")]
+    /// Write an SVG plot per file and case into this folder
+    #[arg(long, value_name = "DIR")]
     pub(crate) plot: Option<PathBuf>,
 }
 
 impl Args {
-    /// What is asked for.
+    /// Converts the arguments to a request.
     pub(super) fn request(&self) -> ScoreRequest {
         let Self { files, config, cell, label, learn, starts, statistics, life, output } = self;
         ScoreRequest {
@@ -165,7 +165,7 @@ fn initial_soc_error(text: &str) -> Result<InitialSocError, String> {
     if text == "none" {
         return Ok(InitialSocError(None));
     }
-    let points = within(text, |points| points.abs() <= 100.0, "a number of points, -100 to 100, or none")?;
+    let points = within(text, |points| points.abs() <= 100.0, "-100 to 100 points, or none")?;
     Ok(InitialSocError(Some(points)))
 }
 
@@ -179,12 +179,12 @@ fn duration(text: &str) -> Result<f64, String> {
     let text = text.trim();
     let (digits, unit) =
         units.iter().find_map(|(unit, seconds)| Some((text.strip_suffix(unit)?, *seconds))).unwrap_or((text, 1.0));
-    let value = within(digits, |value| value >= 0.0, "0 or more, like 600, 600s, 10min or 1h")?;
+    let value = within(digits, |value| value >= 0.0, "0 or more, for example 600, 600s, 10min or 1h")?;
     Ok(value * unit)
 }
 
 fn window(text: &str) -> Result<(f64, f64), String> {
-    let expected = "must be two parts above 0 and at most 1, the smaller first, like 0.4,0.7";
+    let expected = "must be two fractions above 0 and at most 1, the smaller first, for example 0.4,0.7";
     let (least, most) = text.split_once(',').ok_or(expected)?;
     let (least, most) = (finite(least).map_err(|_| expected)?, finite(most).map_err(|_| expected)?);
     if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(expected.to_owned()) }
@@ -194,7 +194,7 @@ fn load(text: &str) -> Result<[f64; 3], String> {
     let values: Option<Vec<f64>> = text.split(',').map(|part| finite(part).ok()).collect();
     let load: Option<[f64; 3]> = values.and_then(|values| values.try_into().ok());
     let load = load.filter(|[current_a, _, cutoff_v]| *current_a > 0.0 && *cutoff_v > 0.0);
-    load.ok_or_else(|| "must be amperes above 0, degrees C and volts above 0, like 2,24,2.7".to_owned())
+    load.ok_or_else(|| "must be amperes above 0, degrees C and volts above 0, for example 2,24,2.7".to_owned())
 }
 
 #[cfg(test)]
@@ -202,14 +202,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn durations_have_units() {
+    fn duration_accepts_units() {
         assert_eq!(duration("10min"), Ok(600.0));
         assert_eq!((duration("90"), duration("90 s"), duration("0.5h")), (Ok(90.0), Ok(90.0), Ok(1800.0)));
         assert!(duration("-1s").is_err() && duration("soon").is_err() && duration("min").is_err());
     }
 
     #[test]
-    fn nothing_but_files_and_a_cell_is_the_default_request() {
+    fn files_and_cell_alone_give_default_request() {
         #[derive(clap::Parser)]
         struct Line {
             #[command(flatten)]
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_and_ranges_are_checked() {
+    fn invalid_lists_and_ranges_are_rejected() {
         assert_eq!(window("0.4,0.7"), Ok((0.4, 0.7)));
         assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
         assert_eq!(load("2,-10,2.7"), Ok([2.0, -10.0, 2.7]));

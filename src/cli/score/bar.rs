@@ -5,7 +5,7 @@ use indicatif::ProgressBar;
 use crate::cli::common::progress::progress_bar;
 use crate::lab::score::ScoreJob;
 
-/// Progress on standard error, when that is a terminal; by the files' sizes.
+/// Progress by file size on standard error, if that is a terminal.
 pub(super) struct Bar {
     bar: ProgressBar,
     bytes: Vec<f64>,
@@ -20,7 +20,7 @@ impl Bar {
         Self { bar, bytes }
     }
 
-    /// Adds a share of the work on file `index`.
+    /// Adds a fraction of the work on file `index`.
     pub(super) fn advance(&self, index: usize, part: f64) {
         self.bar.inc((part * self.bytes.get(index).copied().unwrap_or(0.0)).round() as u64);
     }

@@ -171,7 +171,7 @@ fn alarms(text: &mut String, document: &StatusDocument) {
     let alarms = &document.alarms;
     let unknown = match alarms.unknown.len() {
         0 => String::new(),
-        count => format!(", not known for {count}"),
+        count => format!(", {count} unknown"),
     };
     let _ = writeln!(text, "alarms     {} raised of {} thresholds{unknown}", alarms.raised, alarms.thresholds);
     for alarm in grouped(&alarms.list) {

@@ -19,7 +19,7 @@ fn a_healthy_pack_gives_status_0_and_says_what_is_fine() {
     let (status, page, _) = doctor(&Broken::of(Bench::Pack12, 1), &[]);
     assert_eq!(status, 0, "{page}");
     for words in [
-        "Nothing is wrong",
+        "No faults found",
         "12 of 12 cell voltages every 100 ms",
         "pack current every 10 ms",
         "the sign of the current is right",

@@ -23,7 +23,7 @@ store      works, 21 commits, 0.1 MB
 commands   can0 6B3: unauthenticated
 requests   silent: another tester is at work; 1 refused for good
 answers    can0 7EC: 120 answers, 3 refused (latest code 31), 2 lost: wrong sequence
-alarms     1 raised of 4 thresholds, not known for 1
+alarms     1 raised of 4 thresholds, 1 unknown
            severe capacity_low cell 1 active: 2.412 Ah, threshold 2.500 Ah, 97 % sure
            warning soc_low pack cleared: 63.2 %, threshold 10.0 %, acknowledged
 cell  voltage    temp.           SOC          capacity   resistance  trusted
