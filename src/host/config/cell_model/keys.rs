@@ -12,18 +12,18 @@ use crate::quantity::bounds;
 section! {
     /// A cell type.
     Head at "" {
-        /// Version of this layout.
+        /// Version of the file format.
         format: u16, "", Between(1.0, 1.0), Required;
-        /// Name of the cell, for people.
+        /// Name of the cell, for readers.
         name: String, "", NotEmpty, Required;
-        /// Chemistry, for people.
-        chemistry: Option<String>, "", NotEmpty, Optional;
-        /// Capacity on the label, which SOH is relative to.
+        /// Chemistry, for readers.
+        chemistry: Option<String>, "", NotEmpty, Optional("none");
+        /// Rated capacity, as on the label. SOH is relative to it.
         rated_capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
-        /// Charge of a new cell from full to empty open-circuit voltage.
+        /// Charge of a new cell between full and empty open-circuit voltage.
         capacity_ah: f64, "Ah", within(bounds::CONFIGURED_CAPACITY_AH), Required;
-        /// How far the open-circuit curve shifts as the cell loses capacity, where `[electrodes]` does not say it: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner. Without either: 0.
-        ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional;
+        /// How the open-circuit curve changes as the cell loses capacity, if there is no table `[electrodes]`. 0: the curve shrinks evenly over SOC. 1: the top keeps its ampere-hours and the empty end is reached sooner.
+        ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional("0");
         /// Lowest voltage under load.
         voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
         /// Highest voltage under charge.
@@ -32,35 +32,35 @@ section! {
 }
 
 section! {
-    /// The circuit over SOC and temperature. Two-dimensional tables have one row per temperature and one column per SOC.
+    /// The equivalent circuit over SOC and temperature. Two-dimensional tables have one row per temperature and one column per SOC.
     Tables at "tables" {
-        /// SOC breakpoints, strictly rising from 0 to 1.
+        /// SOC breakpoints, strictly increasing from 0 to 1.
         soc: Vec<f64>, "fraction", Between(0.0, 1.0), Required;
-        /// Temperature breakpoints, strictly rising.
+        /// Temperature breakpoints, strictly increasing.
         temperature_c: Vec<f64>, "degrees C", within(bounds::TEMPERATURE_C), Required;
-        /// Open-circuit voltage, strictly rising along each row.
+        /// Open-circuit voltage, strictly increasing along each row.
         ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
         /// Series resistance of a new cell.
         r0_ohm: Vec<Vec<f64>>, "ohm", within(bounds::RESISTANCE_OHM), Required;
-        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` determines it. Without it: the estimator's `model_error_v_sqrt_s`.
-        voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
+        /// Standard deviation of the model's voltage error, averaged over 100 s, as determined by `packwatch fit`.
+        voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional("`estimator.model_error_v_sqrt_s`");
     }
 }
 
 section! {
-    /// Where the cell was measured, as `packwatch fit` writes it. For people: beyond these temperatures the tables of a fit continue with larger `voltage_error_v`, so that estimates are less certain there.
+    /// The conditions in which the cell was measured, written by `packwatch fit` for readers. Beyond these temperatures a fitted model continues with a larger `voltage_error_v`, so that estimates are less certain there.
     Measured at "measured" {
-        /// Lowest and highest temperature. Without it: not known.
-        temperature_c: Option<Vec<f64>>, "degrees C", within(bounds::TEMPERATURE_C), Optional;
-        /// Lowest and highest current; positive = discharge. Without it: not known.
-        current_a: Option<Vec<f64>>, "A", within(bounds::CURRENT_A), Optional;
-        /// Lowest and highest state of charge. Without it: not known.
-        soc: Option<Vec<f64>>, "fraction", Between(-1.0, 2.0), Optional;
+        /// Lowest and highest temperature.
+        temperature_c: Option<Vec<f64>>, "degrees C", within(bounds::TEMPERATURE_C), Optional("unknown");
+        /// Lowest and highest current; positive = discharge.
+        current_a: Option<Vec<f64>>, "A", within(bounds::CURRENT_A), Optional("unknown");
+        /// Lowest and highest state of charge.
+        soc: Option<Vec<f64>>, "fraction", Between(-1.0, 2.0), Optional("unknown");
     }
 }
 
 section! {
-    /// A branch of a resistor and a capacitor in parallel, 1 to 3 of them.
+    /// A branch: a resistor and a capacitor in parallel. A model has 1 to 3 branches.
     BranchTables at "tables.branches" gives Branch, |keys| {
         /// Resistance of a new cell.
         r_ohm: Vec<Vec<f64>>, "ohm", within(bounds::RESISTANCE_OHM), Required => r_ohm: Table { values: keys.r_ohm.clone() };
@@ -70,38 +70,38 @@ section! {
 }
 
 section! {
-    /// The electrodes of the new cell, as `packwatch fit` finds them in a slow test: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a fraction of its maximum.
+    /// The electrodes of the new cell, as `packwatch fit` identifies them from a slow test. They determine how the open-circuit curve changes as lithium and active material are lost. Lithium contents are fractions of the electrode's maximum.
     ElectrodesKeys at "electrodes" gives Electrodes, |keys| {
         /// Material of the positive electrode.
         positive: PositiveMaterial, "", Any, Required;
         /// Material of the negative electrode.
         negative: NegativeMaterial, "", Any, Required;
-        /// Lithium content of the positive electrode of the empty and of the full cell.
+        /// Lithium content of the positive electrode in the empty and in the full cell.
         positive_content: Vec<f64>, "fraction", Between(0.0, 1.0), Required => positive_content: ends(&keys.positive_content);
-        /// Lithium content of the negative electrode of the empty and of the full cell.
+        /// Lithium content of the negative electrode in the empty and in the full cell.
         negative_content: Vec<f64>, "fraction", Between(0.0, 1.0), Required => negative_content: ends(&keys.negative_content);
     }
 }
 
 section! {
-    /// How far a cell may be from the model, in standard deviations, where it is not of a fit's own type: of a model from a label or of one that the vehicle has learned, as `packwatch model export` writes it. Without it: as cells of one type are.
+    /// How far a cell may differ from the model, as standard deviations. Used if the model was not fitted to the cell's own type: a model from a label, or one learned in a vehicle and written by `packwatch model export`. Without this table the usual spread between cells of one type is assumed.
     SpreadKeys at "spread" gives ModelSpread, |keys| {
-        /// Constant error of the open-circuit curve, beside its modes.
+        /// Constant error of the open-circuit curve, in addition to `curve_modes_v`.
         curve_v: f64, "V", Between(0.0, 1.0), Required;
         /// ln(resistance relative to the model).
         log_resistance: f64, "", Between(0.0, 5.0), Required;
-        /// Resistance of the slowest branch beside the others.
+        /// Resistance of the slowest branch relative to the other resistances.
         slow_branch: f64, "fraction", Between(0.0, 5.0), Required;
         /// Capacity.
         capacity: f64, "fraction", Between(0.0, 1.0), Required;
-        /// Voltage drop: fraction of it over one second.
+        /// Voltage drop: relative error of its average over one second.
         drop_sqrt_s: f64, "", Between(0.0, 100.0), Required;
         /// Two modes of the open-circuit curve's error, one value per `tables.soc`.
         curve_modes_v: Vec<Vec<f64>>, "V", Between(-1.0, 1.0), Required =>;
     }
 }
 
-/// Names of the materials in a cell model.
+/// Makes the names of the materials the choices of a key.
 macro_rules! material {
     ($material:ty) => {
         impl Setting for $material {
@@ -128,13 +128,13 @@ const fn names<T, const N: usize>(all: &[(T, &'static str); N]) -> [&'static str
     names
 }
 
-/// The first and the last value; the number of values is checked before.
+/// The first and the last value. The number of values is checked elsewhere.
 pub(crate) fn ends(values: &[f64]) -> [f64; 2] {
     [values.first().copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN)]
 }
 
 section! {
-    /// The thermal model of one cell; without it there is no fallback for a stale temperature.
+    /// The thermal model of one cell. Without it a stale temperature has no replacement.
     ThermalKeys at "thermal" gives Thermal, |keys| {
         /// Heat capacity.
         heat_capacity_j_per_k: f64, "J/K", Above(0.0, 1e9), Required;
@@ -148,7 +148,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Head>(),
     SectionInfo::notes(
         "provenance",
-        "Where the numbers come from. For people; any keys. `packwatch cells` shows `citation` (or `source`) and `licence`.",
+        "The source of the numbers, for readers; any keys are allowed. `packwatch cells` shows `citation` (or `source`) and `licence`.",
     ),
     SectionInfo::one::<Measured>(),
     SectionInfo::one::<Tables>(),

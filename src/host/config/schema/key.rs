@@ -1,4 +1,4 @@
-//! What every declared key has: its meaning, type and range, and how its value is read from a table.
+//! The properties of a declared key (meaning, type, range) and how its value is read from a table.
 
 use std::fmt;
 use std::ops::Range;
@@ -9,16 +9,16 @@ use toml::de::{DeTable, DeValue};
 use crate::config::document::{Document, TablePlace};
 use crate::quantity::bounds::Bounds;
 
-/// The range of a key's value; of each element when the value is a list.
+/// The range of a key's value; for a list, the range of each element.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum ValueRange {
-    /// Anything of the type (numbers must still be finite).
+    /// Any value of the type (numbers must still be finite).
     Any,
-    /// A number from the first to the second, both included.
+    /// A number between the two bounds, both included.
     Between(f64, f64),
-    /// A number above the first, up to and including the second.
+    /// A number above the first bound, up to and including the second.
     Above(f64, f64),
-    /// A text or list that is not empty.
+    /// A string or list that is not empty.
     NotEmpty,
 }
 
@@ -52,52 +52,52 @@ impl fmt::Display for ValueRange {
     }
 }
 
-/// Why a value is refused, and where exactly.
+/// Why and where a value is rejected.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum ValueFault {
-    /// Not the key's type.
+    /// Wrong type.
     Type(Range<usize>),
-    /// The type, but not in the range.
+    /// Right type, but out of range.
     Range(Range<usize>),
 }
 
-/// `found`, or a fault that the value has another type.
+/// Returns `found`, or a type fault at the value.
 pub(crate) fn typed<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Type(value.span()))
 }
 
-/// `found`, or a fault that the value is out of range.
+/// Returns `found`, or a range fault at the value.
 pub(crate) fn in_range<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Range(value.span()))
 }
 
-/// A type a key may have.
+/// A type that a key may have.
 pub(crate) trait Setting: Sized {
     /// The type in words.
     const KIND: &'static str;
-    /// A list of the type in words.
+    /// A list of the type, in words.
     const LIST_KIND: &'static str = "a list";
-    /// The words it may be, when it is a choice.
+    /// The allowed words, if the type is a choice.
     const CHOICES: &'static [&'static str] = &[];
     /// Reads and checks a value.
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault>;
-    /// Reads and checks a value that is tables with keys of their own; `None` = the type is no such value.
+    /// Reads and checks a value that consists of tables with their own keys; `None` for all other types.
     fn read_tables(_: &TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
         None
     }
-    /// Value of a key that is not written and has no default.
+    /// Value of an optional key that is absent; `None` if the type has no such value.
     fn absent() -> Option<Self> {
         None
     }
 }
 
-/// Effect of a key that is not written.
+/// What happens if a key is absent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Presence {
-    /// It is a fault.
+    /// The absence is a fault.
     Required,
-    /// None is needed; the key's text says what holds without it.
-    Optional,
+    /// Nothing; the text is the default in words, or the condition that requires the key.
+    Optional(&'static str),
     /// This TOML text is read instead.
     Default(&'static str),
 }
@@ -111,23 +111,23 @@ pub(crate) struct Key {
     pub about: &'static str,
     /// Unit, or empty.
     pub unit: &'static str,
-    /// Its type in words.
+    /// Type in words.
     pub kind: &'static str,
-    /// Words it may be, when it is a choice.
+    /// Allowed words, if the key is a choice.
     pub choices: &'static [&'static str],
-    /// Its range.
+    /// Range.
     pub allowed: ValueRange,
-    /// Effect of leaving it out.
+    /// What happens if the key is absent.
     pub presence: Presence,
 }
 
 impl Key {
-    /// The range for people; empty when anything of the type goes.
+    /// The range in words; empty if every value of the type is allowed.
     pub(crate) fn range(&self) -> String {
         if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
-    /// The allowed values with their type, as a fault says it.
+    /// The allowed values with their type, as they appear in a fault.
     pub(crate) fn must_be(&self) -> String {
         let range = self.range();
         if self.allowed == ValueRange::NotEmpty {
@@ -141,7 +141,7 @@ impl Key {
         }
     }
 
-    /// The allowed values, for a value of the right type.
+    /// The allowed values, for a fault of a value that has the right type.
     fn must_be_in_range(&self) -> String {
         match self.range() {
             range if range.is_empty() || self.allowed == ValueRange::NotEmpty => self.must_be(),
@@ -153,16 +153,16 @@ impl Key {
 /// Reads the keys of one table.
 pub(crate) struct TableReader<'a> {
     pub document: &'a Document<'a>,
-    /// Whether the table may be incomplete, so that a missing key is not reported.
+    /// Whether the table may be incomplete; missing keys are then not reported.
     pub broken: bool,
-    /// `None` = not written.
+    /// `None` = the table is absent.
     pub table: Option<&'a DeTable<'a>>,
     /// Place in the file.
     pub place: TablePlace,
 }
 
 impl TableReader<'_> {
-    /// The value of `key`, its default, or `None` with a fault noted.
+    /// The value of `key`, or its default; `None` if it is faulty (the fault is noted).
     pub(crate) fn setting<T: Setting>(&self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);
@@ -188,7 +188,7 @@ impl TableReader<'_> {
 
     fn absent<T: Setting>(&self, key: &Key) -> Option<T> {
         match key.presence {
-            Presence::Optional => T::absent(),
+            Presence::Optional(_) => T::absent(),
             Presence::Default(text) => {
                 let value = DeValue::parse(text).ok()?;
                 T::read(&value, &key.allowed).ok()

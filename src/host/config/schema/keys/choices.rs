@@ -1,4 +1,4 @@
-//! Keys that are a choice between words, and ranges that several tables share.
+//! Keys with a fixed choice of words, and ranges that several tables share.
 
 use crate::alarm::Rule;
 use crate::can::e2e::Profile;
@@ -9,7 +9,7 @@ use crate::config::schema::setting::choice;
 use crate::health::RechargeAlarm;
 use crate::quantity::bounds;
 
-/// Coldest and hottest temperature that may be configured, degrees C.
+/// Lowest and highest temperature that may be configured, degrees C.
 pub(crate) const TEMPERATURE_C: ValueRange = within(bounds::TEMPERATURE_C);
 /// Range of standard deviations and of noise densities.
 pub(crate) const DEVIATION: ValueRange = within(bounds::DEVIATION);
@@ -32,10 +32,10 @@ pub(crate) enum WireOrder {
     Little,
 }
 
-/// Method that measures the capacity in a half-cycle.
+/// How a half-cycle measures the capacity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MethodKey {
-    /// Charge over the swing between the SOCs that the voltages give.
+    /// Charge over the SOC swing found from the voltages.
     Swing,
     /// Charge over a nominal swing.
     Nominal,

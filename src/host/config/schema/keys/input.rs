@@ -1,4 +1,4 @@
-//! The tables of what is read from the buses: `[input]` and the signals below it.
+//! The tables of what is read from the buses: `[input]` and the signal tables below it.
 
 use super::choices::{PositiveCurrent, WireOrder};
 use crate::can::e2e::Profile;
@@ -10,112 +10,112 @@ use crate::config::schema::section::section;
 use crate::config::schema::setting::{CellRanges, NumberRange};
 
 section! {
-    /// The inputs: what is read from the buses. One of `[input.cell_voltage]` and `[input.pack_voltage]` is needed, and `[input.current]`.
+    /// The inputs: what is read from the buses. `[input.current]` is required, and either `[input.cell_voltage]` or `[input.pack_voltage]`.
     Input at "input" {
-        /// DBC files that describe the signals named below, relative to this file. Not needed where all of them are in the answers of `[[input.diagnostic]]`.
+        /// DBC files that describe the signals named below, relative to this file. Not required if all signals are in the answers of `[[input.diagnostic]]`.
         dbc: Vec<String>, "", Any, Default("[]");
-        /// Silence of all inputs together, while no current flows, after which the buses are taken to sleep: that is no fault, raises no alarm and takes two events. At least the largest age of currents and voltages (`max_age_s` of the limits). 0: never; a parked vehicle's silent inputs are then missing.
+        /// If all inputs are silent for this long and no current flows, the vehicle counts as asleep: this is not a fault, raises no alarm and is recorded as two events (asleep, awake). Must be at least the largest `max_age_s` of current and voltages (`[limits.*]`). 0: never asleep; the silent inputs of a parked vehicle are then missing.
         asleep_after_s: f64, "s", Between(0.0, 86_400.0), Default("5.0");
-        /// Most frames of one identifier on one interface that are processed in a second; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender takes no time from the others. The default is twice the rate of the fastest sensible sender (one frame a millisecond) and half the rate of a saturated bus of 500 kbit/s.
+        /// Most frames per second of one identifier on one interface that are processed; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender cannot starve the others. The default is twice the rate of the fastest sensible sender (one frame per millisecond) and half of what fits on a 500 kbit/s bus.
         max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
     }
 }
 
 section! {
-    /// An input message whose sender protects it end to end (AUTOSAR). The readings of a frame that fails its check (damaged, repeated, out of sequence, of another message, or the first after a start) are bad. Each outcome is counted; a change between good and bad is reported.
+    /// An input message that its sender protects end to end (AUTOSAR). If a frame fails its check (damaged, repeated, out of sequence, belonging to another message, or the first one after a start), its readings are bad. Each outcome is counted; a change between good and bad is reported.
     ProtectedInput at "input.protected" {
-        /// Name of the message in its DBC file; one of its signals must be an input.
+        /// Name of the message in its DBC file. At least one of its signals must be an input.
         message: String, "", NotEmpty, Required;
-        /// Interface that carries the message. Needed when there are several.
-        interface: Option<String>, "", NotEmpty, Optional;
-        /// AUTOSAR profile: 1 with the whole data identifier in the CRC (variant A), 1 with four bits of it sent (variant C), or 5.
+        /// Interface that carries the message.
+        interface: Option<String>, "", NotEmpty, Optional("the only interface; required with several");
+        /// AUTOSAR profile: "1A" (profile 1, whole data identifier in the CRC), "1C" (profile 1, four bits of the data identifier are sent), or "5".
         profile: Profile, "", Any, Required;
-        /// Data identifier agreed with the sender; up to 0xFFF in 1C.
+        /// Data identifier agreed with the sender; at most 0xFFF for "1C".
         data_id: u16, "", Between(0.0, 65535.0), Required;
-        /// Frames that may be lost between two; each further check without a good frame allows one more. Up to 14 in profile 1.
+        /// Frames that may be lost between two good ones. Each further check without a good frame allows one more. At most 14 for profile 1.
         max_delta_counter: u8, "frames", Between(0.0, 255.0), Default("1");
-        /// Repeated or missing frames in a row after which the sender must show its sequence again (`sync_counter`); 14 = any number.
+        /// After this many repeated or missing frames in a row, the sender must establish its sequence again (`sync_counter`); 14 = never.
         max_repeated: u8, "frames", Between(0.0, 14.0), Default("14");
-        /// Frames in sequence that show it after too large a jump of the counter; their readings are used. 0 = none is needed: then profile 1 keeps its old counter after a jump (of a sender that restarted) until the sender reaches that counter, after at most 14 frames.
+        /// Frames in sequence that establish it again after too large a jump of the counter; their readings are used. 0 = none required. Profile 1 then keeps its old counter after a jump (the sender restarted) until the sender's counter reaches it, which takes at most 14 frames.
         sync_counter: u8, "frames", Between(0.0, 14.0), Default("0");
     }
 }
 
 section! {
-    /// An answer to a diagnostic request, over ISO-TP, whichever tester asks for it: most electric cars report their cell voltages only so. Nothing is sent without `[poll]`. Its signals are named in `[input.*]` as those of a DBC file: `Name.Signal`. The values of an answer count as measured when its first frame came.
+    /// An answer to a diagnostic request over ISO-TP, from any tester. Most electric cars report cell voltages only this way. packwatch sends requests only with `[poll]`. The tables `[input.*]` name the signals of an answer like those of a DBC file: `Name.Signal`. The values count as measured when the first frame of the answer arrived.
     DiagnosticInput at "input.diagnostic" {
-        /// What its signals are named by, before the dot; several answers may share it.
+        /// Name of the answer, which precedes the dot in `Name.Signal`. Several answers may share a name.
         name: String, "", NotEmpty, Required;
-        /// CAN identifier of the requests; above 0x7FF one of 29 bits.
+        /// CAN identifier of the requests; above 0x7FF a 29-bit identifier.
         request: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
-        /// CAN identifier of the answers.
+        /// CAN identifier of the answers; above 0x7FF a 29-bit identifier.
         response: u32, "", Between(0.0, 0x1FFF_FFFF as f64), Required;
-        /// First data byte of the requests, with extended addressing. Without it: normal addressing.
-        request_extension: Option<u8>, "", Any, Optional;
-        /// First data byte of the answers, with extended addressing. Without it: normal addressing.
-        response_extension: Option<u8>, "", Any, Optional;
-        /// Service: 0x22 (ReadDataByIdentifier of UDS), 0x21 (ReadDataByLocalIdentifier of KWP 2000) or 0x01 (current data of OBD).
+        /// Extended addressing: first data byte of the requests.
+        request_extension: Option<u8>, "", Any, Optional("normal addressing");
+        /// Extended addressing: first data byte of the answers.
+        response_extension: Option<u8>, "", Any, Optional("normal addressing");
+        /// Service: 0x22 (UDS, ReadDataByIdentifier), 0x21 (KWP 2000, readDataByLocalIdentifier) or 0x01 (OBD, current data).
         service: u8, "", Any, Required;
-        /// Identifier of the values: two bytes with service 0x22, otherwise one.
+        /// Identifier of the data: two bytes for service 0x22, else one byte.
         identifier: u16, "", Any, Required;
-        /// How often `[poll]` asks for it while the pack is discharged. Without it: not asked then.
-        drive_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
-        /// The same while the pack is charged. Without it: not asked then.
-        charge_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
-        /// The same while no current flows, or none is known, and the bus is awake all the same. Without it: not asked then.
-        parked_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional;
-        /// The signals, one table each; those that no input names are not read.
+        /// Time between requests of `[poll]` while the pack is being discharged.
+        drive_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional("not polled");
+        /// Time between requests while the pack is being charged.
+        charge_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional("not polled");
+        /// Time between requests while the bus is awake and no current flows or the current is unknown.
+        parked_every_s: Option<f64>, "s", Between(0.1, 86_400.0), Optional("not polled");
+        /// The signals of the answer, one table each. Signals that no input names are ignored.
         signals: SubTables<AnswerSignalKeys>, "", NotEmpty, Required;
     }
 }
 
 section! {
-    /// A signal of the answer, or a row of equal ones. Its value is code x factor + offset.
+    /// A signal of the answer, or a sequence of equally spaced signals. Value = code x factor + offset.
     AnswerSignalKeys at "input.diagnostic.signals" {
-        /// Its name, with `{n}` where the number stands in a row of them.
+        /// Name of the signal. In a sequence, `{n}` stands for the number.
         name: String, "", NotEmpty, Required;
-        /// Position of its first (most significant) bit, counted from the most significant bit of the byte behind the echoed service and identifier (as `bix` of OBDb).
+        /// Position of the first (most significant) bit, counted from the most significant bit of the byte after the echoed service and identifier (like `bix` in OBDb).
         bit: u32, "bits", Between(0.0, 8.0 * 65_535.0), Required;
-        /// Its length.
+        /// Length.
         length: u16, "bits", Between(1.0, 64.0), Required;
-        /// Whether its codes are two's complement.
+        /// Whether the codes are two's complement.
         signed: bool, "", Any, Default("false");
-        /// Which of its bytes comes first: the most ("big") or the least significant one ("little", for whole bytes).
+        /// Which byte comes first: the most significant ("big") or the least significant one ("little", for whole bytes).
         byte_order: WireOrder, "", Any, Default("\"big\"");
-        /// Value of one code.
+        /// Value of one step of the code.
         factor: f64, "unit", Between(-1e9, 1e9), Default("1.0");
-        /// Value of code 0.
+        /// Value at code 0.
         offset: f64, "unit", Between(-1e9, 1e9), Default("0.0");
-        /// Unit of the value, as a DBC would name it.
+        /// Unit of the value, written as in a DBC.
         unit: String, "", Any, Default("\"\"");
-        /// Smallest value that is plausible; below it the reading is bad. Without it: any.
-        minimum: Option<f64>, "unit", Any, Optional;
-        /// Largest value that is plausible; above it the reading is bad. Without it: any.
-        maximum: Option<f64>, "unit", Any, Optional;
+        /// Smallest plausible value; a reading below it is bad.
+        minimum: Option<f64>, "unit", Any, Optional("not checked");
+        /// Largest plausible value; a reading above it is bad.
+        maximum: Option<f64>, "unit", Any, Optional("not checked");
         /// Codes that mean "not available".
         not_available: Vec<u64>, "", Any, Default("[]");
-        /// Numbers that `{n}` in the name counts through. Without it: one signal.
-        numbers: Option<NumberRange>, "", Any, Optional;
-        /// Bits from the first bit of one to that of the next. Without it: the length.
-        step: Option<u32>, "bits", Between(1.0, 8.0 * 65_535.0), Optional;
+        /// Numbers of a sequence, which replace `{n}` in the name.
+        numbers: Option<NumberRange>, "", Any, Optional("one signal");
+        /// Distance between the first bits of consecutive signals of a sequence.
+        step: Option<u32>, "bits", Between(1.0, 8.0 * 65_535.0), Optional("`length`");
     }
 }
 
-/// Declares a table that names a signal on a bus; every such table has these keys.
+/// Declares a table that names a signal on a bus, with the keys that all these tables share.
 macro_rules! signal_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
         section! {
             $(#[doc = $about])+
             $name at $path gives SignalSource<'_>, |keys| {
-                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer; in `[input.cell_voltage]` and `[input.balancing]` a pattern, see there.
+                /// `Message.Signal` of one of the DBC files, or `Name.Signal` of a diagnostic answer. In `[input.cell_voltage]` and `[input.balancing]` a pattern (see there).
                 signal: String, "", NotEmpty, Required => signal: &keys.signal;
-                /// Interface that carries the signal. Needed when there are several.
-                interface: Option<String>, "", NotEmpty, Optional => interface: keys.interface.as_deref();
-                /// Factor from the DBC's unit to this program's, after the DBC's own factor (0.001 for a DBC in milli-units).
+                /// Interface that carries the signal.
+                interface: Option<String>, "", NotEmpty, Optional("the only interface; required with several") => interface: keys.interface.as_deref();
+                /// Factor from the DBC's unit to packwatch's unit, applied after the DBC's own factor (0.001 if the DBC is in milli-units).
                 scale: f64, $unit, Above(0.0, 1e9), Default("1.0");
-                /// Added after `scale`, in this program's unit (-273.15 for a DBC in kelvin).
+                /// Offset in packwatch's unit, added after `scale` (-273.15 if the DBC is in kelvin).
                 offset: f64, "", Between(-1e9, 1e9), Default("0.0");
-                /// Raw codes that mean "not available", in addition to those of the DBC's value table.
+                /// Raw codes that mean "not available", in addition to those in the DBC's value table.
                 not_available: Vec<u64>, "", Any, Default("[]") => not_available: &keys.not_available;
                 $($keys)*
             } and { place: &keys.place }
@@ -123,18 +123,18 @@ macro_rules! signal_section {
     };
 }
 
-/// The keys that all signal tables have.
+/// The keys that all signal tables share.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SignalSource<'a> {
     /// Place in the file.
     pub place: &'a TablePlace,
     /// `Message.Signal`, or a pattern.
     pub signal: &'a str,
-    /// Interface name, when given.
+    /// Interface name, if given.
     pub interface: Option<&'a str>,
-    /// DBC unit to ours.
+    /// Factor from the DBC's unit to ours.
     pub scale: f64,
-    /// Added after it.
+    /// Offset in our unit, added after the scale.
     pub offset: f64,
     /// Raw codes that mean "not available".
     pub not_available: &'a [u64],
@@ -143,15 +143,15 @@ pub(crate) struct SignalSource<'a> {
 signal_section! {
     /// The pack current.
     CurrentInput at "input.current", "A per unit of the DBC" {
-        /// What a positive value on the bus means. Buses differ, so there is no default. Inside this program and in everything it reports, positive is discharge.
+        /// Meaning of a positive value on the bus. There is no default because buses differ. Everything that packwatch computes and reports uses positive = discharge.
         positive: PositiveCurrent, "", Any, Required =>;
     }
 }
 
 signal_section! {
-    /// The state of the pack's contactors. While it says that they are open, no current flows: 0 A is used in place of what the current sensor reports, also when it reports nothing. Without a state (no reading for `max_age_s`, or none yet) the current is as measured.
+    /// The state of the pack's contactors. While it reads "open", packwatch uses 0 A, whatever the current sensor reports and even if it reports nothing. If the state is unknown (no reading within `max_age_s`), the current sensor's reading is used.
     ContactorInput at "input.contactor", "any unit" {
-        /// Values of the signal (after the DBC's factor, `scale` and `offset`) that mean open; every other value means closed.
+        /// Signal values (after the DBC's factor, `scale` and `offset`) that mean open. Every other value means closed.
         open: Vec<f64>, "", NotEmpty, Required =>;
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("5.0") =>;
@@ -159,43 +159,43 @@ signal_section! {
 }
 
 signal_section! {
-    /// One voltage per cell. `{n}` in `signal` stands for the cell's number, `{m}` for any number, in message and signal name:
-    /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal; multiplexed signals are supported.
+    /// One voltage per cell. In `signal`, `{n}` stands for the cell's number and `{m}` for any number, in message and signal name:
+    /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal. Multiplexed signals are supported.
     CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
-        /// Number of the first cell in the names.
+        /// Number that `{n}` has for the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
     }
 }
 
 signal_section! {
-    /// One signal per cell that shows whether the BMS bleeds the cell, so that the leaks of all cells can be learned. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means bled; for an inverted bit set `offset = -1.0`. A value holds until the next one, for at most `max_age_s`. Frames with nothing but these signals do not wake sleeping buses. Needs `pack.balancing = true`.
+    /// One signal per cell that shows whether the BMS bleeds the cell. With it, leaks can be learned for all cells. `signal` is a pattern as in `[input.cell_voltage]`. A value other than 0 (after the DBC's factor, `scale` and `offset`) means that the cell is bled; for an inverted bit set `offset = -1.0`. A value holds until the next one, for at most `max_age_s`. Frames that carry only these signals do not wake sleeping buses. Requires `pack.balancing = true`.
     BalancingInput at "input.balancing", "any unit" {
-        /// Number of the first cell in the names.
+        /// Number that `{n}` has for the first cell.
         first: u16, "", Between(0.0, 60000.0), Default("1") =>;
-        /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances; parallel strings share it. At most a fifth of the pack's rated capacity in an hour.
+        /// Current of a balancing resistor while the bit is 1, at the voltage at which the BMS balances. Parallel strings share it. At most a fifth of the pack's rated capacity per hour (C/5).
         bleed_a: f64, "A", Above(0.0, 1e6), Required =>;
-        /// Longest time for which a value holds. Must be longer than the period at which the BMS sends it, also while the vehicle is parked: the rest of a longer period counts as one without values.
+        /// Longest time for which a value holds. Must be longer than the period at which the BMS sends the signal, also while the vehicle is parked; otherwise the balancing state is unknown for the rest of each period.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
-        /// Whether the BMS bleeds no cell while no values come. Only where it sends them for as long as it balances, and this computer is awake for as long. `false`: nothing is known of that time, and leaks are learned from the rest alone. The time for which the program does not run is unknown in any case.
+        /// `true`: no cell is bled while no values arrive. Set it only if the BMS sends values for as long as it balances and this computer stays awake for as long. `false`: the balancing state during that time is unknown, and leaks are learned from the remaining time only. The state is always unknown while the program does not run.
         only_while_sent: bool, "", Any, Default("false") =>;
     }
 }
 
 signal_section! {
-    /// The pack's total voltage, for a pack that publishes no cell voltages: `pack.cells` equal cells are assumed and estimated as one.
+    /// The pack's total voltage, for a pack that reports no cell voltages. `pack.cells` equal cells are assumed and estimated as one.
     PackVoltageInput at "input.pack_voltage", "V per unit of the DBC" {}
 }
 
 signal_section! {
     /// A temperature sensor.
     TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
-        /// Cells this sensor serves. Without it: all cells.
-        cells: Option<CellRanges>, "", Any, Optional =>;
+        /// Cells that this sensor serves.
+        cells: Option<CellRanges>, "", Any, Optional("all cells") =>;
     }
 }
 
 signal_section! {
-    /// State of charge as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
+    /// State of charge as reported by the pack, for the rule `bms_disagrees`. Estimates do not use it. If `scale` is not set, a signal with the DBC unit % is divided by 100.
     ReportedSocInput at "input.reported_soc", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
@@ -203,7 +203,7 @@ signal_section! {
 }
 
 signal_section! {
-    /// State of health (capacity over rated capacity) as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
+    /// State of health (capacity over rated capacity) as reported by the pack, for the rule `bms_disagrees`. Estimates do not use it. If `scale` is not set, a signal with the DBC unit % is divided by 100.
     ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0") =>;
@@ -211,9 +211,9 @@ signal_section! {
 }
 
 signal_section! {
-    /// Voltage of the vehicle's supply battery: while it is low, or not known, `[poll]` asks for nothing.
+    /// Voltage of the vehicle's supply battery. While it is low or unknown, `[poll]` sends no requests.
     SupplyVoltageInput at "input.supply_voltage", "V per unit of the DBC" {
-        /// Least voltage at which requests may be sent. The default is that of a half empty lead battery of 12 V.
+        /// Lowest voltage at which requests may be sent. The default is the voltage of a half-discharged 12 V lead-acid battery.
         minimum_v: f64, "V", Above(0.0, 100.0), Default("12.2") =>;
         /// A reading older than this is stale.
         max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
@@ -221,11 +221,11 @@ signal_section! {
 }
 
 signal_section! {
-    /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, also when the pack was exchanged while the program did not run. What was learned of the old pack is kept under its number, for up to eight packs (384 cells together), and restored when its number comes back.
+    /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, even if the pack was exchanged while the program did not run. Values learned for the old pack are kept under its number, for up to eight packs (384 cells in total), and restored when its number returns.
     PackIdentityInput at "input.pack_identity", "any unit" {
-        /// Readings in a row that must show the same new value.
+        /// Consecutive readings that must show the same new value.
         readings: u32, "", Between(1.0, 10000.0), Default("10") =>;
-        /// Whether a signal without end-to-end protection is accepted. Three forged or damaged frames of one put aside everything learned until the number is right again, and end the half-cycle under way; diagnostic answers have no such protection. Without it the message must be in `[[input.protected]]`.
+        /// Whether a signal without end-to-end protection is accepted; if `false`, the message must be listed in `[[input.protected]]`. Without protection, a few forged or damaged frames are enough to put all learned values aside until the correct number returns, and to end the current half-cycle. Diagnostic answers have no such protection.
         accept_unprotected: bool, "", Any, Default("false") =>;
     }
 }
