@@ -2,10 +2,10 @@
 //!
 //! | file | content |
 //! | --- | --- |
-//! | `pattern`, `answers`, `signals` | signals looked up in the DBC files and diagnostic answers |
-//! | `cross`, `alarm`, `cells` | keys that concern each other, and the cell models |
-//! | `input_tables`, `plausible` | faulty tables checked as far as they go; what cannot be meant |
-//! | `protect`, `output`, `commands`, `j1939`, `polling` | frames that are checked, sent, asked for |
+//! | `pattern`, `answers`, `signals` | look up signals in the DBC files and diagnostic answers |
+//! | `cross`, `alarm`, `cells` | keys that depend on each other, and the cell models |
+//! | `input_tables`, `plausible` | checks of faulty tables as far as possible; values that are allowed but implausible |
+//! | `protect`, `output`, `commands`, `j1939`, `polling` | frames that are checked, sent or requested |
 //! | `monitor` | the settings of the core |
 
 mod alarm;

@@ -1,4 +1,4 @@
-//! A configuration and its keys in words: for `packwatch check`, the reference page and the manual page.
+//! Describes a configuration and its keys in words, for `packwatch check`, the reference page and the manual page.
 
 mod describe;
 mod manual;

@@ -1,11 +1,11 @@
-//! The files of a configuration: their texts parsed and merged, the places of keys, and the list of faults.
+//! The files of a configuration: their texts parsed and merged, the positions of keys, and the list of faults.
 //!
 //! | file | content |
 //! | --- | --- |
-//! | `faults` | what is wrong, and where |
-//! | `source` | the file and its drop-ins, their texts |
-//! | `merge` | the texts parsed and merged |
-//! | `text` | the merged tables as one TOML text |
+//! | `faults` | the list of faults and their positions |
+//! | `source` | the file and its drop-ins |
+//! | `merge` | parses and merges the texts |
+//! | `text` | writes the merged tables as one TOML text |
 
 mod faults;
 mod merge;

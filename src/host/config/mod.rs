@@ -1,28 +1,28 @@
-//! The TOML configuration: as written, then checked; every fault at once, with file, line, key, found and allowed.
+//! The TOML configuration: read, merged and checked. All faults are reported at once, with file, line, key, found and allowed.
 //!
-//! In: the configuration file, its drop-ins and the files they name (DBC files, cell model). Out: [`Config`], the settings of the other
-//! modules, which cannot be wrong; or [`ConfigFaults`], a line per fault.
+//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`], consistent
+//! settings for the other modules, or [`ConfigFaults`], one line per fault.
 //!
-//! Six layers; each uses only those above it in this table, and nothing uses this file but the rest of the program.
+//! Six layers. Each uses only the layers above it in this table, and none uses this file.
 //!
 //! | layer | content |
 //! | --- | --- |
-//! | `document` | the files: drop-ins, merged tables, places of keys, faults |
-//! | `schema` | the tables as they are written; every key, declared once |
-//! | [`cell_model`] | cell model files, by the same mechanism |
-//! | `checks` | what was written to what is meant: signals looked up, what must fit together, settings of the core |
-//! | `result` | the checked configuration and the steps that make it |
+//! | `document` | the files: drop-ins, merged tables, positions of keys, faults |
+//! | `schema` | the tables as written; every key, declared once |
+//! | [`cell_model`] | cell model files, declared the same way |
+//! | `checks` | looks up signals, checks keys against each other, makes the settings of the core |
+//! | `result` | the checked configuration and the steps that produce it |
 //! | `description` | the configuration and its keys in words |
 //!
-//! # How a key is added
-//! 1. In `schema/keys`, a line in the table's `section!`: doc comment, name, type, unit, range, presence. In a table that `gives`
-//!    the parameters of an algorithm it fills the field of the same name; another field, or one that needs other values,
-//!    stands behind `=>` on the same line.
-//! 2. In the algorithm, that field.
-//! 3. `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
+//! # How to add a key
+//! 1. In `schema/keys`, add a line to the table's `section!`: doc comment, name, type, unit, range, presence. In a table
+//!    that `gives` the parameters of an algorithm, the key sets the field of the same name. To set another field, or to
+//!    compute the value, write `=> field: value` on the same line.
+//! 2. Add the field to the algorithm's parameters.
+//! 3. Run `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
 //!
-//! Reading, default, range check, fault texts, reference and manual page follow from the line. A check that concerns
-//! several keys goes into `checks/cross`. A new table needs a line in `schema/tables` too.
+//! Reading, default, range check, fault texts, reference and manual page follow from the declaration. A check that
+//! involves several keys belongs in `checks/cross`. A new table also needs a line in `schema/tables`.
 
 pub mod cell_model;
 mod checks;

@@ -1,4 +1,4 @@
-//! The checked configuration, which the rest of the program uses, and the steps that make it.
+//! The checked configuration that the rest of the program uses, and the steps that produce it.
 
 mod config;
 mod key_source;

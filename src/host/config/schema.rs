@@ -1,12 +1,12 @@
-//! The tables of the files as they are written: every key once, with its meaning, type, unit, range and default.
+//! The tables and keys of the files: every key is declared once, with meaning, type, unit, range and default.
 //!
 //! | file | content |
 //! | --- | --- |
-//! | `key` | what a key has, how its value is read |
-//! | `setting`, `threshold` | types a key may have |
-//! | `section` | what a declared table gives |
-//! | `reader` | the tables of a document, unknown keys |
-//! | `keys` | every key, declared once |
+//! | `key` | the properties of a key, how its value is read |
+//! | `setting`, `threshold` | the types of keys |
+//! | `section` | declaration of tables |
+//! | `reader` | reads the tables of a document; unknown keys |
+//! | `keys` | every key |
 //! | `tables` | every table of the file |
 
 mod key;

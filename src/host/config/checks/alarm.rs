@@ -201,6 +201,6 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {
-        alarm.place.fault(key, "must be 0 to 1, or a text like \"20 %\"");
+        alarm.place.fault(key, "must be 0 to 1, or a string like \"20 %\"");
     }
 }

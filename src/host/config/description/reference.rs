@@ -1,4 +1,4 @@
-//! The reference page of all keys, from the same lines the faults come from.
+//! The reference page of all keys, generated from the same declarations as the faults.
 
 use std::fmt::Write as _;
 
@@ -8,13 +8,14 @@ use crate::config::schema::{Key, Presence, SECTIONS, SectionInfo};
 /// The page, as Markdown; `docs/src/reference/keys.md` is exactly this.
 pub fn reference() -> String {
     let mut page = String::from(
-        "# Reference of keys\n\n\
-         Printed by `packwatch check --reference`; do not edit. Unknown keys are refused. Whole numbers may be\n\
-         written in hex (`0x7FF`). Inside and in everything reported, positive current is discharge and SOC is a\n\
-         fraction.\n\n# Configuration\n",
+        "# Configuration keys\n\n\
+         Printed by `packwatch check --reference`; do not edit. Unknown keys are rejected. Whole numbers may be written\n\
+         in hex (`0x7FF`). Everywhere in packwatch a positive current is a discharge, and SOC is a fraction.\n\n\
+         The column \"default\" shows the default as code, or describes it in words; keys marked \"required\" have none.\n\n\
+         # Configuration file\n",
     );
     sections(&mut page, SECTIONS);
-    page.push_str("\n# Cell model\n\nA file of its own, named by `pack.cell_model`.\n");
+    page.push_str("\n# Cell model file\n\nA separate file, named by `pack.cell_model`.\n");
     sections(&mut page, cell_model::SECTIONS);
     page
 }
@@ -25,7 +26,7 @@ fn sections(page: &mut String, sections: &[SectionInfo]) {
         // Writing to a String cannot fail.
         let _ = write!(page, "\n## {heading}\n\n{}\n", info.about.trim());
         if let Some(keys) = info.keys {
-            page.push_str("\n| key | value | unit | without it | meaning |\n| --- | --- | --- | --- | --- |\n");
+            page.push_str("\n| key | value | unit | default | meaning |\n| --- | --- | --- | --- | --- |\n");
             for key in keys {
                 page.push_str(&row(key));
             }
@@ -34,8 +35,8 @@ fn sections(page: &mut String, sections: &[SectionInfo]) {
 }
 
 fn row(key: &Key) -> String {
-    let (value, without) = (value(key), without(key));
-    format!("| `{}` | {value} | {} | {without} | {} |\n", key.name, key.unit, key.about.trim())
+    let (value, default) = (value(key), default(key));
+    format!("| `{}` | {value} | {} | {default} | {} |\n", key.name, key.unit, key.about.trim())
 }
 
 /// Allowed values.
@@ -47,20 +48,20 @@ pub(crate) fn value(key: &Key) -> String {
     }
 }
 
-/// Effect of leaving it out.
-pub(crate) fn without(key: &Key) -> String {
+/// The default as code or in words; `required` if there is none.
+pub(crate) fn default(key: &Key) -> String {
     match key.presence {
         Presence::Required => "required".to_owned(),
-        Presence::Optional => "see meaning".to_owned(),
+        Presence::Optional(default) => default.to_owned(),
         Presence::Default(value) => format!("`{value}`"),
     }
 }
 
-/// How a table is written.
+/// The table's name as written in a file.
 pub(crate) fn heading(info: &SectionInfo) -> String {
     match (info.path, info.many) {
         ("", _) => "Top of the file".to_owned(),
-        (path, true) => format!("`[[{path}]]`, any number of times"),
+        (path, true) => format!("`[[{path}]]` (repeatable)"),
         (path, false) => format!("`[{path}]`"),
     }
 }

@@ -1,7 +1,7 @@
-//! Every key of the configuration file: meaning, type, unit, range and default, once.
+//! Every key of the configuration file, declared once with meaning, type, unit, range and default.
 //!
-//! From these lines come the reading, every fault's "must be", the reference page (`docs/src/reference/keys.md`), the manual page
-//! and, in a table that `gives` the parameters of an algorithm, those parameters. How a key is added: see
+//! These declarations drive the reading, every fault's "must be", the reference page (`docs/src/reference/keys.md`), the
+//! manual page and, in a table that `gives` the parameters of an algorithm, those parameters. How to add a key: see
 //! [`config`](super::super).
 
 mod algorithms;

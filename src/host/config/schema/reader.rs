@@ -1,4 +1,4 @@
-//! Reads the declared tables of a document and notes unknown keys, with the nearest known one.
+//! Reads the declared tables of a document. Unknown keys are faults, with the most similar known key as a hint.
 
 use std::collections::BTreeSet;
 
@@ -12,20 +12,20 @@ use crate::config::document::{Document, SourceLine};
 /// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
-    /// Whether syntax or tables are broken somewhere, so that a missing key may still be there: then none is reported as
-    /// missing.
+    /// Whether syntax or tables are broken somewhere. A key that was not found may then still exist, so none is reported
+    /// as missing.
     pub broken: bool,
 }
 
 impl<'a> SchemaReader<'a> {
-    /// A walk that has checked the document for unknown keys.
+    /// Creates a reader and notes the unknown keys of the document.
     pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo]) -> Self {
         let mut walk = Self { document, broken: document.broken };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
 
-    /// A table that is always read: without it in the file its required keys are missing.
+    /// A table that is always read. If it is absent, its required keys are missing.
     pub(crate) fn one<S: Section>(&self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
@@ -40,12 +40,12 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// A table that may be left out.
+    /// A table that may be absent.
     pub(crate) fn optional<S: Section>(&self) -> Option<S> {
         self.document.find(S::PATH).and_then(|_| self.one())
     }
 
-    /// A table that may be written any number of times; faulty ones are left out (and noted).
+    /// A repeatable table; faulty ones are noted and left out.
     pub(crate) fn many<S: Section>(&self) -> Vec<S> {
         let Some(DeValue::Array(items)) = self.document.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
@@ -60,7 +60,7 @@ impl<'a> SchemaReader<'a> {
         sections
     }
 
-    /// How often the table at `path` is written; what is no list of tables counts once.
+    /// How often the table at `path` is present; a value that is not a list counts once.
     pub(crate) fn count(&self, path: &str) -> usize {
         match self.document.find(path).map(Spanned::get_ref) {
             None => 0,
@@ -69,7 +69,7 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// Line of the table that the table at `path`, which is not written, would be in.
+    /// Line of the parent of `path`, for faults of a table that is absent.
     fn line_above(&self, path: &str) -> SourceLine {
         let above = path.rsplit_once('.').and_then(|(above, _)| self.document.find(above));
         above.map_or_else(|| self.document.first_line(), |value| self.document.line(&value.span()))
@@ -81,8 +81,8 @@ impl<'a> SchemaReader<'a> {
         S::read(&TableReader { document: self.document, broken: self.broken, table, place })
     }
 
-    /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema,
-    /// `shown` the one for people (with the number of a repeated table).
+    /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema, `shown` the
+    /// path in faults (with the number of a repeated table).
     fn refuse_unknown(&mut self, schema: &str, shown: &str, table: &'a DeTable<'a>, known: &[SectionInfo]) {
         let here = known.iter().find(|info| info.path == schema);
         if here.is_some_and(|info| info.keys.is_none()) {

@@ -1,8 +1,8 @@
-//! The mechanism behind every declared key: a line of [`section!`] gives its type, reading, faults and reference text.
+//! Declares tables and keys: one line of [`section!`] gives a key's type, reading, faults and reference text.
 //!
-//! [`section!`] declares a table of a file and, where the table `gives` a parameter struct, makes that struct of the keys.
-//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads declared tables from a document and notes every fault:
-//! missing, unknown, of the wrong type, out of range.
+//! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the keys.
+//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document and notes every
+//! fault: missing, unknown, of the wrong type, out of range.
 
 use toml::Spanned;
 use toml::de::DeValue;
@@ -15,9 +15,9 @@ pub(crate) trait Section: Sized {
     const PATH: &'static str;
     /// Purpose of the table.
     const ABOUT: &'static str;
-    /// Its keys.
+    /// The keys of the table.
     const KEYS: &'static [Key];
-    /// Reads it; `None` when a key is bad (noted in the faults).
+    /// Reads the table; `None` if a key is bad (noted in the faults).
     fn read(table: &TableReader<'_>) -> Option<Self>;
 }
 
@@ -26,55 +26,55 @@ pub(crate) trait Section: Sized {
 pub(crate) struct SectionInfo {
     /// Dotted path.
     pub path: &'static str,
-    /// Whether it is written `[[path]]`, any number of times.
+    /// Whether the table is written `[[path]]` and may be repeated.
     pub many: bool,
     /// Purpose of the table.
     pub about: &'static str,
-    /// Its keys; `None` = any key (notes for people).
+    /// The keys of the table; `None` = any key is allowed (notes for readers).
     pub keys: Option<&'static [Key]>,
 }
 
 impl SectionInfo {
-    /// A table written once.
+    /// A table that appears once.
     pub(crate) const fn one<S: Section>() -> Self {
         Self { path: S::PATH, many: false, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table written once or not at all.
+    /// A table that may be absent.
     pub(crate) const fn optional<S: Section>() -> Self {
         Self::one::<S>()
     }
 
-    /// A table written any number of times.
+    /// A repeatable table.
     pub(crate) const fn many<S: Section>() -> Self {
         Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table for people, never read.
+    /// A table for readers; the program ignores it.
     pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
         Self { path, many: false, about, keys: None }
     }
 }
 
-/// Declares a table of a file: the struct, its keys, how it is read and, after `gives`, the parameters it stands for.
+/// Declares a table of a file: the struct, its keys, how it is read and, after `gives`, the parameters it provides.
 ///
 /// ```text
 /// section! {
 ///     /// What the table is for.
 ///     Transition at "transition" gives TransitionConfig, |keys, pack_ah: f64| {
-///         /// A key that is the field of the same name.
+///         /// A key that sets the field of the same name.
 ///         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-///         /// A key from which a field is computed; behind an arrow alone, no field is.
-///         dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional => dead_band_a: keys.dead_band_a.unwrap_or(pack_ah / 50.0);
+///         /// A key from which a field is computed. With `=>` alone, the key sets no field.
+///         dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50") => dead_band_a: keys.dead_band_a.unwrap_or(pack_ah / 50.0);
 ///     } and {
 ///         a_field_without_a_key: 1.0,
 ///     }
 /// }
 /// ```
 ///
-/// The parameters are then those of `config(&self, pack_ah: f64) -> TransitionConfig`.
+/// This example generates `config(&self, pack_ah: f64) -> TransitionConfig`.
 macro_rules! section {
-    // Collects the fields of the parameters, one key at a time.
+    // Collects the fields of the parameter struct, one key at a time.
     (@fields $target:ident $keys:ident [$($done:tt)*]) => { $target { $($done)* } };
     (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident; $($rest:tt)*) => {
         $crate::config::schema::section!(@fields $target $keys [$($done)* $key: $keys.$key,] $($rest)*)
@@ -103,7 +103,7 @@ macro_rules! section {
         }
 
         impl $name {
-            /// The parameters these keys stand for.
+            /// The parameters that these keys set.
             pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target $(<$borrow>)? {
                 let $keys = self;
                 $crate::config::schema::section!(
@@ -149,29 +149,29 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// The field of [`tables!`] for a table: a list where it may be written many times.
+/// The field type in [`tables!`]: a list if the table is repeatable.
 macro_rules! table_field {
     (many $section:ty) => { Vec<$section> };
     ($kind:ident $section:ty) => { Option<$section> };
 }
 pub(crate) use table_field;
 
-/// Lists the tables of a file, in the order of the reference page: the struct of all of them and how it is read.
+/// Lists the tables of a file in the order of the reference page: generates their struct and how it is read.
 ///
-/// Each is `one` (always read: without it in the file its defaults hold, and its required keys are missing), `optional`
-/// (read where it is written) or `many` (`[[path]]`, any number of times); `with` names the tables that one of its keys holds.
+/// A table is `one` (always read: if it is absent, its defaults apply and its required keys are missing), `optional` (read
+/// if present) or `many` (`[[path]]`, repeatable). `with` names the tables inside one of its keys.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*
         #[derive(Debug)]
         pub(crate) struct $name {
-            /// The file, as people named it.
+            /// The file, as the user named it.
             pub file: String,
             /// Where faults are noted.
             pub faults: $crate::config::document::Faults,
-            /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
+            /// Whether the file's syntax or a table is broken. A table that was not found may then still exist.
             pub broken: bool,
-            /// How often each table is written, faulty or not.
+            /// How often each table is present, including faulty ones.
             written: std::collections::BTreeMap<&'static str, usize>,
             $( pub $field: $crate::config::schema::table_field!($kind $section), )+
         }
@@ -190,12 +190,12 @@ macro_rules! tables {
                 }
             }
 
-            /// Whether a table is written, faulty or not.
+            /// Whether a table is present, even if faulty.
             pub(crate) fn is_written<S: $crate::config::schema::Section>(&self) -> bool {
                 self.count::<S>() > 0
             }
 
-            /// How often a table is written, faulty or not.
+            /// How often a table is present, including faulty ones.
             pub(crate) fn count<S: $crate::config::schema::Section>(&self) -> usize {
                 self.written.get(S::PATH).copied().unwrap_or_default()
             }
@@ -236,7 +236,7 @@ impl<S: Section> Setting for SubTables<S> {
             let place = reader.document.place(&path, reader.document.line(&item.span()), table);
             S::read(&TableReader { table: Some(table), place, ..*reader })
         };
-        // Every one is read, so that each fault is noted.
+        // Reads every table before returning, so that each fault is noted.
         let tables: Vec<Option<S>> = items.iter().zip(1..).map(read).collect();
         Some(tables.into_iter().collect::<Option<Vec<S>>>().map(Self))
     }

@@ -1,4 +1,4 @@
-//! The types a key may have: how each is read from TOML.
+//! The types that a key may have, and how each is read from TOML.
 
 use std::ops::RangeInclusive;
 
@@ -7,7 +7,7 @@ use toml::de::{DeInteger, DeValue};
 
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 
-/// Most numbers in a row: more than any pack has cells.
+/// Most numbers in a sequence; more than any pack has cells.
 const MAX_ROW: usize = 2048;
 
 impl<T: Setting> Setting for Option<T> {
@@ -44,7 +44,7 @@ impl Setting for f64 {
     }
 }
 
-/// The number an integer in any of TOML's bases stands for; `None` when it does not fit.
+/// The value of an integer in any of TOML's bases; `None` if it does not fit.
 fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }
@@ -66,8 +66,8 @@ macro_rules! whole_numbers {
 whole_numbers!(u8, u16, u32, u64);
 
 impl Setting for String {
-    const KIND: &'static str = "a text";
-    const LIST_KIND: &'static str = "a list of texts";
+    const KIND: &'static str = "a string";
+    const LIST_KIND: &'static str = "a list of strings";
 
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
         let text = typed(value, value.get_ref().as_str())?;
@@ -88,7 +88,7 @@ impl<T: Setting> Setting for Vec<T> {
     }
 }
 
-/// Cell numbers as people write them: `"1-12, 15"`, counted from 1.
+/// Cell numbers in text form, `"1-12, 15"`, counted from 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct CellRanges(pub Vec<RangeInclusive<u16>>);
 
@@ -111,12 +111,12 @@ impl Setting for CellRanges {
     }
 }
 
-/// Numbers in a row: `"1-32"`.
+/// A range of numbers: `"1-32"`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct NumberRange(pub RangeInclusive<u16>);
 
 impl Setting for NumberRange {
-    const KIND: &'static str = "numbers in a row, like \"1-32\"";
+    const KIND: &'static str = "a range of numbers, like \"1-32\"";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         let parse = |text: &str| {

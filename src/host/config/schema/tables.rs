@@ -1,4 +1,4 @@
-//! The tables of a configuration file as they are read: one line per table.
+//! The tables of a configuration file: one line per table.
 
 use super::keys::{
     Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
@@ -13,7 +13,7 @@ use crate::config::document::TablePlace;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 tables! {
-    /// The tables of a file; `None` = not written, or faulty (and noted).
+    /// The tables of a file; `None` = absent, or faulty (noted).
     RawTables, SECTIONS {
         vehicle: one Vehicle,
         pack: one Pack,

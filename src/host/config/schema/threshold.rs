@@ -1,4 +1,4 @@
-//! Thresholds of alarms as they are written: `2.08`, `"80 %"`, `{ set = ..., clear = ... }`, and `when`.
+//! Thresholds of alarms as written in the file (`2.08`, `"80 %"`, `{ set = ..., clear = ... }`), and `when`.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -6,12 +6,12 @@ use toml::de::{DeTable, DeValue};
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 use crate::alarm::Comparison;
 
-/// A value to compare with: in the rule's unit, or relative.
+/// A threshold value: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Level {
     /// In the rule's unit.
     Absolute(f64),
-    /// A part of what a new cell has, from a text like "80 %".
+    /// A fraction of a new cell's value, from a string like "80 %".
     Relative(f64),
 }
 
@@ -19,7 +19,7 @@ pub(crate) enum Level {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Threshold {
     pub set: Level,
-    /// `None` = by the hysteresis.
+    /// `None` = follows from the hysteresis.
     pub clear: Option<Level>,
 }
 
@@ -35,7 +35,7 @@ impl Level {
 }
 
 impl Setting for Threshold {
-    const KIND: &'static str = "a number, a text like \"80 %\", or { set = ..., clear = ... } of these";
+    const KIND: &'static str = "a number, a string like \"80 %\", or { set = ..., clear = ... } of these";
 
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
         let DeValue::Table(table) = value.get_ref() else {

@@ -46,11 +46,11 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = 10\n",
-            "pack.toml:17: alarm[1].warning = 10, must be 0 to 1, or a text like \"20 %\"",
+            "pack.toml:17: alarm[1].warning = 10, must be 0 to 1, or a string like \"20 %\"",
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clera = 0.2 }\n",
-            "pack.toml:17: alarm[1].warning = { set = 0.1, clera = 0.2 }, must be a number, a text like \"80 %\", or { set \
+            "pack.toml:17: alarm[1].warning = { set = 0.1, clera = 0.2 }, must be a number, a string like \"80 %\", or { set \
              = ..., clear = ... } of these, -1000000000 to 1000000000 (the rule's)",
         ),
         (

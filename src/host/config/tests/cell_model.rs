@@ -6,7 +6,7 @@ use super::*;
 fn faults_of_a_cell_model() {
     let table: &[(&str, &str, &str)] = &[
         ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
-        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a text that is not empty"),
+        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a string that is not empty"),
         ("capacity_ah = 1.9", "capacity_ah = -1.9", "cell.toml:4: capacity_ah = -1.9, must be 0.001 to 100000"),
         (
             "voltage_max_v = 4.2",
