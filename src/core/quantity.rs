@@ -1,11 +1,11 @@
-//! Time, cell numbers, quality of a reading, and the conventions every module keeps.
+//! Time, cell numbers, the quality of a reading, and the conventions that every module keeps.
 //!
-//! Conventions inside the program (wire units and wire signs end in `can` and `config`):
+//! Conventions inside the program (only `can` and `config` use wire units and wire signs):
 //! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
 //! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
 //! * SOC and SOH are fractions 0..1.
 //!
-//! [`bounds`] states what each of them can be at most, [`catalogue`] which numbers are published, and under which names.
+//! [`bounds`] gives the physical limits of each quantity, [`catalogue`] lists the published quantities and their names.
 
 pub mod bounds;
 pub mod catalogue;
@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 
 /// A point on a clock that never steps, in integer nanoseconds.
 ///
-/// Its origin is the driver's choice (the daemon starts it at the wall time of its start, a log at the
-/// log's own stamps); only differences mean anything to the core.
+/// The driver chooses the origin: the daemon uses the wall time of its start, a replay the time stamps of its log. The
+/// core uses only differences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Timestamp(i64);
@@ -32,10 +32,10 @@ impl Timestamp {
         Self(nanos)
     }
 
-    /// From seconds since the clock's origin, rounded to the nearest nanosecond; saturates at the ends
-    /// of the range (292 years), NaN gives the origin.
+    /// From seconds since the clock's origin, rounded to the nearest nanosecond. Saturates at the ends of the range
+    /// (292 years). NaN gives the origin.
     pub fn from_secs(seconds: f64) -> Self {
-        // Whole seconds apart: their product with 1e9 would not fit a float's 53 bits.
+        // Convert whole seconds separately: a float's 53 bits cannot hold nanoseconds since 1970.
         let whole = seconds.floor();
         Self((whole as i64).saturating_mul(1_000_000_000).saturating_add(((seconds - whole) * 1e9).round() as i64))
     }
@@ -53,7 +53,7 @@ impl Timestamp {
     /// Seconds from `earlier` to `self`; negative when `earlier` is later.
     #[inline]
     pub fn since(self, earlier: Self) -> f64 {
-        // A branch that is never taken is cheaper than to saturate every time.
+        // A branch that is never taken costs less than saturating every time.
         let nanos = self.0.checked_sub(earlier.0).unwrap_or_else(|| self.0.saturating_sub(earlier.0));
         nanos as f64 * 1e-9
     }
@@ -82,31 +82,30 @@ pub struct InvalidState {
 
 impl InvalidState {
     /// Rejects the number unless `is_sound`.
+    /// Returns an error unless `is_sound`.
     pub fn unless(is_sound: bool, what: &'static str, found: f64, allowed: &'static str) -> Result<(), Self> {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
-
-    /// Rejects a number that is not finite, or whose square or cube may overflow. Measured values stay far below the bound.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::NUMBER.check(what, found)
     }
 
-    /// Rejects a number as [`Self::unless_number`] does, and negative ones.
+    /// Rejects negative numbers and those that [`Self::unless_number`] rejects.
     pub fn unless_natural(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
     }
 
-    /// Applies [`Self::unless_number`] to all; the error is the first one.
+    /// Applies [`Self::unless_number`] to every number and returns the first error.
     pub fn unless_numbers(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
         all.into_iter().try_for_each(|found| Self::unless_number(what, found))
     }
 
-    /// Applies [`Self::unless_natural`] to all; the error is the first one.
+    /// Applies [`Self::unless_natural`] to every number and returns the first error.
     pub fn unless_naturals(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
         all.into_iter().try_for_each(|found| Self::unless_natural(what, found))
     }
 
-    /// Rejects numbers at or near 0 as well, so that the caller can divide by the square.
+    /// Rejects numbers at or near 0, so that the caller can divide by the square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::VARIANCE.check(what, found)
     }
@@ -117,8 +116,8 @@ impl InvalidState {
     }
 }
 
-/// Largest number of cells (series elements) one daemon watches: 1,024, so that a cell number and
-/// "the pack as a whole" fit the 11-bit field of the alarm frame.
+/// Largest number of cells (series elements) of a pack. With 1,024, a cell number or "the whole pack" fits the 11-bit
+/// field of the alarm frame.
 pub const MAX_CELLS: usize = 1024;
 
 /// Index of a cell in the pack, from 0. Displays and DBC patterns may count from 1.
@@ -159,12 +158,12 @@ impl SensorIndex {
 
 /// Input that a configured signal feeds.
 ///
-/// Readings of one frame are processed in this order: a voltage triggers the estimator, so current and temperature of
-/// the same frame come first.
+/// The order is the order in which readings of one frame are processed: a voltage triggers the estimator, so current
+/// and temperature of the same frame come first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {
-    /// State of the pack's contactors: open ones mean no current.
+    /// State of the pack's contactors. When they are open, no current flows.
     Contactor,
     /// Pack current, A, positive = discharge after the configured sign.
     Current,
@@ -174,13 +173,15 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage, V.
     CellVoltage(CellIndex),
-    /// SOC as the pack itself reports it, fraction. Compared with the estimate, never used by it.
+    /// SOC reported by the pack, fraction. Only compared with the estimate, never used by it.
     ReportedSoc,
-    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with the estimate, never used by it.
+    /// SOH (capacity over rated capacity) reported by the pack, fraction. Only compared with the estimate, never used
+    /// by it.
     ReportedSoh,
-    /// Voltage of the vehicle's 12 V (or 24 V) supply, V: without enough of it nothing is asked. Never used by an estimate.
+    /// Voltage of the vehicle's 12 V (or 24 V) supply, V. If it is too low, no diagnostic requests are sent. Never used
+    /// by an estimate.
     SupplyVoltage,
-    /// Whether the BMS bleeds a cell: 0 = it does not. Only the diagnosis uses it.
+    /// Whether the BMS bleeds a cell; 0 = it does not. Only the diagnosis uses it.
     Balancing(CellIndex),
     /// Serial number of the pack, or another number that identifies it.
     PackIdentity,
@@ -192,7 +193,7 @@ pub enum Channel {
 pub enum Fault {
     /// The frame carries fewer bytes than the signal needs.
     ShortFrame,
-    /// Its frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
+    /// The frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
     EndToEnd,
     /// The sender marks the signal as not available.
     NotAvailable,
@@ -200,7 +201,7 @@ pub enum Fault {
     NotFinite,
     /// Outside the range the DBC or the configuration gives.
     OutOfRange,
-    /// Moved faster than the configured rate allows.
+    /// Changed faster than the configured rate allows.
     RateTooHigh,
     /// Unchanged for longer than the configured time while current flows.
     Stuck,
@@ -211,7 +212,7 @@ pub enum Fault {
 /// One value decoded from a frame, in the program's units and sign, or the fault that prevents it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// Input that it feeds.
+    /// The input that the reading belongs to.
     pub channel: Channel,
     /// The value, or the fault that makes it unusable.
     pub value: Result<f64, Fault>,

@@ -1,18 +1,19 @@
-//! Physical bounds: what a cell, a sensor and a clock can be, whatever a file or a bus says.
+//! Physical bounds: the range that a quantity of a cell, a sensor or a clock can have, regardless of what a file or a
+//! bus says.
 //!
-//! One place for every door: keys of the configuration and of a cell model, stored states, and the running filters, which start
-//! again where they leave them. A bound is wide: beyond it a number is certainly wrong, within it it may still be.
+//! The same bounds apply to configuration keys, cell models, stored states and the running filters, which restart when
+//! they leave them. The bounds are wide: a number outside is certainly wrong, a number inside may still be wrong.
 
 use super::InvalidState;
 
-/// A closed range, with its unit in words.
+/// A closed range, with a description that includes the unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
     /// Smallest value.
     pub low: f64,
     /// Largest value.
     pub high: f64,
-    /// Both in words, with the unit.
+    /// The range in words, with the unit.
     pub allowed: &'static str,
 }
 
@@ -21,58 +22,58 @@ impl Bounds {
         Self { low, high, allowed }
     }
 
-    /// Whether a value is within; NaN is not.
+    /// Whether the value is in the range; `false` for NaN.
     #[inline]
     pub fn has(&self, value: f64) -> bool {
         self.low <= value && value <= self.high
     }
 
-    /// Rejects a value of a stored state that is not within.
+    /// Rejects a value of a stored state outside the range.
     ///
     /// # Errors
-    /// The value, and what is allowed.
+    /// The value and the allowed range.
     pub fn check(&self, what: &'static str, found: f64) -> Result<(), InvalidState> {
         InvalidState::unless(self.has(found), what, found, self.allowed)
     }
 
-    /// Applies [`Self::check`] to all.
+    /// Applies [`Self::check`] to every value.
     ///
     /// # Errors
-    /// The first value that is not within.
+    /// The first value outside the range.
     pub fn check_all(&self, what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), InvalidState> {
         all.into_iter().try_for_each(|found| self.check(what, found))
     }
 }
 
-/// Capacity of a cell as it is configured, Ah: from a cell of a watch to a hundred times the largest cell that is made.
+/// Capacity of a cell in the configuration, Ah: from a watch cell to a hundred times the largest cell on the market.
 pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 Ah");
 
-/// Capacity of a cell as it is estimated, Ah: a thousandth of the smallest cell to ten thousand times the largest.
+/// Estimated capacity of a cell, Ah: from a thousandth of the smallest cell to ten thousand times the largest.
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
-/// SOC in a running filter: beyond empty and full as far as a model's curve is continued. A filter beyond it starts again.
+/// SOC in a running filter: as far beyond empty and full as a model's curve is extrapolated. A filter outside restarts.
 pub const FILTER_SOC: Bounds = Bounds::new(-0.5, 1.5, "-0.5 to 1.5");
 
-/// SOC in a filter that is believed: the errors of a curve's ends, no more.
+/// SOC of a trusted estimate: allows for the error at the ends of a curve.
 pub const TRUSTED_SOC: Bounds = Bounds::new(-0.1, 1.1, "-0.1 to 1.1");
 
-/// SOC in a stored state: earlier programs let a filter go further than [`FILTER_SOC`].
+/// SOC in a stored state. Wider than [`FILTER_SOC`], because earlier versions allowed a filter to go further.
 pub const STORED_SOC: Bounds = Bounds::new(-10.0, 10.0, "-10 to 10");
 
-/// ln of a cell's resistance relative to new: no cell has a thousand times the resistance of a new one, or a thousandth.
+/// Natural logarithm of a cell's resistance relative to new: a factor of about 1,000 in both directions.
 pub const LOG_RESISTANCE: Bounds = Bounds::new(-7.0, 7.0, "-7 to 7");
 
-/// The same where it is believed: 33 times.
+/// Like [`LOG_RESISTANCE`], for a trusted estimate: a factor of 33.
 pub const TRUSTED_LOG_RESISTANCE: Bounds = Bounds::new(-3.5, 3.5, "-3.5 to 3.5");
 
-/// Capacity that is learned and believed, relative to that of the model or the configured one: a worn cell keeps more than a
-/// twentieth, and no cell has three times its label.
+/// Learned capacity that is trusted, relative to the cell model's or the configured capacity: a worn cell keeps more
+/// than a twentieth, and no cell has three times its label.
 pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's");
 
 /// Configured initial capacity relative to the cell model's.
 pub const INITIAL_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell model's");
 
-/// Resistance in a cell, ohm: a bar of copper to a cell of a watch.
+/// Resistance in a cell, ohm: from a copper bar to a watch cell.
 pub const RESISTANCE_OHM: Bounds = Bounds::new(1e-9, 1e3, "1e-9 to 1000 ohm");
 
 /// Capacitance of a branch, F.
@@ -81,34 +82,34 @@ pub const CAPACITANCE_F: Bounds = Bounds::new(1e-6, 1e12, "1e-6 to 1e12 F");
 /// Temperature of a cell, degrees C.
 pub const TEMPERATURE_C: Bounds = Bounds::new(-100.0, 200.0, "-100 to 200 degrees C");
 
-/// Voltage of a cell, V; a reading may be that of a broken wire.
+/// Voltage of a cell, V. The reading may come from a broken wire.
 pub const VOLTAGE_V: Bounds = Bounds::new(-1e3, 1e3, "-1000 to 1000 V");
 
 /// Current of a pack, A.
 pub const CURRENT_A: Bounds = Bounds::new(-1e6, 1e6, "-1e6 to 1e6 A");
 
-/// Time that passes, s: 300 years.
+/// Duration, s: up to 300 years.
 pub const TIME_S: Bounds = Bounds::new(0.0, 1e10, "0 to 1e10 s");
 
 /// Counted charge, As: [`CURRENT_A`] for [`TIME_S`].
 pub const CHARGE_AS: Bounds = Bounds::new(-1e16, 1e16, "-1e16 to 1e16 As");
 
-/// A point in time, ns: the difference of two fits the clock's range.
+/// A point in time, ns. The difference of two points fits the clock's range.
 pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of the clock's origin");
 
-/// Most of a number without a bound of its own: its square and its cube do not overflow.
+/// Any number without a more specific bound: its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
-/// Variance, in the square of its unit: a caller can divide by its square.
+/// Variance, in the square of its unit. The caller can divide by its square.
 pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 
-/// Standard deviation or noise density of the configuration, in its unit.
+/// Standard deviation or noise density in the configuration, in its unit.
 pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 
-/// Standard deviation of a voltage sensor's noise, V: no converter is better than the lowest.
+/// Standard deviation of a voltage sensor's noise, V. No converter is better than the lower bound.
 pub const VOLTAGE_NOISE_V: Bounds = Bounds::new(1e-6, 10.0, "1e-6 to 10 V");
 
-/// Spread of the sigma points: below it their differences are lost in rounding.
+/// Spread of the sigma points. Below the lower bound, their differences are lost in rounding.
 pub const SIGMA_POINT_SPREAD: Bounds = Bounds::new(1e-3, 1.0, "0.001 to 1");
 
 #[cfg(test)]
@@ -116,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ends_are_within_and_nan_is_not() {
+    fn range_includes_ends_but_not_nan() {
         assert!(TEMPERATURE_C.has(-100.0) && TEMPERATURE_C.has(200.0));
         assert!(!TEMPERATURE_C.has(f64::NAN) && !TEMPERATURE_C.has(200.1) && !TEMPERATURE_C.has(f64::INFINITY));
         let fault = TIME_S.check_all("a time", [1.0, -1.0]).expect_err("negative");
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_may_be_configured_may_be_estimated_and_stored() {
+    fn narrower_bounds_lie_within_wider_ones() {
         for (inner, outer) in [
             (CONFIGURED_CAPACITY_AH, CAPACITY_AH),
             (TRUSTED_SOC, FILTER_SOC),

@@ -1,8 +1,9 @@
-//! The catalogue: every number that is published of the pack and of its cells, each declared once.
+//! Catalogue of every published number of the pack and its cells.
 //!
-//! [`TABLE`] has a row per quantity: its keys in JSON, its unit, and for the pack and for a cell a description and the names in
-//! metrics, MQTT and VSS. Status document, metrics, MQTT entities, VSS signals, export and the manual's page iterate over it; the
-//! [`Monitor`](crate::monitor::Monitor) sets the values. To publish another number, add a row here and set it there.
+//! [`TABLE`] has a row per quantity: its JSON keys, its unit, and for the pack and for a cell a description and the
+//! names in metrics, MQTT and VSS. The status document, metrics, MQTT entities, VSS signals, exports and the manual's
+//! page iterate over it; the [`Monitor`](crate::monitor::Monitor) sets the values. To publish another number, add a row
+//! here and set its value in the monitor.
 
 use std::fmt;
 
@@ -20,7 +21,7 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// One of its numbers.
+    /// The mean or the standard deviation.
     pub fn part(self, part: Part) -> Option<f64> {
         match part {
             Part::Mean => Some(self.mean),
@@ -28,7 +29,7 @@ impl Estimate {
         }
     }
 
-    /// Without what is not finite; `None` = the mean.
+    /// Drops a standard deviation that is not finite; `None` = the mean is not finite.
     fn known(self) -> Option<Self> {
         let std = self.std.filter(|std| std.is_finite());
         self.mean.is_finite().then_some(Self { std, ..self })
@@ -56,14 +57,14 @@ pub enum Part {
     Std,
 }
 
-/// Unit of a quantity inside the program. Each output converts it: see the `match` on it there.
+/// Unit of a quantity inside the program. Each output converts it with a `match`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
-    /// Part of a full or a new battery, 0 to 1.
+    /// Fraction of a full or of a new battery, 0 to 1.
     Level,
-    /// Any other part, 0 to 1.
+    /// Any other fraction, 0 to 1.
     Fraction,
-    /// Times as new.
+    /// Multiple of the value when new.
     Ratio,
     /// V.
     Volts,
@@ -82,7 +83,7 @@ pub enum Unit {
 }
 
 impl Unit {
-    /// As tables write it.
+    /// The unit as written in tables.
     pub const fn symbol(self) -> &'static str {
         match self {
             Self::Level | Self::Fraction => "fraction",
@@ -98,25 +99,25 @@ impl Unit {
     }
 }
 
-/// Path of a VSS signal. That of the standard deviation follows from it.
+/// Path of a VSS signal. The path of the standard deviation is derived from it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VssPath {
-    /// Of VSS itself, below its branch of the battery.
+    /// A signal of standard VSS, below its battery branch.
     Standard(&'static str),
-    /// Of the overlay, below the configured branch.
+    /// A signal of the overlay, below the configured branch.
     Overlay(&'static str),
 }
 
-/// What describes a quantity of one owner: the pack, or each cell.
+/// Description and names of a quantity for one owner: the pack, or each cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Presentation {
     /// Description, for readers.
     pub about: &'static str,
     /// Key in MQTT; `None` = not published there.
     pub mqtt_key: Option<&'static str>,
-    /// Name of its entity in Home Assistant; empty for a cell, which has none.
+    /// Name of its entity in Home Assistant; empty for a cell, which has no entity.
     pub mqtt_name: &'static str,
-    /// Signal of VSS.
+    /// VSS signal.
     pub vss: VssPath,
 }
 
@@ -125,22 +126,22 @@ pub struct Presentation {
 pub struct QuantityRow {
     /// The quantity.
     pub quantity: Quantity,
-    /// Key of its mean in JSON, and name of its column.
+    /// JSON key and column name of its mean.
     pub key: &'static str,
-    /// The same of its standard deviation; `None` = it has none.
+    /// JSON key and column name of its standard deviation; `None` = it has none.
     pub std_key: Option<&'static str>,
     /// Unit.
     pub unit: Unit,
-    /// Name of its metric without prefix and unit.
+    /// Name of its metric, without prefix and unit.
     pub metric: &'static str,
-    /// As a value of the pack; `None` = only cells have it.
+    /// Presentation as a value of the pack; `None` = only cells have it.
     pub pack: Option<Presentation>,
-    /// As a value of a cell; `None` = only the pack has it.
+    /// Presentation as a value of a cell; `None` = only the pack has it.
     pub cell: Option<Presentation>,
 }
 
 impl QuantityRow {
-    /// The key of each number that it has.
+    /// The keys of its mean and, if it has one, its standard deviation.
     pub fn parts(&self) -> impl Iterator<Item = (Part, &'static str)> + use<> {
         [(Part::Mean, self.key)].into_iter().chain(self.std_key.map(|key| (Part::Std, key)))
     }
@@ -356,13 +357,13 @@ impl Quantity {
     }
 }
 
-/// The values of the pack, or of a cell. `None` = unknown.
+/// The values of the pack or of one cell. `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Values<const IS_PACK: bool>([Option<Estimate>; TABLE.len()]);
 
 /// The values of the pack.
 pub type PackValues = Values<true>;
-/// The values of a cell.
+/// The values of one cell.
 pub type CellValues = Values<false>;
 
 impl<const IS_PACK: bool> Default for Values<IS_PACK> {
@@ -372,37 +373,37 @@ impl<const IS_PACK: bool> Default for Values<IS_PACK> {
 }
 
 impl<const IS_PACK: bool> Values<IS_PACK> {
-    /// The rows of its owner, each with its presentation.
+    /// The rows that apply to this owner, each with its presentation.
     pub fn rows() -> impl Iterator<Item = (&'static QuantityRow, &'static Presentation)> {
         TABLE.iter().filter_map(|row| Some((row, if IS_PACK { row.pack.as_ref() } else { row.cell.as_ref() }?)))
     }
 
-    /// A value.
+    /// The value of a quantity.
     pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
         self.0[quantity as usize]
     }
 
-    /// Its mean.
+    /// The mean of a quantity.
     pub fn mean(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity).map(|estimate| estimate.mean)
     }
 
-    /// Its standard deviation.
+    /// The standard deviation of a quantity.
     pub fn std(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity)?.std
     }
 
-    /// Either of them.
+    /// The mean or the standard deviation of a quantity.
     pub fn part(&self, quantity: Quantity, part: Part) -> Option<f64> {
         self.get(quantity)?.part(part)
     }
 
-    /// Sets a value. A mean that is not finite is unknown, and so is a standard deviation.
+    /// Sets a value. A mean or a standard deviation that is not finite becomes unknown.
     pub fn set(&mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) {
         self.0[quantity as usize] = value.map(Into::into).and_then(Estimate::known);
     }
 
-    /// The same values with another one.
+    /// Returns the values with one of them replaced.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         self.set(quantity, value);
@@ -422,7 +423,7 @@ impl<'de, const IS_PACK: bool> Deserialize<'de> for Values<IS_PACK> {
     }
 }
 
-/// The quantities that are recorded after each half-cycle of a cell: in the event `capacity`, in the history and in exported tables.
+/// Quantities recorded after each half-cycle of a cell: in the event `capacity`, in the history and in exported tables.
 pub const RECORDED: [Quantity; 3] = [Quantity::Capacity, Quantity::UsableCapacity, Quantity::ResistanceRatio];
 
 /// Values of the [`RECORDED`] quantities of a cell. `None` = unknown.
@@ -430,22 +431,22 @@ pub const RECORDED: [Quantity; 3] = [Quantity::Capacity, Quantity::UsableCapacit
 pub struct RecordedValues([Option<Estimate>; RECORDED.len()]);
 
 impl RecordedValues {
-    /// A value; `None` also for a quantity that is not recorded.
+    /// The value of a quantity; `None` if it is unknown or not recorded.
     pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
         RECORDED.iter().zip(self.0).find(|(recorded, _)| **recorded == quantity)?.1
     }
 
-    /// Its mean.
+    /// The mean of a quantity.
     pub fn mean(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity).map(|estimate| estimate.mean)
     }
 
-    /// Its mean and standard deviation.
+    /// Mean and standard deviation of a quantity.
     pub fn pair(&self, quantity: Quantity) -> Option<(f64, f64)> {
         self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
     }
 
-    /// The same values with another one of a recorded quantity.
+    /// Returns the values with one of them replaced. Ignores quantities that are not recorded.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         let value = value.map(Into::into).and_then(Estimate::known);
@@ -455,7 +456,7 @@ impl RecordedValues {
         self
     }
 
-    /// The names of the values in order, means before their standard deviations.
+    /// The keys of the values in order, each mean before its standard deviation.
     pub fn keys() -> impl Iterator<Item = &'static str> {
         RECORDED.into_iter().flat_map(|quantity| quantity.row().parts().map(|(_, key)| key))
     }
@@ -474,7 +475,7 @@ impl<'de> Deserialize<'de> for RecordedValues {
     }
 }
 
-/// Writes values by their keys.
+/// Writes the values as a map by key.
 fn write<S: Serializer>(
     serializer: S,
     values: impl Iterator<Item = (&'static QuantityRow, Option<Estimate>)>,
@@ -524,7 +525,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_quantity_has_its_own_row_with_names_of_its_own() {
+    fn quantity_rows_are_in_order_with_unique_keys() {
         assert!(TABLE.iter().enumerate().all(|(index, row)| row.quantity as usize == index));
         let keys: Vec<_> = TABLE.iter().flat_map(|row| [Some(row.key), row.std_key]).flatten().collect();
         assert_eq!(keys.iter().collect::<BTreeSet<_>>().len(), keys.len());
@@ -544,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn values_survive_json_and_unknown_is_null() {
+    fn json_round_trip_keeps_values_and_unknowns() {
         let values = CellValues::default()
             .with(Quantity::Soc, Some(Estimate { mean: 0.5, std: Some(0.01) }))
             .with(Quantity::Voltage, Some(3.6))
