@@ -1,9 +1,8 @@
 //! One alarm machine per rule, severity and cell; reports their changes.
 //!
-//! In: values in each rule's unit with the time of the look, and commands. Out: [`AlarmChange`]s and the list of raised
-//! alarms in the order rule, severity, cell (the pack first). One rule may have a threshold per severity; each has
-//! alarms of its own. A value for a rule that is not configured, or for a cell a rule does not watch, concerns no alarm
-//! and is ignored.
+//! In: values in each rule's unit with the time of their comparison, and commands. Out: [`AlarmChange`]s and the list
+//! of raised alarms in the order rule, severity, cell (the pack first). A rule may have one threshold per severity;
+//! each threshold has its own alarms. Values are ignored if their rule is not configured or does not watch their cell.
 
 pub mod summary;
 
@@ -17,65 +16,65 @@ use super::rule::{Rule, Scope, Severity};
 use super::selector::{CommandOutcome, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// An alarm as it is now.
+/// Current state of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {
-    /// Which rule.
+    /// The rule.
     pub rule: Rule,
     /// Its severity.
     pub severity: Severity,
-    /// Which cell; `None` = the pack.
+    /// The cell; `None` = the pack.
     pub cell: Option<CellIndex>,
     /// Its state.
     pub state: AlarmState,
-    /// The latest value, in the rule's unit; `None` = not known (any more).
+    /// The latest value, in the rule's unit; `None` = unknown.
     pub value: Option<f64>,
-    /// Probability that the truth is beyond the threshold; `None` = the value has no standard deviation.
+    /// Probability that the true value is beyond the threshold; `None` = the value has no standard deviation.
     pub probability: Option<f64>,
-    /// What it is compared with.
+    /// The configured threshold, in the rule's unit.
     pub threshold: f64,
-    /// Times it was raised.
+    /// How often the alarm was raised.
     pub occurrences: u32,
-    /// Comparison it was raised for the first of these times; `None` = never.
+    /// Time of the comparison that raised it first; `None` = never raised.
     pub first_raised: Option<Timestamp>,
-    /// Comparison it was raised last.
+    /// Time of the comparison that raised it last; `None` = never raised.
     pub last_raised: Option<Timestamp>,
     /// The value that raised it last; `None` = never raised.
     pub raised_value: Option<f64>,
-    /// Whether it has been acknowledged since it was raised last.
+    /// Whether it has been acknowledged since it was last raised.
     pub is_acknowledged: bool,
 }
 
-/// A change of an alarm, and the alarm after it.
+/// A change of an alarm, with the state of the alarm after the change.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AlarmChange {
     /// The change.
     pub change: Change,
-    /// The alarm after it.
+    /// The alarm after the change.
     pub alarm: Alarm,
 }
 
 /// Summary of all alarms of one threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ThresholdState {
-    /// Which rule.
+    /// The rule.
     pub rule: Rule,
     /// Its severity.
     pub severity: Severity,
-    /// Whether one of its alarms is raised.
+    /// Whether any alarm of the threshold is raised.
     pub is_raised: bool,
-    /// Times the most often raised of them was raised.
+    /// Largest number of times that one of its alarms was raised.
     pub occurrences: u32,
 }
 
 /// One alarm of a stored state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StoredAlarm {
-    /// Which rule.
+    /// The rule.
     pub rule: Rule,
     /// Its severity.
     pub severity: Severity,
-    /// Which cell; `None` = the pack.
+    /// The cell; `None` = the pack.
     pub cell: Option<CellIndex>,
     machine: Machine,
 }
@@ -86,13 +85,13 @@ impl StoredAlarm {
         self.machine.state.is_raised()
     }
 
-    /// Times it was raised.
+    /// How often it was raised.
     pub fn occurrences(&self) -> u32 {
         self.machine.occurrences
     }
 }
 
-/// One alarm with its latest value: what a snapshot keeps for a continuation without a break.
+/// One alarm with its latest value, as stored in a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunningAlarm {
     #[serde(flatten)]
@@ -102,14 +101,14 @@ pub struct RunningAlarm {
     probability: Option<f64>,
 }
 
-/// Stored part of an engine: every alarm that was raised or is about to be.
+/// Stored part of an engine: every alarm that was raised or is pending.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct AlarmSnapshot {
     alarms: Vec<StoredAlarm>,
 }
 
 impl AlarmSnapshot {
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Moves every time stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         for alarm in &mut self.alarms {
             alarm.machine.rebase(by_nanos);
@@ -117,17 +116,17 @@ impl AlarmSnapshot {
     }
 }
 
-/// The slots of one threshold: the pack's first where it has one, then its cells in order.
+/// The slots of one threshold: first the pack's slot, if the rule has one, then the cells' slots in order.
 #[derive(Debug, Clone)]
 struct RuleSlots {
     config: RuleConfig,
     first: usize,
     pack_slots: usize,
     cell_slots: usize,
-    /// Alarms of it whose value is not known.
+    /// Number of alarms whose value is unknown.
     unknown: usize,
-    /// Alarms of it that are not at rest.
-    restless: usize,
+    /// Number of alarms that are not at rest ([`IndexEntry::is_at_rest`]).
+    not_at_rest: usize,
 }
 
 impl RuleSlots {
@@ -138,7 +137,7 @@ impl RuleSlots {
             Scope::Both => (1, cells),
         };
         let all = pack_slots + cell_slots;
-        Self { config, first, pack_slots, cell_slots, unknown: all, restless: all }
+        Self { config, first, pack_slots, cell_slots, unknown: all, not_at_rest: all }
     }
 
     fn slots(&self) -> Range<usize> {
@@ -161,19 +160,19 @@ impl RuleSlots {
 /// All alarms of a pack.
 #[derive(Debug, Clone)]
 pub struct AlarmEngine {
-    /// In the order of wire number, then severity.
+    /// Sorted by wire number, then severity.
     rules: Vec<RuleSlots>,
-    /// Where in `rules` each rule's thresholds are, by wire number.
+    /// Range in `rules` of each rule's thresholds, by wire number.
     by_rule: [Range<usize>; Rule::ALL.len() + 1],
     machines: Vec<Machine>,
-    /// Raised slots, rising: what `raised` walks.
+    /// Raised slots in ascending order, for `raised`.
     raised: Vec<usize>,
-    /// Slots whose debounce runs, rising: what `poll` walks.
+    /// Slots with a running debounce in ascending order, for `poll`.
     counting: Vec<usize>,
 }
 
 impl AlarmEngine {
-    /// An engine with every alarm unknown.
+    /// Creates an engine in which every alarm is unknown.
     pub fn new(mut rules: Vec<RuleConfig>, cells: u16) -> Self {
         rules.sort_by_key(|config| (config.rule, config.severity));
         let mut slots: Vec<RuleSlots> = Vec::with_capacity(rules.len());
@@ -195,7 +194,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Takes the value of `rule` for `cell` (`None` = the pack) at `now`.
+    /// Handles the value of `rule` for `cell` (`None` = the pack) at `now`.
     pub fn observe(
         &mut self,
         now: Timestamp,
@@ -207,16 +206,16 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether values of `rule`, whatever cell they are of, change nothing as long as none is worse than `worst`: every
-    /// alarm is at rest, and that is not beyond a threshold. Also when nothing watches the rule.
+    /// Whether values of `rule` up to `worst` change no alarm, for any cell: every alarm of the rule is at rest, and
+    /// `worst` is not beyond a threshold. Also true if the rule is not configured.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
             let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;
-            slots.restless == 0 && !is_beyond()
+            slots.not_at_rest == 0 && !is_beyond()
         })
     }
 
-    /// A cell's or the pack's value of a rule for which [`is_quiet`](Self::is_quiet) holds: it is shown, nothing else.
+    /// Stores a value for display. The caller makes sure that [`is_quiet`](Self::is_quiet) holds for it.
     #[inline]
     pub fn show(&mut self, rule: Rule, cell: Option<CellIndex>, value: f64) {
         for slots in &self.rules[self.by_rule[usize::from(rule as u8)].clone()] {
@@ -226,21 +225,22 @@ impl AlarmEngine {
         }
     }
 
-    /// Lets time pass for the values that hold until the next one ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
+    /// Advances the debounce of values that stay valid until the next one
+    /// ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
             let is_learned = self.rules[index].config.rule.spec().is_learned;
-            // A change takes the slot out of the list.
+            // A slot whose alarm changes leaves the list.
             let has_changed =
                 is_learned && self.change(index, slot, changes, |machine, config| machine.poll(now, config));
             next += usize::from(!has_changed);
         }
     }
 
-    /// No value comes until the next one (asleep, restarted, log with a hole): for values that do not hold
-    /// between readings the time up to then does not count.
+    /// Handles a period without values (vehicle asleep, restart, hole in a log): it does not count towards the debounce
+    /// of measured values.
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
@@ -251,7 +251,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Forgets alarms on learned values, and their past: another pack is connected.
+    /// Forgets alarms on learned values and their history, because another pack is connected.
     pub fn forget_learned(&mut self, changes: &mut Vec<AlarmChange>) {
         for index in 0..self.rules.len() {
             if !self.rules[index].config.rule.spec().is_learned {
@@ -267,7 +267,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Raised alarms in stable order: rule, severity, cell (the pack first).
+    /// Raised alarms in the order rule, severity, cell (the pack first).
     pub fn raised(&self) -> impl ExactSizeIterator<Item = Alarm> + '_ {
         self.raised.iter().map(|&slot| self.alarm(self.rule_of(slot), slot))
     }
@@ -280,19 +280,18 @@ impl AlarmEngine {
             .flat_map(move |(index, rule)| rule.slots().map(move |slot| self.alarm(index, slot)))
     }
 
-    /// Raised alarms.
+    /// Number of raised alarms.
     pub fn count(&self) -> usize {
         self.raised.len()
     }
 
-    /// The alarm of a rule and cell as it is now (the worst severity's, when the rule has several thresholds); `None` =
-    /// nothing watches it.
+    /// The alarm of a rule and cell (of the worst severity if the rule has several thresholds); `None` = not watched.
     pub fn get(&self, rule: Rule, cell: Option<CellIndex>) -> Option<Alarm> {
         let index = self.by_rule[usize::from(rule as u8)].clone().next_back()?;
         self.rules[index].slot(cell).map(|slot| self.alarm(index, slot))
     }
 
-    /// The part to be stored.
+    /// The state to store.
     pub fn snapshot(&self) -> AlarmSnapshot {
         let of_rule = |rule: &RuleSlots| {
             let kept = rule.slots().filter(|&slot| self.machines[slot].is_worth_storing());
@@ -307,8 +306,8 @@ impl AlarmEngine {
         AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Restores a stored state (rebased by the caller); returns those of its alarms that no configured threshold
-    /// watches any more: they are gone, and the caller reports them.
+    /// Restores a stored state whose times the caller has rebased. Returns the alarms that no configured threshold
+    /// watches any longer; the caller reports them.
     pub fn restore(&mut self, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
@@ -318,14 +317,14 @@ impl AlarmEngine {
                 orphans.push(alarm.clone());
                 continue;
             };
-            // Its value comes with the next observation.
+            // The value arrives with the next observation.
             self.machines[slot] = alarm.machine.without_value();
             self.update_index(index, slot, Machine::default().index_entry());
         }
         orphans
     }
 
-    /// Every alarm that is not as at the start.
+    /// Every alarm that differs from its initial state.
     pub fn running(&self) -> Vec<RunningAlarm> {
         let of_rule = |rule: &RuleSlots| {
             let used = rule.slots().filter(|&slot| self.machines[slot] != Machine::default());
@@ -343,7 +342,7 @@ impl AlarmEngine {
         self.rules.iter().flat_map(of_rule).collect()
     }
 
-    /// Continues each alarm as it was, with its value; those that no threshold watches are left out.
+    /// Restores alarms with their values. Ignores alarms that no threshold watches.
     pub fn resume(&mut self, alarms: &[RunningAlarm]) {
         for RunningAlarm { alarm, is_known, observation, probability } in alarms {
             let Some((index, slot)) = self.locate(alarm.rule, alarm.severity, alarm.cell) else { continue };
@@ -355,8 +354,8 @@ impl AlarmEngine {
         }
     }
 
-    /// Continues with other rules: an alarm with a rule, severity and cell that are still watched stays, and is judged again
-    /// when its threshold is another one; any other that is raised or has been is forgotten. Returns the number of those.
+    /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept, and compared again if its
+    /// threshold changed. Other alarms that are or were raised are forgotten; returns their number.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,
@@ -412,7 +411,7 @@ impl AlarmEngine {
         }
     }
 
-    /// Changes one machine and all that is known of it here; returns whether the change is published.
+    /// Applies `act` to one machine and updates the lists and counts; returns whether the alarm changed.
     #[inline]
     fn change(
         &mut self,
@@ -464,7 +463,7 @@ impl AlarmEngine {
 
     fn alarm(&self, index: usize, slot: usize) -> Alarm {
         let (rule, machine) = (&self.rules[index], &self.machines[slot]);
-        let has_been = machine.occurrences > 0;
+        let was_raised = machine.occurrences > 0;
         Alarm {
             rule: rule.config.rule,
             severity: rule.config.severity,
@@ -474,14 +473,14 @@ impl AlarmEngine {
             probability: machine.probability.filter(|_| machine.is_known),
             threshold: rule.config.threshold,
             occurrences: machine.occurrences,
-            first_raised: has_been.then_some(machine.first_raised),
-            last_raised: has_been.then_some(machine.last_raised),
-            raised_value: machine.raised_value.filter(|_| has_been),
+            first_raised: was_raised.then_some(machine.first_raised),
+            last_raised: was_raised.then_some(machine.last_raised),
+            raised_value: machine.raised_value.filter(|_| was_raised),
             is_acknowledged: machine.is_acknowledged,
         }
     }
 
-    /// Updates the lists and counts after a machine has changed.
+    /// Updates the lists and counts after a machine changed.
     fn update_index(&mut self, index: usize, slot: usize, before: IndexEntry) {
         let now = self.machines[slot].index_entry();
         if now == before {
@@ -489,7 +488,7 @@ impl AlarmEngine {
         }
         let rule = &mut self.rules[index];
         rule.unknown = rule.unknown + usize::from(!now.is_known) - usize::from(!before.is_known);
-        rule.restless = rule.restless + usize::from(!now.is_at_rest) - usize::from(!before.is_at_rest);
+        rule.not_at_rest = rule.not_at_rest + usize::from(!now.is_at_rest) - usize::from(!before.is_at_rest);
         set_member(&mut self.raised, slot, now.is_raised);
         set_member(&mut self.counting, slot, now.is_counting);
     }

@@ -1,9 +1,9 @@
-//! Every input of an alarm engine as a value, so that another engine can take the same inputs.
+//! Every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
 //! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the same as the engine's own
 //! methods. The values do not depend on thresholds, so an engine with other thresholds and the same inputs does what a
-//! monitor with those thresholds would have done (except `input_missing`: its strictest threshold decides whether a
-//! silence is passed to the engine at all).
+//! monitor with those thresholds would have done. Exception: for `input_missing`, the strictest threshold decides
+//! whether the monitor reports a silence to the engine at all.
 
 use super::engine::{AlarmChange, AlarmEngine};
 use super::limit::Observation;
@@ -17,21 +17,21 @@ use crate::quantity::{CellIndex, Timestamp};
 pub enum AlarmInput {
     /// [`AlarmEngine::observe`].
     Observe {
-        /// Of which rule.
+        /// The rule.
         rule: Rule,
-        /// Of which cell; `None` = of the pack.
+        /// The cell; `None` = the pack.
         cell: Option<CellIndex>,
         /// The value.
         observation: Observation,
     },
-    /// Whether the inputs a learned value came from are valid now: while they are not, the value cannot be renewed, and
-    /// nothing is raised or cleared by it. For rules whose value is measured all the time it does nothing.
+    /// Whether the inputs of a learned value are valid now. While they are not, the value cannot be renewed and changes
+    /// no alarm. Ignored for rules that are not learned.
     InputsValid {
-        /// Of which rule.
+        /// The rule.
         rule: Rule,
-        /// Of which cell; `None` = of the pack.
+        /// The cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// Whether they are.
+        /// Whether the inputs are valid.
         valid: bool,
     },
     /// [`AlarmEngine::poll`].
@@ -40,15 +40,16 @@ pub enum AlarmInput {
     Gap,
     /// Acknowledges alarms.
     Acknowledge(Selector),
-    /// Clears alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten; those that
-    /// are active, or whose value has not been healthy since, stay and count as refused. No learned value is touched.
+    /// Clears alarms: latched alarms end (unless they are beyond their threshold again), the history of past alarms is
+    /// forgotten. Alarms that are active, or whose value has not been healthy since, stay and count as refused. Learned
+    /// values do not change.
     Clear(Selector),
     /// [`AlarmEngine::forget_learned`].
     ForgetLearned,
 }
 
 impl AlarmEngine {
-    /// Takes one input at `now`; returns the outcome of a command.
+    /// Handles one input at `now`; returns the outcome of a command.
     pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         match *input {
             AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),

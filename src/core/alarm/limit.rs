@@ -1,20 +1,21 @@
-//! A value against a rule: beyond, between, healthy, or not to be judged.
+//! Compares a value with a rule's thresholds: beyond, between, healthy or unknown.
 //!
-//! A rule compares the value itself (`when = "mean"`), or the probability that the truth is beyond the threshold
-//! (`when = { probability = p }`): the value is then taken as normally distributed with its standard deviation, and
+//! A rule compares the value itself (`when = "mean"`), or the probability that the true value is beyond the threshold
+//! (`when = { probability = p }`). For the latter, the value is assumed to be normally distributed with its standard
+//! deviation, and
 //!
 //! ```text
 //! beyond    P(truth beyond the set threshold)   >  p
 //! healthy   P(truth beyond the clear threshold) <= min(p, c)
 //! ```
 //!
-//! where c is 0.5, and 0.05 for a learned value: an alarm is cleared by a value that is at the clear threshold or better,
-//! never by doubt that has grown. As the clear threshold is on the healthy side of the set threshold, the second
-//! probability is the larger one: no value is both. With p = 0.5 this is the plain comparison. A value without a standard
-//! deviation where one is needed is not to be judged.
+//! where c is 0.05 for a learned value and 0.5 otherwise: only a value at the clear threshold or better clears an
+//! alarm, never a growing uncertainty. The clear threshold is on the healthy side of the set threshold, so the second
+//! probability is the larger one and no value is both beyond and healthy. With p = 0.5, the result is the same as for
+//! `when = "mean"`. If the standard deviation is needed but missing, the result is unknown.
 //!
-//! A learned value (a capacity, a resistance, a life) does not recover by itself: an estimate that wanders about its
-//! threshold must not clear its alarm, whichever quantity is compared.
+//! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
+//! `when = "mean"`: an estimate that fluctuates around its threshold must not clear its alarm.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,42 +27,42 @@ use crate::filter::probability_below;
 pub enum Comparison {
     /// The value itself.
     Mean,
-    /// The probability that the truth is beyond must pass this level, above 0 and below 1.
+    /// The probability that the true value is beyond the threshold must exceed this level, between 0 and 1 (exclusive).
     Probability(f64),
 }
 
-/// One threshold of a rule, and how an alarm follows from it.
+/// One threshold of a rule, with debounce, hysteresis and latching.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RuleConfig {
     /// The rule.
     pub rule: Rule,
     /// Its severity. A rule has at most one threshold per severity.
     pub severity: Severity,
-    /// Raised when the value is beyond this (below for `*Low`, above for the others), in the rule's unit.
+    /// The alarm is raised if the value is beyond this (below for `*Low`, above for the others), in the rule's unit.
     pub threshold: f64,
-    /// Cleared only when the value is at this or beyond it on the healthy side; never on the bad side of `threshold`.
+    /// The alarm clears only if the value is here or further on the healthy side; never on the bad side of `threshold`.
     pub clear: f64,
-    /// The compared quantity.
+    /// What is compared with the threshold.
     pub when: Comparison,
-    /// Must hold this long before it is raised, and be healthy this long before it clears, s.
+    /// How long the value must be beyond before the alarm is raised, and healthy before it clears, s.
     pub debounce_s: f64,
-    /// Must hold for this many new values before it is raised or cleared, at least 1.
+    /// Number of new values needed before the alarm is raised or cleared, at least 1.
     pub debounce_events: u32,
-    /// Whether an alarm stays raised when its value is healthy again, until it is cleared.
+    /// Whether the alarm stays raised after its value is healthy again, until a command clears it.
     pub is_latching: bool,
 }
 
 /// A rule's value at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observation {
-    /// In the rule's unit; `None` or not finite = not known.
+    /// In the rule's unit; `None` or not finite = unknown.
     pub value: Option<f64>,
-    /// Its standard deviation, in the same unit; `None` = none known.
+    /// Its standard deviation, in the same unit; `None` = unknown.
     pub std: Option<f64>,
-    /// The truth may be worse than the value, never better: some of what it is the worst of is not known. Such a value
-    /// can be beyond a threshold, but not healthy.
+    /// The true value may be worse than this value, never better: the value is the worst of several sources, some of
+    /// them unknown. Such a value can be beyond a threshold, but not healthy.
     pub is_bound: bool,
-    /// Whether it is a new measurement, which counts for `debounce_events`.
+    /// Whether it is a new measurement; only new measurements count towards `debounce_events`.
     pub is_new: bool,
 }
 
@@ -71,13 +72,13 @@ impl Observation {
         Self { value, is_new: true, ..Self::default() }
     }
 
-    /// With a standard deviation.
+    /// Adds a standard deviation.
     #[must_use]
     pub fn with_std(self, std: f64) -> Self {
         Self { std: Some(std), ..self }
     }
 
-    /// The same of a part of the sources only, if `is_bound`: the others may be worse.
+    /// If `is_bound`, marks the value as known from some of its sources only: the others may be worse.
     #[must_use]
     pub fn of_part(self, is_bound: bool) -> Self {
         Self { is_bound, ..self }
@@ -98,19 +99,20 @@ pub(super) enum LimitCheck {
 }
 
 impl LimitCheck {
-    /// Compares; also gives the probability that the truth is beyond the set threshold, where it can be said.
+    /// Compares an observation with a rule. Also returns the probability that the true value is beyond the set
+    /// threshold, if known.
     #[inline]
     pub(super) fn of(rule: &RuleConfig, observation: &Observation) -> (Self, Option<f64>) {
         let Some(value) = observation.value.filter(|value| value.is_finite()) else { return (Self::Unknown, None) };
         let std = observation.std.filter(|std| *std >= 0.0 && std.is_finite());
-        // How far the value is on the good side of a threshold.
+        // Distance of the value from a threshold, positive on the good side.
         let good_by = |threshold: f64| match rule.rule.spec().direction {
             Direction::Below => value - threshold,
             Direction::Above => threshold - value,
         };
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
-        // Highest probability of being beyond the clear threshold that clears, for a learned value and any other.
+        // An alarm clears only if the probability of being beyond the clear threshold is at most this.
         let clear_level = if rule.rule.spec().is_learned { 0.05 } else { 0.5 };
         let (is_beyond, is_healthy) = match rule.when {
             Comparison::Mean => {
@@ -131,7 +133,8 @@ impl LimitCheck {
     }
 }
 
-/// Probability that a normal value, on the good side by `good_by` in the mean, is on the bad side.
+/// Probability that a normally distributed value is on the bad side. `good_by` is the distance of its mean from the
+/// threshold, positive on the good side.
 fn probability_beyond(good_by: f64, std: f64) -> f64 {
     if std > 0.0 {
         probability_below(-good_by, std)
@@ -164,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn the_threshold_itself_is_not_beyond_and_the_clear_threshold_is_healthy() {
+    fn threshold_is_not_beyond_but_clear_threshold_is_healthy() {
         let rule = low(Comparison::Mean);
         assert_eq!(check(&rule, 1.4, None), LimitCheck::Between);
         assert_eq!(check(&rule, 1.4 - 1e-9, None), LimitCheck::Beyond);
@@ -176,12 +179,12 @@ mod tests {
     }
 
     #[test]
-    fn probability_is_that_of_the_normal_distribution() {
-        // 1.645 standard deviations: 95 %.
+    fn probability_follows_normal_distribution() {
+        // 95 % is at 1.645 standard deviations.
         let rule = low(Comparison::Probability(0.95));
         assert_eq!(check(&rule, 1.4 - 0.1 * 1.65, Some(0.1)), LimitCheck::Beyond);
         assert_eq!(check(&rule, 1.4 - 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
-        // Cleared by a value at the clear threshold, not by doubt.
+        // A value at the clear threshold clears the alarm, a growing uncertainty does not.
         assert_eq!(check(&rule, 1.5 - 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
         assert_eq!(check(&rule, 1.2, Some(10.0)), LimitCheck::Between);
         let soc = RuleConfig { rule: Rule::SocLow, ..rule.clone() };
@@ -195,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn half_probability_is_the_mean_rule() {
+    fn probability_of_half_equals_mean_comparison() {
         for step in -20..20 {
             let value = 1.4 + 0.013 * f64::from(step) + 1e-6;
             for rule in [Rule::CapacityLow, Rule::SocLow] {
@@ -207,10 +210,10 @@ mod tests {
     }
 
     #[test]
-    fn a_learned_value_clears_when_it_is_surely_healthy() {
+    fn learned_value_clears_at_95_percent_certainty() {
         let rule = low(Comparison::Mean);
         assert_eq!(check(&rule, 1.4 - 1e-9, Some(0.1)), LimitCheck::Beyond);
-        // 1.645 standard deviations: 95 %.
+        // 95 % is at 1.645 standard deviations.
         assert_eq!(check(&rule, 1.5 + 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
         assert_eq!(check(&rule, 1.5 + 0.1 * 1.65, Some(0.1)), LimitCheck::Healthy);
         let soc = RuleConfig { rule: Rule::SocLow, ..rule };
@@ -218,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn without_deviation_probability_cannot_be_judged_and_zero_deviation_is_certain() {
+    fn probability_needs_deviation_and_zero_is_certain() {
         let rule = low(Comparison::Probability(0.9));
         assert_eq!(check(&rule, 1.0, None), LimitCheck::Unknown);
         assert_eq!(check(&rule, 1.0, Some(f64::NAN)), LimitCheck::Unknown);
@@ -227,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bound_can_be_beyond_but_never_healthy() {
+    fn bound_can_be_beyond_but_never_healthy() {
         let rule = low(Comparison::Mean);
         let bound = |value| LimitCheck::of(&rule, &Observation { is_bound: true, ..Observation::new(Some(value)) }).0;
         assert_eq!(bound(1.3), LimitCheck::Beyond);
@@ -236,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_are_not_finite_are_unknown() {
+    fn infinite_and_nan_values_are_unknown() {
         for odd in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             assert_eq!(check(&low(Comparison::Mean), odd, None), LimitCheck::Unknown);
         }

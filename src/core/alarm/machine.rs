@@ -2,21 +2,26 @@
 //!
 //! | state | beyond | between | healthy | unknown | acknowledge | clear |
 //! | --- | --- | --- | --- | --- | --- | --- |
-//! | unknown | count towards active | rest | rest | stay | settle | forget |
-//! | inactive | count towards active | stay | stay | unknown | settle | forget |
-//! | pending | count towards active | rest | rest | hold | settle | forget |
+//! | unknown | count towards active | rest | rest | stay | mark | forget |
+//! | inactive | count towards active | stay | stay | unknown | mark | forget |
+//! | pending | count towards active | rest | rest | hold | mark | forget |
 //! | active | stay | stay | count towards the end | suppressed | mark | refuse |
 //! | clearing | active | active | count towards the end | suppressed | mark | refuse |
 //! | suppressed | active | active | count towards the end | hold | mark | refuse |
 //! | latched | count towards active | stay | stay | hold | mark | rest |
 //! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
 //!
-//! Rest is `cleared` when the alarm has been raised and not been acknowledged, else `inactive`. The end is
-//! `latched` for a rule that latches, else rest. An alarm is raised while it is active, clearing, suppressed or latched.
+//! * Rest: `cleared` if the alarm was raised and not acknowledged, else `inactive`.
+//! * End: `latched` for a latching rule, else rest.
+//! * Count: both the time and the number of new values of the debounce must be reached.
+//! * Hold: stay, and keep what was counted.
+//! * Mark: acknowledge the latest occurrence. Forget: reset the number of occurrences. Refuse: change nothing.
 //!
-//! Counting means time and new values; both must be reached. Time counts only between two observations of a known value on the
-//! same side. Time next to an unknown value does not count, and resets nothing either: otherwise a flickering input could
-//! keep an alarm from ever being raised.
+//! An alarm is raised while it is active, clearing, suppressed or latched.
+//!
+//! Time counts only between two observations of known values on the same side. Time before or after an unknown value
+//! does not count, but does not reset the count either: otherwise a flickering input could keep an alarm from being
+//! raised forever.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -28,22 +33,22 @@ use crate::quantity::Timestamp;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlarmState {
-    /// Its value is not known, nor whether it should be raised.
+    /// The value is unknown, and so is whether the alarm should be raised.
     #[default]
     Unknown,
-    /// Nothing wrong.
+    /// The value is not beyond the threshold.
     Inactive,
-    /// Beyond the threshold, not yet for long enough.
+    /// Beyond the threshold, but not long enough yet.
     Pending,
     /// Raised.
     Active,
-    /// Raised, healthy again, not yet for long enough.
+    /// Raised; the value is healthy again, but not long enough yet.
     Clearing,
-    /// Raised, and its value is not known any more.
+    /// Raised, but the value has become unknown.
     Suppressed,
-    /// Raised earlier, healthy again; stays until a command clears it.
+    /// Raised earlier; the value is healthy again. The alarm stays until a command clears it.
     Latched,
-    /// Raised earlier, healthy again, not acknowledged.
+    /// Raised earlier; the value is healthy again. Not acknowledged.
     Cleared,
 }
 
@@ -53,7 +58,7 @@ impl AlarmState {
         matches!(self, Self::Active | Self::Clearing | Self::Suppressed | Self::Latched)
     }
 
-    /// The code on the wire (`AlarmState` of the alarm frame).
+    /// The wire code (`AlarmState` of the alarm frame).
     pub const fn wire_code(self) -> u8 {
         match self {
             Self::Inactive => 0,
@@ -67,64 +72,64 @@ impl AlarmState {
     }
 }
 
-/// A change of an alarm that is published.
+/// A published change of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Change {
     /// Raised, or raised again while latched.
     Raised,
-    /// Raised, but its value is not known any more.
+    /// Still raised, but the value has become unknown.
     Suppressed,
-    /// Raised, and its value is known again.
+    /// Still raised, and the value is known again.
     Resumed,
-    /// Healthy again, kept until a command clears it.
+    /// The value is healthy again; the alarm stays until a command clears it.
     Latched,
-    /// Over.
+    /// No longer raised.
     Cleared,
     /// Acknowledged by a command.
     Acknowledged,
-    /// Its past was forgotten on request.
+    /// History forgotten: by a command, after a pack exchange, or because no threshold watches the alarm any longer.
     Forgotten,
 }
 
-/// Why a command changed nothing.
+/// Reason why a command changed nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Refusal {
-    /// The alarm is raised, and its value is not healthy (or not known): only the value can clear it.
+    /// The alarm is raised and its value is not healthy or unknown. Only a healthy value can end it.
     NotHealthy,
-    /// There was nothing to do.
+    /// There is nothing to acknowledge or to clear.
     Nothing,
 }
 
-/// One alarm: its state, its past, and what its debounce has counted.
+/// One alarm: its state, its history and the progress of its debounce.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Machine {
     pub(super) state: AlarmState,
     /// Whether the latest observation could be compared.
     #[serde(skip)]
     pub(super) is_known: bool,
-    /// The latest value, standard deviation and probability; the value of a learned rule outlives its input.
+    /// The latest observation, and its probability; a learned value is kept while its inputs are lost.
     #[serde(skip)]
     pub(super) observation: Observation,
     #[serde(skip)]
     pub(super) probability: Option<f64>,
-    /// Times it was raised since its past was last forgotten.
+    /// How often it was raised since its history was last forgotten.
     pub(super) occurrences: u32,
-    /// Comparison it was raised for the first and the last of these times, and the value that raised it last.
+    /// Times of the comparisons that raised it first and last, and the value that raised it last.
     pub(super) first_raised: Timestamp,
     pub(super) last_raised: Timestamp,
     pub(super) raised_value: Option<f64>,
-    /// Whether the last of them was acknowledged.
+    /// Whether the last occurrence was acknowledged.
     pub(super) is_acknowledged: bool,
     /// Time counted by the running debounce, ns.
     held_nanos: i64,
-    /// New values counted by it.
+    /// New values counted by the running debounce.
     events: u32,
-    /// From when on time counts; `None` = not counting.
+    /// Time up to which the debounce has counted; `None` = not counting.
     counted_to: Option<Timestamp>,
-    /// The inputs a learned value came from are not valid now.
+    /// The inputs of a learned value are not valid now.
     is_suspended: bool,
 }
 
@@ -133,9 +138,9 @@ pub(super) struct Machine {
 pub(super) struct IndexEntry {
     pub(super) is_known: bool,
     pub(super) is_raised: bool,
-    /// Whether time is being counted.
+    /// Whether a debounce is running.
     pub(super) is_counting: bool,
-    /// Whether only a value beyond its threshold, or one that is not known, changes anything.
+    /// Whether only a value beyond the threshold or an unknown value can change the alarm.
     pub(super) is_at_rest: bool,
 }
 
@@ -151,14 +156,15 @@ impl Machine {
         }
     }
 
-    /// Shows a value that changes nothing, without a deviation.
+    /// Stores a value that changes nothing, without a standard deviation.
     #[inline]
     pub(super) fn show(&mut self, value: f64) {
         (self.observation, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
     }
 
-    /// Takes a value. A value learned while its inputs are lost (their loss ends the half-cycle before) may raise the alarm.
-    /// It does not change an alarm that is raised already until the inputs are back: it would clear it, or look fresh.
+    /// Handles a value. If the inputs of a learned value are lost, a value may still arrive, because the loss ends a
+    /// half-cycle. It may raise the alarm, but it does not change an alarm that is already raised: it would clear the
+    /// alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.state == AlarmState::Suppressed {
@@ -168,12 +174,12 @@ impl Machine {
         self.judge(now, rule)
     }
 
-    /// Lets time pass over a value that still holds.
+    /// Advances the debounce for a value that is still valid.
     pub(super) fn poll(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if self.counted_to.is_some() { self.count(now, rule, false) } else { None }
     }
 
-    /// The inputs of the learned value are not valid now: the value cannot be renewed.
+    /// Handles the loss of the inputs of a learned value.
     pub(super) fn suspend(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if self.is_suspended {
             return None;
@@ -182,7 +188,7 @@ impl Machine {
         self.handle_check(now, rule, LimitCheck::Unknown, false)
     }
 
-    /// The inputs are valid again: the value holds as before, or as learned since.
+    /// Handles the return of the inputs: the learned value is valid again, or a newer one that was learned since.
     pub(super) fn resume(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if !std::mem::take(&mut self.is_suspended) {
             return None;
@@ -195,7 +201,7 @@ impl Machine {
         self.counted_to = None;
     }
 
-    /// Takes another threshold: counts towards the old one are dropped, and a known value is new to it.
+    /// Switches to another threshold: resets the debounce and compares the known value again.
     pub(super) fn retarget(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         (self.held_nanos, self.events, self.counted_to) = (0, 0, None);
         if !self.is_known {
@@ -217,11 +223,12 @@ impl Machine {
         Ok(Change::Acknowledged)
     }
 
-    /// Clears it: a latched alarm ends, a past one is forgotten, one that is beyond or not known stays.
+    /// Handles the command "clear": ends a latched alarm, forgets the history of a past alarm, refuses if the value is
+    /// beyond the threshold or unknown.
     pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
         match self.state {
             AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => Err(Refusal::NotHealthy),
-            // Beyond again, only not for long enough yet.
+            // Beyond again, but not long enough yet.
             AlarmState::Latched if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
             AlarmState::Latched => {
                 self.is_acknowledged = true;
@@ -239,7 +246,8 @@ impl Machine {
         }
     }
 
-    /// Its published state: an unknown value is shown as such, also before the first observation after a restart.
+    /// The published state: with an unknown value, also before the first observation after a restart, it is `Unknown`
+    /// or `Suppressed`.
     pub(super) fn shown(&self) -> AlarmState {
         match self.state {
             AlarmState::Inactive | AlarmState::Cleared if !self.is_known => AlarmState::Unknown,
@@ -248,17 +256,17 @@ impl Machine {
         }
     }
 
-    /// The latest value, unless it is not known (any more).
+    /// The latest value; `None` = unknown.
     pub(super) fn value(&self) -> Option<f64> {
         self.observation.value.filter(|value| self.is_known && value.is_finite())
     }
 
-    /// Whether a restart must not forget it.
+    /// Whether the alarm must survive a restart.
     pub(super) fn is_worth_storing(&self) -> bool {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// As it is restored: its value is not known before the next observation.
+    /// The machine as it is restored: its value is unknown until the next observation.
     pub(super) fn without_value(self) -> Self {
         Self { is_known: false, observation: Observation::default(), probability: None, ..self }
     }
@@ -273,12 +281,12 @@ impl Machine {
     fn judge(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         let (check, probability) = LimitCheck::of(rule, &self.observation);
         self.probability = probability;
-        // New only once, however often it is judged.
+        // A value counts as new only at its first comparison.
         let is_new = std::mem::take(&mut self.observation.is_new);
         self.handle_check(now, rule, check, is_new)
     }
 
-    /// The table of the machine: every state with every outcome of a comparison.
+    /// The transition table: every state with every outcome of a comparison.
     fn handle_check(&mut self, now: Timestamp, rule: &RuleConfig, check: LimitCheck, is_new: bool) -> Option<Change> {
         use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
         use LimitCheck::{Between, Beyond, Healthy};
@@ -297,9 +305,9 @@ impl Machine {
             (Latched, Between | Healthy) => self.enter(Latched),
             (Unknown, LimitCheck::Unknown) => {}
             (Inactive | Cleared, LimitCheck::Unknown) => self.enter(Unknown),
-            // What was counted is kept, and nothing is counted.
+            // Keep the count, but stop counting.
             (Pending | Suppressed | Latched, LimitCheck::Unknown) => self.counted_to = None,
-            // What was counted towards the end is kept.
+            // Keep the count towards the end.
             (Active | Clearing, LimitCheck::Unknown) => {
                 (self.state, self.counted_to) = (Suppressed, None);
                 return Some(Change::Suppressed);

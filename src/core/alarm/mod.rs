@@ -1,13 +1,13 @@
-//! Rules over named values: debounce, hysteresis, severity, acknowledgement. Sees values with age and validity, no estimator.
+//! Rules over named values: debounce, hysteresis, severity, acknowledgement. Independent of the estimators.
 //!
-//! In: a rule's value per cell or per pack, in the rule's unit, or `None` when it is not known; commands.
-//! Out: changes of alarms. Promise: an unknown value neither raises nor clears, and is visible; memory is bounded by
-//! rules x cells. States and transitions follow ISA-18.2 (unacknowledged, latched, suppressed).
-//! * [`rule`] says what each rule compares;
+//! In: a rule's value per cell or per pack, in the rule's unit, or `None` if unknown; commands. Out: changes of alarms.
+//! Promise: an unknown value neither raises nor clears an alarm, and is visible; memory is bounded by rules x cells.
+//! States and transitions follow ISA-18.2 (unacknowledged, latched, suppressed).
+//! * [`rule`] specifies what each rule compares;
 //! * [`limit`] compares a value with a threshold;
-//! * [`machine`] holds the life of one alarm as a transition table;
-//! * [`engine`] holds one such machine per threshold and cell;
-//! * [`input`] holds every input of an engine as a value, so that another engine can take the same;
+//! * [`machine`] is the state machine of one alarm;
+//! * [`engine`] holds one machine per threshold and cell;
+//! * [`input`] represents every input of an engine as a value, so that another engine can replay them;
 //! * [`selector`] selects the alarms of a command.
 
 pub mod engine;

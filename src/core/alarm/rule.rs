@@ -1,11 +1,11 @@
-//! Subjects of alarms: one specification per rule, and the severities.
+//! Alarm rules and severities.
 //!
-//! The table in [`Rule::spec`] is the one place that specifies what a rule compares; configuration, reference page, frames
-//! and engine all take it from there.
+//! The table in [`Rule::spec`] specifies what each rule compares; configuration, reference page, frames and engine use
+//! it.
 
 use serde::{Deserialize, Serialize};
 
-/// Subject of an alarm. The number is the one on the wire (`config/packwatch.dbc`), never reused.
+/// An alarm rule. The number is the wire code (`config/packwatch.dbc`) and is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -16,35 +16,38 @@ pub enum Rule {
     UsableCapacityLow = 2,
     /// Recharge period below the threshold, s.
     RechargePeriodLow = 3,
-    /// A configured input has not come for too long; the value is its age, s.
+    /// A configured input is missing for too long; the value is its age, s.
     InputMissing = 4,
     /// A configured input keeps being implausible; the value is the share of bad readings, fraction.
     InputImplausible = 5,
-    /// The estimator's innovations contradict its own covariance, or the model is another cell's; the value is the mean
-    /// normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) in the same scale.
+    /// The estimator's innovations contradict its own covariance, or the model belongs to another cell. The value is
+    /// the mean normalised innovation squared, or the mismatch ([`ModelCheck`](crate::cell::ModelCheck)) on the same
+    /// scale.
     EstimateUntrusted = 6,
-    /// Resistance relative to new above the threshold, as the last half-cycle left it.
+    /// Resistance relative to new above the threshold, as learned in the last half-cycle.
     ResistanceHigh = 7,
     /// SOC of the cell that limits discharge below the threshold, fraction.
     SocLow = 8,
     /// The hottest sensor above the threshold, degrees C.
     TemperatureHigh = 9,
-    /// SOC of the fullest cell minus that of the emptiest above the threshold, fraction.
+    /// SOC difference between the fullest and the emptiest cell above the threshold, fraction.
     CellImbalance = 10,
     /// Remaining useful life below the threshold, equivalent full cycles.
     RemainingLifeLow = 11,
-    /// SOC or SOH as the pack itself reports it differs from ours, fraction (the larger of the two differences).
+    /// SOC or SOH reported by the pack differs from the estimate; the value is the larger of the two differences,
+    /// fraction.
     BmsDisagrees = 12,
-    /// A file that keeps what was learned or recorded cannot be written; the value is for how long, s.
+    /// A file of the stored state or of the records cannot be written; the value is the duration, s.
     StoreFailed = 13,
-    /// An interface is down, missing, bus-off or takes no frames; the value is for how long, s.
+    /// An interface is down, missing, bus-off or accepts no frames; the value is the duration, s.
     BusFault = 14,
-    /// Self-discharge against the other cells of the pack above the threshold, fraction of the capacity in a day.
+    /// Self-discharge relative to the other cells of the pack above the threshold, fraction of the capacity per day.
     CellLeak = 15,
-    /// Contact resistance beyond that of the other cells above the threshold, fraction of a cell's series resistance in the middle
-    /// of the charge at 25 degrees C.
+    /// Contact resistance in excess of the other cells' above the threshold, fraction of a cell's series resistance at
+    /// medium SOC and 25 degrees C.
     ConnectionResistance = 16,
-    /// The voltage channel shows no cell of its own; the value is 1 then, else 0. The cell's other rules are unknown meanwhile.
+    /// The voltage channel does not show its own cell; the value is then 1, else 0. Meanwhile the cell's other rules
+    /// are unknown.
     ChannelFaulty = 17,
 }
 
@@ -55,7 +58,7 @@ pub enum Scope {
     Pack,
     /// One value per cell.
     Cell,
-    /// One value per cell, and one for the inputs of no cell (such as the pack's current).
+    /// One value per cell, and one for inputs that belong to the whole pack (such as the pack's current).
     Both,
 }
 
@@ -71,15 +74,15 @@ pub enum Direction {
 /// Unit of a rule's values and thresholds inside the program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
-    /// Ah; a threshold may be a part of the rated capacity.
+    /// Ah; the configuration may give a threshold as a fraction of the rated capacity.
     AmpereHours,
     /// s.
     Seconds,
     /// 0 to 1.
     Fraction,
-    /// 0 to 1, in a day.
+    /// 0 to 1 per day.
     FractionPerDay,
-    /// Times something (as new, as expected).
+    /// A multiple of a reference (of the value when new, of the expected value).
     Ratio,
     /// Degrees C.
     Celsius,
@@ -88,7 +91,7 @@ pub enum Unit {
 }
 
 impl Unit {
-    /// As written after a number; empty for plain numbers.
+    /// The unit as written after a number; empty for plain numbers.
     pub const fn symbol(self) -> &'static str {
         match self {
             Self::AmpereHours => "Ah",
@@ -101,23 +104,23 @@ impl Unit {
     }
 }
 
-/// Specification of one rule: the compared quantity.
+/// Specification of one rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RuleSpec {
     /// Pack, cells or both.
     pub scope: Scope,
-    /// Which side of its threshold is bad.
+    /// The bad side of its threshold.
     pub direction: Direction,
     /// Unit of value and threshold.
     pub unit: Unit,
-    /// Whether the value comes with a standard deviation, so that its probability can be judged.
+    /// Whether the value has a standard deviation, so that a threshold can compare its probability.
     pub has_deviation: bool,
-    /// Whether a value stays true until the next one, so that the time debounce may run out between them.
+    /// Whether a value stays valid until the next one, so that the time debounce runs on between values.
     ///
-    /// A value learned at a transition does: a capacity is not less low because no cycle has ended since.
-    /// A value measured all the time does not: without a new consistency figure the old one proves nothing.
+    /// A learned value does: a capacity stays low until the next cycle. A measured value does not: without new data,
+    /// the old value proves nothing.
     pub is_learned: bool,
-    /// The compared quantity, for readers.
+    /// The compared quantity, for messages.
     pub about: &'static str,
 }
 
@@ -143,12 +146,12 @@ impl Rule {
         Self::ChannelFaulty,
     ];
 
-    /// The rule of a wire number.
+    /// The rule with a wire number; `None` = no such rule.
     pub fn from_number(number: u8) -> Option<Self> {
         Self::ALL.into_iter().find(|rule| *rule as u8 == number)
     }
 
-    /// As written in configurations, events and on the command line.
+    /// The name in configurations, events and on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::CapacityLow => "capacity_low",
@@ -171,7 +174,7 @@ impl Rule {
         }
     }
 
-    /// Whether the rule compares what the cell's voltages show: a faulty channel shows nothing of it.
+    /// Whether the rule depends on the cell's voltages, so that a faulty channel makes its value unknown.
     pub const fn is_of_cell_voltage(self) -> bool {
         matches!(
             self,
@@ -184,7 +187,7 @@ impl Rule {
         )
     }
 
-    /// Its specification.
+    /// The specification of the rule.
     pub const fn spec(self) -> RuleSpec {
         use Direction::{Above, Below};
         use Scope::{Both, Cell, Pack};
@@ -202,17 +205,17 @@ impl Rule {
             Self::SocLow => (Pack, Below, Fraction, true, false, "the SOC of the emptiest cell"),
             Self::TemperatureHigh => (Pack, Above, Celsius, false, false, "the highest temperature"),
             Self::CellImbalance => {
-                (Pack, Above, Fraction, true, false, "the SOC between the fullest and the emptiest cell")
+                (Pack, Above, Fraction, true, false, "the SOC difference between the fullest and the emptiest cell")
             }
             Self::RemainingLifeLow => (Pack, Below, Cycles, true, true, "the remaining useful life"),
             Self::BmsDisagrees => {
                 (Pack, Above, Fraction, true, false, "the difference from the SOC or SOH the pack reports")
             }
             Self::StoreFailed => (Pack, Above, Seconds, false, false, "the time a file could not be written"),
-            Self::BusFault => (Pack, Above, Seconds, false, false, "the time an interface was out of order"),
+            Self::BusFault => (Pack, Above, Seconds, false, false, "the duration of an interface fault"),
             Self::CellLeak => (Cell, Above, FractionPerDay, true, true, "a cell's self-discharge"),
             Self::ConnectionResistance => {
-                (Cell, Above, Fraction, true, true, "a cell's contact resistance beyond the others'")
+                (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the others'")
             }
             Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
         };
@@ -220,7 +223,7 @@ impl Rule {
     }
 }
 
-/// Severity, as on the wire.
+/// Severity; the number is the wire code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -234,10 +237,10 @@ pub enum Severity {
 }
 
 impl Severity {
-    /// All of them, mildest first.
+    /// All severities, mildest first.
     pub const ALL: [Self; 3] = [Self::Info, Self::Warning, Self::Severe];
 
-    /// As written in configurations, events and on the command line.
+    /// The name in configurations, events and on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Info => "info",
@@ -252,7 +255,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_dense_and_found_again() {
+    fn wire_numbers_are_dense_and_reversible() {
         for (number, rule) in (1..).zip(Rule::ALL) {
             assert_eq!(rule as u8, number);
             assert_eq!(Rule::from_number(number), Some(rule));

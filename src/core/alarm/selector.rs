@@ -1,24 +1,24 @@
-//! The alarms that a command selects, and its outcome.
+//! Selection of alarms by a command, and the outcome of the command.
 
 use serde::{Deserialize, Serialize};
 
 use super::rule::{Rule, Severity};
 use crate::quantity::CellIndex;
 
-/// Alarms of a rule, a severity and a cell; a field without a value selects all.
+/// Selects alarms by rule, severity and cell; a field without a value matches every alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Selector {
-    /// Which rule.
+    /// The rule.
     pub rule: Option<Rule>,
-    /// Which severity.
+    /// The severity.
     pub severity: Option<Severity>,
-    /// Which cell, counted from 0; the pack's own alarms are selected only without it.
+    /// The cell, counted from 0. The pack's own alarms match only if this is not set.
     pub cell: Option<CellIndex>,
 }
 
 impl Selector {
-    /// Whether it selects that alarm (`cell`: `None` = the pack's).
+    /// Whether the selector matches an alarm (`cell`: `None` = the pack's).
     pub fn matches(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> bool {
         self.rule.is_none_or(|wanted| wanted == rule)
             && self.severity.is_none_or(|wanted| wanted == severity)
@@ -31,6 +31,6 @@ impl Selector {
 pub struct CommandOutcome {
     /// Alarms changed.
     pub changed: u32,
-    /// Alarms that were to be cleared, but are raised and not healthy (or their value is not known).
+    /// Alarms that could not be cleared, because they are raised and their value is unhealthy or unknown.
     pub refused: u32,
 }

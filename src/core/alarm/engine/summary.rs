@@ -1,4 +1,4 @@
-//! What the engine reports of its thresholds and rules: counts, severities, and alarms in turn.
+//! Summaries of thresholds and rules: counts, severities, and alarms by rotating index.
 
 use super::{Alarm, AlarmEngine, Rule, Severity, ThresholdState};
 use crate::quantity::CellIndex;
@@ -6,9 +6,9 @@ use crate::quantity::CellIndex;
 /// Summary of all alarms of one rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RuleSummary {
-    /// The worst severity of its raised alarms; `None` = none is raised.
+    /// The worst severity of the raised alarms of the rule; `None` = none raised.
     pub worst: Option<Severity>,
-    /// Whether all of its alarms have a known value.
+    /// Whether every alarm of the rule has a known value.
     pub is_known: bool,
 }
 
@@ -26,24 +26,24 @@ impl AlarmEngine {
         })
     }
 
-    /// The worst severity of the raised alarms; `None` = none is raised.
+    /// The worst severity of all raised alarms; `None` = none raised.
     pub fn highest_severity(&self) -> Option<Severity> {
         self.raised.iter().map(|&slot| self.rules[self.rule_of(slot)].config.severity).max()
     }
 
-    /// Thresholds, and those of them with an alarm whose value is not known.
+    /// Number of thresholds, and number of thresholds with an alarm whose value is unknown.
     pub fn unknown(&self) -> (usize, usize) {
         (self.rules.len(), self.rules.iter().filter(|rule| rule.unknown > 0).count())
     }
 
-    /// The thresholds with unknown values: rule, severity, how many of their alarms.
+    /// Thresholds with unknown values: rule, severity, number of alarms with an unknown value.
     pub fn unknown_thresholds(&self) -> impl Iterator<Item = (Rule, Severity, usize)> + '_ {
         let waiting = self.rules.iter().filter(|rule| rule.unknown > 0);
         waiting.map(|rule| (rule.config.rule, rule.config.severity, rule.unknown))
     }
 
-    /// For the `turn`-th of the thresholds with unknown values, counted round and round, one such alarm that is not
-    /// raised; `None` = there is none.
+    /// An alarm that has an unknown value and is not raised, from the `turn`-th threshold with unknown values (modulo
+    /// their number); `None` = no such alarm.
     pub fn unknown_alarm(&self, turn: usize) -> Option<Alarm> {
         let (_, count) = self.unknown();
         let mut waiting = self.rules.iter().enumerate().filter(|(_, rule)| rule.unknown > 0);
@@ -52,12 +52,12 @@ impl AlarmEngine {
         rule.slots().find(is_waiting).map(|slot| self.alarm(index, slot))
     }
 
-    /// The alarm of a rule, severity and cell as it is now; `None` = nothing watches it.
+    /// The alarm of a rule, severity and cell; `None` = not watched.
     pub fn find(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<Alarm> {
         self.locate(rule, severity, cell).map(|(index, slot)| self.alarm(index, slot))
     }
 
-    /// The summary of a rule; `None` = nothing watches it.
+    /// The summary of a rule; `None` = the rule is not configured.
     pub fn rule_summary(&self, rule: Rule) -> Option<RuleSummary> {
         let thresholds = &self.rules[self.by_rule[usize::from(rule as u8)].clone()];
         if thresholds.is_empty() {
@@ -72,7 +72,7 @@ impl AlarmEngine {
         Some(RuleSummary { worst, is_known: thresholds.iter().all(|slots| slots.unknown == 0) })
     }
 
-    /// The `turn`-th threshold with its rule and severity, counted round and round; `None` = there is none.
+    /// Rule, severity and value of the `turn`-th threshold (modulo their number); `None` = no thresholds.
     pub fn threshold(&self, turn: usize) -> Option<(Rule, Severity, f64)> {
         let config = &self.rules.get(turn.checked_rem(self.rules.len())?)?.config;
         Some((config.rule, config.severity, config.threshold))

@@ -1,4 +1,4 @@
-//! Scenarios over the whole engine; the table of a single machine is tested next to it.
+//! Scenarios with a whole engine; `machine/tests.rs` tests the transition table.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -35,27 +35,27 @@ fn at(seconds: f64) -> Timestamp {
 const CELL: Option<CellIndex> = Some(CellIndex(0));
 
 #[test]
-fn noise_around_the_threshold_for_24_hours_gives_one_raise_and_one_clear() {
+fn noise_at_threshold_raises_and_clears_once() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::EstimateUntrusted, 3.0, 0.5, 5.0, 3)], 1);
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let mut changes = Vec::new();
     let mut crossings = 0;
     let mut was_beyond = false;
     for second in 0..24 * 3600 {
-        // Six hours well, twelve hours on the threshold, six hours well; noise +/- 0.4 all the time.
+        // Six hours healthy, twelve hours at the threshold, six hours healthy; noise of +/- 0.4 throughout.
         let mean = if (6 * 3600..18 * 3600).contains(&second) { 3.0 } else { 1.5 };
         let value = mean + rng.random_range(-0.4..0.4);
         crossings += u32::from((value > 3.0) != was_beyond);
         was_beyond = value > 3.0;
         see(&mut engine, at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), &mut changes);
     }
-    assert!(crossings > 10_000, "the noise must cross the threshold all the time, it did {crossings} times");
+    assert!(crossings > 10_000, "the noise must cross the threshold often, but did so only {crossings} times");
     assert_eq!(changes.iter().map(|change| change.change).collect::<Vec<_>>(), [Change::Raised, Change::Cleared]);
     assert_eq!(engine.count(), 0);
 }
 
 #[test]
-fn input_lost_while_active_keeps_the_alarm_without_a_value() {
+fn lost_input_keeps_active_alarm_without_value() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.05, 0.0, 1)], 2);
     let mut changes = Vec::new();
     see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
@@ -63,14 +63,14 @@ fn input_lost_while_active_keeps_the_alarm_without_a_value() {
     see(&mut engine, at(10.0), Rule::CapacityLow, CELL, None, &mut changes);
     engine.poll(at(1e6), &mut changes);
     let heard: Vec<_> = changes.iter().map(|change| change.change).collect();
-    assert_eq!(heard, [Change::Raised, Change::Suppressed], "neither cleared nor raised again");
+    assert_eq!(heard, [Change::Raised, Change::Suppressed], "expected neither a clear nor another raise");
     let alarms: Vec<_> = engine.raised().collect();
     assert_eq!((alarms.len(), alarms[0].value, alarms[0].last_raised), (1, None, Some(at(0.0))));
     assert_eq!((alarms[0].state, alarms[0].raised_value), (AlarmState::Suppressed, Some(1.3)));
 }
 
 #[test]
-fn unknown_values_alone_raise_nothing() {
+fn unknown_values_raise_no_alarm() {
     let mut engine = AlarmEngine::new(Rule::ALL.map(|r| rule(r, 1.0, 0.0, 0.0, 1)).to_vec(), 4);
     let mut changes = Vec::new();
     for r in Rule::ALL {
@@ -84,7 +84,7 @@ fn unknown_values_alone_raise_nothing() {
 }
 
 #[test]
-fn a_learned_value_holds_while_time_debounce_runs_out_and_a_measured_one_does_not() {
+fn only_learned_values_debounce_without_new_observation() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 30.0, 1), rule(Rule::EstimateUntrusted, 3.0, 0.0, 30.0, 1)];
     let mut engine = AlarmEngine::new(rules, 1);
     let mut changes = Vec::new();
@@ -98,7 +98,7 @@ fn a_learned_value_holds_while_time_debounce_runs_out_and_a_measured_one_does_no
 }
 
 #[test]
-fn a_gap_does_not_count_for_measured_values() {
+fn gap_does_not_debounce_measured_values() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::InputMissing, 5.0, 0.0, 10.0, 1)], 1);
     let mut changes = Vec::new();
     see(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
@@ -110,7 +110,7 @@ fn a_gap_does_not_count_for_measured_values() {
 }
 
 #[test]
-fn poll_raises_every_alarm_that_is_due_in_one_call() {
+fn poll_raises_all_due_alarms_at_once() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 1.0, 1)], 5);
     let mut changes = Vec::new();
     for cell in 0..5 {
@@ -122,7 +122,7 @@ fn poll_raises_every_alarm_that_is_due_in_one_call() {
 }
 
 #[test]
-fn active_alarms_are_listed_by_rule_then_cell_whatever_the_order_of_raising() {
+fn raised_alarms_are_sorted_by_rule_and_cell() {
     let mut engine = AlarmEngine::new(
         vec![
             rule(Rule::InputMissing, 5.0, 0.0, 0.0, 1),
@@ -152,7 +152,7 @@ fn active_alarms_are_listed_by_rule_then_cell_whatever_the_order_of_raising() {
 }
 
 #[test]
-fn values_of_rules_and_cells_not_watched_are_passed_over() {
+fn values_of_unwatched_rules_and_cells_are_ignored() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 2);
     let mut changes = Vec::new();
     see(&mut engine, at(0.0), Rule::CapacityLow, None, Some(0.0), &mut changes);
@@ -164,7 +164,7 @@ fn values_of_rules_and_cells_not_watched_are_passed_over() {
 }
 
 #[test]
-fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
+fn restored_engine_behaves_like_stored_engine() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 10.0, 2), rule(Rule::RechargePeriodLow, 900.0, 0.0, 0.0, 1)];
     let mut first = AlarmEngine::new(rules.clone(), 2);
     let mut changes = Vec::new();
@@ -185,7 +185,7 @@ fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
 }
 
 #[test]
-fn alarms_of_rules_no_longer_configured_are_counted_on_restore() {
+fn restore_returns_alarms_of_removed_rules() {
     let mut first = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 4);
     for cell in 0..4 {
         see(&mut first, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut Vec::new());
@@ -196,7 +196,7 @@ fn alarms_of_rules_no_longer_configured_are_counted_on_restore() {
 }
 
 #[test]
-fn thresholds_with_an_unknown_value_are_counted_and_named_in_turn() {
+fn unknown_thresholds_are_counted_and_rotated() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1), rule(Rule::SocLow, 0.1, 0.0, 0.0, 1)];
     let mut engine = AlarmEngine::new(rules, 2);
     let mut changes = Vec::new();
@@ -213,12 +213,12 @@ fn thresholds_with_an_unknown_value_are_counted_and_named_in_turn() {
     let lost = |rule, cell| AlarmInput::InputsValid { rule, cell, valid: false };
     engine.apply(at(1.0), &lost(Rule::CapacityLow, CELL), &mut changes);
     engine.apply(at(1.0), &lost(Rule::SocLow, None), &mut changes);
-    assert_eq!(engine.unknown(), (2, 1), "only a learned value outlives its inputs and waits for them");
+    assert_eq!(engine.unknown(), (2, 1), "only a learned value is kept while its inputs are lost");
     assert_eq!(changes, []);
 }
 
 #[test]
-fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
+fn commands_change_selected_alarms_and_refuse_unhealthy_ones() {
     let mut latching = rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1);
     latching.is_latching = true;
     let mut engine = AlarmEngine::new(vec![latching, rule(Rule::SocLow, 0.1, 0.0, 0.0, 1)], 3);
@@ -255,10 +255,10 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
 }
 
 #[test]
-fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
+fn show_equals_observe_for_quiet_values() {
     let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
     let mut configs = rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec();
-    // Two thresholds of one rule, and one that cannot limit a value without its deviation.
+    // Two thresholds of one rule, and one that needs a standard deviation, which shown values lack.
     configs.push(RuleConfig { severity: Severity::Severe, ..rule(Rule::InputMissing, 3.1, 0.2, 1.0, 1) });
     configs[2].when = Comparison::Probability(0.9);
     let mut observation = AlarmEngine::new(configs, 2);
@@ -267,7 +267,7 @@ fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
     for second in 0..5000 {
         let (now, r) = (at(f64::from(second)), rules[rng.random_range(0..3)]);
         let cell = [None, CELL, Some(CellIndex(1)), Some(CellIndex(2))][rng.random_range(0..4)];
-        // Now and then a stretch beyond the threshold.
+        // Occasionally, a period beyond the threshold.
         let value = rng.random_range(0.0..3.2) + if second % 1000 > 900 { 1.0 } else { 0.0 };
         let mut shown = observation.clone();
         let is_quiet = observation.is_quiet(r, value);

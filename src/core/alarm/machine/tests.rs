@@ -1,4 +1,4 @@
-//! Every state with every input, and what the table cannot express: counting, past, suspension.
+//! The transition table, and what it cannot express: counting, history, suspension.
 
 use super::super::{Comparison, Rule, Severity};
 use super::*;
@@ -58,7 +58,7 @@ fn look(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitChec
     machine.observe(at(seconds), rule, &Observation::new(value))
 }
 
-/// A machine that has come to `state` at the latest at 100 s, whose running debounce began then.
+/// A machine that has reached `state` at 100 s at the latest; its debounce, if running, starts then.
 fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     use LimitCheck::{Beyond, Healthy, Unknown};
     let rule = rule(state == AlarmState::Latched);
@@ -79,8 +79,8 @@ fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     (machine, rule)
 }
 
-/// AlarmState after being input, and after being input the same again when the debounce has run out, and what others hear of
-/// the first.
+/// Expected state after `input`, expected state after the same input once the debounce has run out, and the change
+/// published by the first.
 fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, Option<Change>) {
     use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
     use LimitCheck::{Between, Beyond, Healthy};
@@ -123,7 +123,7 @@ fn apply(machine: &mut Machine, rule: &RuleConfig, seconds: f64, input: MachineI
 }
 
 #[test]
-fn every_state_and_input_leads_where_the_table_says() {
+fn transitions_match_table_for_all_inputs() {
     for state in STATES {
         for input in INPUTS {
             let (early, late, change) = expected(state, input);
@@ -140,7 +140,7 @@ fn every_state_and_input_leads_where_the_table_says() {
     }
 }
 
-/// Commands do not make a value known.
+/// Commands never make a value known.
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,
@@ -151,11 +151,11 @@ fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
 }
 
 #[test]
-fn time_that_passes_counts_in_every_state_only_where_a_debounce_runs() {
+fn poll_counts_time_only_during_debounce() {
     for state in STATES {
         let (mut machine, rule) = machine_in(state);
         let change = machine.poll(at(1e6), &rule);
-        // One value each: what is missing is the second value, so that time alone changes nothing.
+        // The debounce needs a second value, so time alone changes nothing.
         assert_eq!((machine.state, change), (state, None), "{state:?}");
         let runs = matches!(state, AlarmState::Pending | AlarmState::Clearing);
         assert_eq!(machine.index_entry().is_counting, runs, "{state:?}");
@@ -163,7 +163,7 @@ fn time_that_passes_counts_in_every_state_only_where_a_debounce_runs() {
 }
 
 #[test]
-fn commands_that_change_nothing_say_why() {
+fn commands_without_effect_return_reason() {
     for state in STATES {
         let (machine, _) = machine_in(state);
         let mut cleared = machine;
@@ -181,11 +181,11 @@ fn commands_that_change_nothing_say_why() {
 }
 
 #[test]
-fn a_latched_alarm_that_is_beyond_again_is_a_new_occurrence_after_the_debounce() {
+fn latched_alarm_beyond_again_is_new_occurrence() {
     let (mut machine, rule) = machine_in(AlarmState::Latched);
     assert_eq!(machine.occurrences, 1);
     assert_eq!(look(&mut machine, &rule, 50.0, LimitCheck::Beyond), None);
-    // Healthy in between: what was counted is forgotten.
+    // A healthy value in between resets the count.
     look(&mut machine, &rule, 55.0, LimitCheck::Healthy);
     assert_eq!(look(&mut machine, &rule, 56.0, LimitCheck::Beyond), None);
     assert_eq!(look(&mut machine, &rule, 65.9, LimitCheck::Beyond), None);
@@ -194,7 +194,7 @@ fn a_latched_alarm_that_is_beyond_again_is_a_new_occurrence_after_the_debounce()
 }
 
 #[test]
-fn a_latched_alarm_cleared_while_its_value_is_unknown_is_unknown() {
+fn latched_alarm_cleared_without_value_is_unknown() {
     let (mut machine, rule) = machine_in(AlarmState::Latched);
     look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
     assert_eq!(machine.clear(), Ok(Change::Cleared));
@@ -202,7 +202,7 @@ fn a_latched_alarm_cleared_while_its_value_is_unknown_is_unknown() {
 }
 
 #[test]
-fn an_acknowledged_alarm_rests_inactive_and_raised_anew_is_not_acknowledged() {
+fn raising_again_resets_acknowledgement() {
     let (mut machine, rule) = machine_in(AlarmState::Active);
     machine.acknowledge().expect("raised");
     look(&mut machine, &rule, 200.0, LimitCheck::Healthy);
@@ -214,7 +214,7 @@ fn an_acknowledged_alarm_rests_inactive_and_raised_anew_is_not_acknowledged() {
 }
 
 #[test]
-fn a_past_alarm_is_cleared_again_when_its_value_comes_back() {
+fn past_alarm_is_cleared_when_value_returns() {
     let (mut machine, rule) = machine_in(AlarmState::Cleared);
     look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
     assert_eq!(machine.state, AlarmState::Unknown);
@@ -224,18 +224,18 @@ fn a_past_alarm_is_cleared_again_when_its_value_comes_back() {
 }
 
 #[test]
-fn time_alone_or_values_alone_do_not_raise() {
+fn raising_needs_both_time_and_values() {
     let (mut by_time, rule) = machine_in(AlarmState::Pending);
-    assert_eq!(by_time.poll(at(1e6), &rule), None, "one value, endless time");
+    assert_eq!(by_time.poll(at(1e6), &rule), None, "one value for a long time");
     let (mut by_values, rule) = machine_in(AlarmState::Pending);
     for _ in 0..1000 {
         assert_eq!(look(&mut by_values, &rule, 109.9, LimitCheck::Beyond), None, "many values, 9.9 s");
     }
-    assert_eq!(by_values.poll(at(110.0), &rule), Some(Change::Raised), "and 0.1 s later both hold");
+    assert_eq!(by_values.poll(at(110.0), &rule), Some(Change::Raised), "after another 0.1 s both conditions hold");
 }
 
 #[test]
-fn time_beside_an_unknown_value_does_not_count_and_takes_nothing_away() {
+fn unknown_value_pauses_debounce_without_reset() {
     for (state, check, change) in [
         (AlarmState::Pending, LimitCheck::Beyond, Change::Raised),
         (AlarmState::Clearing, LimitCheck::Healthy, Change::Cleared),
@@ -245,13 +245,13 @@ fn time_beside_an_unknown_value_does_not_count_and_takes_nothing_away() {
         look(&mut machine, &rule, 105.0, LimitCheck::Unknown);
         assert_eq!(machine.poll(at(190.0), &rule), None);
         look(&mut machine, &rule, 200.0, check);
-        assert_eq!(machine.poll(at(205.9), &rule), None, "4 s before the unknown value count, 1 s beside it does not");
+        assert_eq!(machine.poll(at(205.9), &rule), None, "4 s before the unknown value count, 1 s next to it does not");
         assert_eq!(machine.poll(at(206.0), &rule), Some(change));
     }
 }
 
 #[test]
-fn time_in_a_gap_does_not_count() {
+fn gap_does_not_count_towards_debounce() {
     let (mut machine, rule) = machine_in(AlarmState::Pending);
     machine.handle_gap();
     assert_eq!(look(&mut machine, &rule, 500.0, LimitCheck::Beyond), None);
@@ -259,17 +259,17 @@ fn time_in_a_gap_does_not_count() {
 }
 
 #[test]
-fn a_clock_that_goes_back_takes_nothing_away() {
+fn backward_clock_keeps_counted_time() {
     let (mut machine, rule) = machine_in(AlarmState::Pending);
     assert_eq!(look(&mut machine, &rule, -50.0, LimitCheck::Beyond), None);
     assert_eq!(look(&mut machine, &rule, -40.0, LimitCheck::Beyond), Some(Change::Raised));
 }
 
 #[test]
-fn a_learned_value_whose_inputs_are_lost_is_suppressed_and_stands_when_they_are_back() {
+fn learned_value_is_suppressed_until_inputs_return() {
     let (mut machine, rule) = machine_in(AlarmState::Active);
     assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));
-    assert_eq!(machine.suspend(at(201.0), &rule), None, "input once");
+    assert_eq!(machine.suspend(at(201.0), &rule), None, "reported once");
     assert_eq!((machine.value(), machine.state), (None, AlarmState::Suppressed));
     assert_eq!(machine.resume(at(300.0), &rule), Some(Change::Resumed));
     assert_eq!((machine.value(), machine.state), (Some(1.3), AlarmState::Active));
@@ -279,7 +279,7 @@ fn a_learned_value_whose_inputs_are_lost_is_suppressed_and_stands_when_they_are_
 }
 
 #[test]
-fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_raised() {
+fn value_learned_without_inputs_keeps_raised_alarm() {
     for (value, change, state) in
         [(1.2, Change::Resumed, AlarmState::Active), (1.6, Change::Cleared, AlarmState::Cleared)]
     {
@@ -287,7 +287,7 @@ fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_r
         let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
         assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));
         assert_eq!(machine.observe(at(200.2), &rule, &Observation::new(Some(value))), None);
-        assert_eq!((machine.value(), machine.state), (None, AlarmState::Suppressed), "neither cleared nor fresh");
+        assert_eq!((machine.value(), machine.state), (None, AlarmState::Suppressed), "neither cleared nor up to date");
         assert_eq!(machine.suspend(at(200.3), &rule), None);
         assert_eq!(machine.resume(at(300.0), &rule), Some(change));
         assert_eq!((machine.value(), machine.state), (Some(value), state));
@@ -296,12 +296,16 @@ fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_r
     let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
     assert_eq!(machine.suspend(at(200.0), &rule), None);
     let last = Observation::new(Some(1.2));
-    assert_eq!(machine.observe(at(200.2), &rule, &last), Some(Change::Raised), "the last half-cycle of a drive");
+    assert_eq!(
+        machine.observe(at(200.2), &rule, &last),
+        Some(Change::Raised),
+        "a value from the last half-cycle of a drive"
+    );
     assert_eq!(machine.suspend(at(200.3), &rule), Some(Change::Suppressed));
 }
 
 #[test]
-fn wire_codes_are_those_of_the_alarm_frame() {
+fn wire_codes_match_alarm_frame() {
     let codes = STATES.map(AlarmState::wire_code);
     assert_eq!(codes, [6, 0, 3, 1, 1, 5, 4, 2]);
 }
