@@ -46,8 +46,8 @@ pub enum Rule {
     /// Contact resistance in excess of the other cells' above the threshold, fraction of a cell's series resistance at
     /// medium SOC and 25 degrees C.
     ConnectionResistance = 16,
-    /// The voltage channel does not show its own cell; the value is then 1, else 0. Meanwhile the cell's other rules
-    /// are unknown.
+    /// The voltage channel does not show its own cell; the value is then 1, else 0. While it is 1, the
+    /// cell's rules that depend on its voltage are unknown.
     ChannelFaulty = 17,
 }
 
@@ -175,7 +175,7 @@ impl Rule {
     }
 
     /// Whether the rule depends on the cell's voltages, so that a faulty channel makes its value unknown.
-    pub const fn is_of_cell_voltage(self) -> bool {
+    pub const fn depends_on_cell_voltage(self) -> bool {
         matches!(
             self,
             Self::CapacityLow

@@ -1,7 +1,8 @@
-//! A cell's sample: what the sampler hands to the cell's estimator, and the moment at which voltages were measured together.
+//! The sample that the sampler passes to a cell's estimator, and the moment shared by voltages that were measured
+//! together.
 //!
-//! In: a voltage (V) with the fresh current (A) and temperature (degrees C) and the charge counted so far (As). Stored samples
-//! are checked ([`CellSample::check`]).
+//! In: a voltage (V) with the fresh current (A) and temperature (degrees C) and the charge counted so far (As). Stored
+//! samples are checked ([`CellSample::check`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -14,20 +15,20 @@ use crate::quantity::{CellIndex, InvalidState, Timestamp};
 pub struct CellSample {
     /// Time of the voltage reading.
     pub time: Timestamp,
-    /// Which cell.
+    /// The cell.
     pub cell: CellIndex,
     /// Cell voltage, V.
     pub voltage_v: f64,
-    /// Cell current, A, positive = discharge; `None` = the last good one is too old.
+    /// Cell current, A, positive = discharge; `None` = the last good reading is too old.
     pub current_a: Option<f64>,
-    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it for
-    /// the current between its last reading and `time`.
+    /// Cumulative charge taken out of the cell, As; only differences are meaningful. Later readings may correct the
+    /// part between the last current reading and `time`.
     pub charge_as: f64,
-    /// Time so far in which the current's reading was other than exactly zero, s.
+    /// Cumulative time in which the current reading was not exactly zero, s.
     pub offset_s: f64,
-    /// Time so far without a usable current, s: the charge of that time is unknown.
+    /// Cumulative time without a usable current, s. The charge of this time is unknown.
     pub unmeasured_s: f64,
-    /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
+    /// Cell temperature, degrees C; `None` = no sensor, or the last good reading is too old.
     pub temperature_c: Option<f64>,
 }
 
@@ -37,14 +38,14 @@ impl CellSample {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        bounds::VOLTAGE_V.check("the voltage of a sample that waits for its step", self.voltage_v)?;
+        bounds::VOLTAGE_V.check("the voltage of a pending sample", self.voltage_v)?;
         bounds::CURRENT_A.check_all("its current", self.current_a)?;
         bounds::CHARGE_AS.check("its charge", self.charge_as)?;
         bounds::TEMPERATURE_C.check_all("its temperature", self.temperature_c)?;
         bounds::TIME_S.check_all("its times", [self.offset_s, self.unmeasured_s])
     }
 
-    /// The same voltage, measured at this moment.
+    /// Returns the same voltage as measured at `moment`.
     #[must_use]
     pub fn measured_at(self, moment: &Moment) -> Self {
         let Moment { time, current_a, charge_as, offset_s, unmeasured_s } = *moment;
@@ -52,8 +53,8 @@ impl CellSample {
     }
 }
 
-/// What a cell's sample takes from the current at a moment: for voltages that were measured together and arrive later, as the
-/// answer to a diagnostic request does.
+/// Current and counters at a moment, for voltages that are measured together but arrive later (responses to diagnostic
+/// requests).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Moment {
     pub(super) time: Timestamp,

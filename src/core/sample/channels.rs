@@ -1,4 +1,4 @@
-//! What the sampler knows of each channel: its limits, its place, and when its value should move.
+//! Properties of each channel: its limits, its slot, and the clock of its stuck check.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};
@@ -35,13 +35,13 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// Clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
-/// constant, so only discharging counts for a voltage; temperature and current should move while current flows.
+/// Clock of the stuck check: cumulative time in which the signal should have changed, s. A charger may hold the voltage
+/// constant, so for a voltage only discharging counts; temperature and current should change whenever current flows.
 pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // No rule says when they should move.
+        // Not checked for being stuck.
         Channel::ReportedSoc
         | Channel::ReportedSoh
         | Channel::SupplyVoltage

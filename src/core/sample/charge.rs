@@ -1,14 +1,16 @@
-//! Counts the charge through the pack, and the time without a current measurement.
+//! Counts the charge through the pack and the time without a current measurement.
 //!
-//! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured
-//! time, s; only their differences have a meaning. The rule for an interval between two current readings:
-//! * no longer than the current's `max_age_s`: trapezoid over the elapsed time;
-//! * longer: the first reading holds for `max_age_s` (the longest time that a value may be used), the rest of the
-//!   interval is unmeasured. No hole is interpolated, whatever its cause (bad readings, lost frames, sleep, a restart).
+//! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured time, s;
+//! only their differences are meaningful. An interval between two current readings counts as follows:
+//! * up to the current's `max_age_s`: trapezoid over the elapsed time;
+//! * longer: the first reading is held for `max_age_s` (the longest time that a value may be used), the rest of the
+//!   interval is unmeasured. Holes are never interpolated, regardless of their cause (bad readings, lost frames, sleep,
+//!   a restart).
 //!
-//! Between readings the latest one holds in the same way; the next reading replaces that hold by the trapezoid.
-//! While the contactors are open the current is zero, measured or not, for as long as their reading holds.
-//! Unmeasured time never falls and never grows faster than time; before the first current all time is unmeasured.
+//! After the latest reading, the current is held in the same way; the next reading replaces the held value by the
+//! trapezoid. While the contactors are open, the current is zero, measured or not, for as long as the contactors'
+//! reading is valid. Unmeasured time never decreases and never grows faster than time; before the first current
+//! reading, all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,7 +22,7 @@ use crate::quantity::{InvalidState, Timestamp};
 pub struct ChargeTotals {
     /// Charge taken out of the pack, As.
     pub charge_as: f64,
-    /// Time in which the reading was other than exactly zero, s: the charge of that time has the sensor's offset.
+    /// Time in which the reading was not exactly zero, s. The sensor's offset contributes to the charge of this time.
     pub offset_s: f64,
     /// Time without a usable current, s.
     pub unmeasured_s: f64,
@@ -30,25 +32,25 @@ pub struct ChargeTotals {
     pub(super) discharging_s: f64,
 }
 
-/// The counter: totals up to a moment, and the current from there on.
+/// The counter: totals up to `counted_to`, and the current from there on.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct ChargeCounter {
     totals: ChargeTotals,
-    /// End of the final totals; `None` = no input yet.
+    /// Time up to which the totals are final; `None` = no input yet.
     counted_to: Option<Timestamp>,
-    /// The reading at `counted_to`, A; `None` = unmeasured from there on.
+    /// The current from `counted_to` on, A; `None` = unmeasured.
     current_a: Option<f64>,
-    /// The contactors are open up to here; `None` = closed, or not known.
+    /// The contactors are open until this time; `None` = closed or unknown.
     open_until: Option<Timestamp>,
 }
 
 impl ChargeCounter {
-    /// Starts the clock at the first input of any kind: from here on a missing current is unmeasured time.
+    /// Starts the clock at the first input of any kind. From here on, time without a current is unmeasured.
     pub(super) fn begin(&mut self, time: Timestamp) {
         self.counted_to.get_or_insert(time);
     }
 
-    /// Counts a good reading. `flow_a` is the smallest current that counts as flowing.
+    /// Handles a good reading. `flow_a` is the smallest current that counts as flowing.
     pub(super) fn handle_current(&mut self, time: Timestamp, current_a: f64, max_age_s: f64, flow_a: f64) {
         let dt_s = self.passed_s(time);
         match self.current_a {
@@ -62,7 +64,7 @@ impl ChargeCounter {
         self.current_a = Some(current_a);
     }
 
-    /// Totals at `time`; the latest reading holds for at most `max_age_s`.
+    /// Totals at `time`; the latest reading is held for at most `max_age_s`.
     #[inline]
     pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> ChargeTotals {
         let dt_s = self.passed_s(time);
@@ -87,13 +89,13 @@ impl ChargeCounter {
         self.open_until.is_some_and(|until| now <= until)
     }
 
-    /// Handles open contactors: no current from `time` to `until`, unless they close before.
+    /// Handles open contactors: no current from `time` to `until`, unless they close earlier.
     pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
         self.hold(time, Some(0.0), max_age_s);
         self.open_until = Some(until);
     }
 
-    /// Handles closed contactors: after open ones the current is `measured_a` from `time` on.
+    /// Handles closed contactors. If they were open, the current is `measured_a` from `time` on.
     pub(super) fn close(&mut self, time: Timestamp, measured_a: Option<f64>, max_age_s: f64) {
         if self.open_until.is_some() {
             self.hold(time, measured_a, max_age_s);
@@ -101,14 +103,14 @@ impl ChargeCounter {
         }
     }
 
-    /// Ends the present hold at `time`, and holds another current from there on.
+    /// Makes the totals final up to `time`, and holds `current_a` from there on.
     fn hold(&mut self, time: Timestamp, current_a: Option<f64>, max_age_s: f64) {
         self.totals = self.totals_at(time, max_age_s);
         self.counted_to = Some(self.counted_to.map_or(time, |last| last.max(time)));
         self.current_a = current_a;
     }
 
-    /// How long the latest current holds: `max_age_s`, and while the contactors are open, s.
+    /// How long the latest current is held, s: `max_age_s`, or longer while the contactors are open.
     #[inline]
     fn hold_s(&self, max_age_s: f64) -> f64 {
         match (self.open_until, self.counted_to) {
@@ -117,7 +119,7 @@ impl ChargeCounter {
         }
     }
 
-    /// Forgets the state of contactors that are no longer an input.
+    /// Forgets the state of contactors that are no longer configured.
     pub(super) fn forget_contactors(&mut self) {
         self.open_until = None;
     }
@@ -128,12 +130,12 @@ impl ChargeCounter {
         }
     }
 
-    /// Checks a stored counter; the error is its first impossible number.
+    /// Checks a stored counter; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let ChargeTotals { charge_as, offset_s, unmeasured_s, flowing_s, discharging_s } = self.totals;
         bounds::CHARGE_AS.check("the counted charge", charge_as)?;
-        bounds::CURRENT_A.check_all("the current that is counted", self.current_a)?;
-        bounds::TIME_S.check_all("the time that charge is counted", [offset_s, unmeasured_s, flowing_s, discharging_s])
+        bounds::CURRENT_A.check_all("the current of the charge counter", self.current_a)?;
+        bounds::TIME_S.check_all("the times of the charge counter", [offset_s, unmeasured_s, flowing_s, discharging_s])
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {
@@ -141,7 +143,7 @@ impl ChargeCounter {
     }
 }
 
-/// Part of a reading's time in which it has the sensor's offset: a reading of exactly zero has none.
+/// 1 if the sensor's offset is part of the reading, else 0: a reading of exactly zero has no offset.
 fn offset_part(current_a: f64) -> f64 {
     if current_a == 0.0 { 0.0 } else { 1.0 }
 }
@@ -180,14 +182,14 @@ mod tests {
     }
 
     #[test]
-    fn uneven_steps_of_a_ramp_integrate_exactly() {
-        // i = t: charge t^2 / 2 whatever the steps.
+    fn ramp_integrates_exactly_with_uneven_steps() {
+        // i = t: the charge is t^2 / 2 for any step size.
         let counter = counter(&[(0.0, 0.0), (0.5, 0.5), (2.5, 2.5), (2.75, 2.75), (4.0, 4.0)]);
         assert_eq!(charge_and_gap(&counter, 4.0), (8.0, 0.0));
     }
 
     #[test]
-    fn the_next_reading_replaces_the_hold_by_the_trapezoid() {
+    fn next_reading_replaces_hold_by_trapezoid() {
         let mut counter = counter(&[(0.0, 1.0)]);
         assert_eq!(charge_and_gap(&counter, 1.0), (1.0, 0.0));
         counter.handle_current(at(2.0), 3.0, 2.0, 0.1);
@@ -195,11 +197,11 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_is_held_for_the_age_limit_and_unmeasured_beyond() {
+    fn hole_is_held_for_age_limit_then_unmeasured() {
         let mut counter = counter(&[(0.0, 1.0)]);
         assert_eq!(charge_and_gap(&counter, 10.0), (2.0, 8.0));
         counter.handle_current(at(10.0), 50.0, 2.0, 0.1);
-        assert_eq!(charge_and_gap(&counter, 10.0), (2.0, 8.0), "the same, and nothing of the 50 A");
+        assert_eq!(charge_and_gap(&counter, 10.0), (2.0, 8.0), "the 50 A do not count backwards");
     }
 
     #[test]
@@ -211,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_gap_counts_neither_charge_nor_time() {
+    fn gap_counts_neither_charge_nor_time() {
         let mut counter = counter(&[(0.0, 1.0), (1.0, 1.0)]);
         counter.handle_gap(at(2.0), at(1000.0), 2.0);
         assert_eq!(charge_and_gap(&counter, 1000.0), (2.0, 0.0));
@@ -220,21 +222,25 @@ mod tests {
     }
 
     #[test]
-    fn open_contactors_hold_zero_for_their_own_time_and_closed_ones_end_it() {
+    fn open_contactors_hold_zero_until_closed_or_stale() {
         let mut counter = counter(&[(0.0, 3.0)]);
         counter.open(at(1.0), at(11.0), 2.0);
         assert!(counter.is_open(at(11.0)) && !counter.is_open(at(11.1)));
-        assert_eq!(charge_and_gap(&counter, 9.0), (3.0, 0.0), "held to the opening, nothing since, all of it known");
-        assert_eq!(charge_and_gap(&counter, 14.0), (3.0, 3.0), "unknown once their reading is too old");
+        assert_eq!(
+            charge_and_gap(&counter, 9.0),
+            (3.0, 0.0),
+            "held until the contactors open, zero afterwards, no unmeasured time"
+        );
+        assert_eq!(charge_and_gap(&counter, 14.0), (3.0, 3.0), "unmeasured once the contactor reading is too old");
         counter.open(at(8.0), at(18.0), 2.0);
         counter.close(at(9.0), Some(2.0), 2.0);
         assert_eq!(charge_and_gap(&counter, 10.0), (5.0, 0.0));
         counter.close(at(10.5), None, 2.0);
-        assert_eq!(charge_and_gap(&counter, 11.0), (7.0, 0.0), "closed already: the current goes on");
+        assert_eq!(charge_and_gap(&counter, 11.0), (7.0, 0.0), "already closed: the current is still held");
     }
 
     #[test]
-    fn a_stamp_that_goes_back_counts_nothing() {
+    fn backward_time_stamp_counts_nothing() {
         let counter = counter(&[(10.0, 1.0), (4.0, 1.0), (11.0, 1.0)]);
         assert_eq!(charge_and_gap(&counter, 11.0), (1.0, 0.0));
     }

@@ -1,8 +1,9 @@
-//! Settings of the sample stage: plausible values, largest ages, and the sensor of each cell. `config` checks their ranges.
+//! Settings of the sample stage: plausible values, maximum ages, and the sensor of each cell. `config` checks their
+//! ranges.
 
 use crate::quantity::SensorIndex;
 
-/// Limits on one kind of reading. A value outside them is a bad reading and changes no estimate.
+/// Limits of one kind of reading. A value outside is a bad reading and changes no estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Smallest plausible value, in the channel's unit.
@@ -11,7 +12,7 @@ pub struct Limits {
     pub max: f64,
     /// Fastest plausible change, unit per second; `None` = not checked.
     pub max_rate_per_s: Option<f64>,
-    /// A value unchanged for this long while current flows is stuck; `None` = not checked.
+    /// A value that is unchanged for this long while it should change is stuck; `None` = not checked.
     pub stuck_after_s: Option<f64>,
     /// A value older than this is stale.
     pub max_age_s: f64,
@@ -20,32 +21,32 @@ pub struct Limits {
 /// Source of the cells' voltages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VoltageSource {
-    /// One reading per cell.
+    /// One signal per cell.
     Cells,
-    /// Only the pack's total: `series` equal cells are assumed and estimated as one.
+    /// Only the total voltage of the pack: `series` equal cells are assumed and estimated as one.
     PackTotal {
-        /// Cells in series the total is divided by.
+        /// Number of cells in series, by which the total is divided.
         series: u16,
     },
 }
 
-/// Settings of the contactors' signal.
+/// Settings of the contactor signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContactorConfig {
-    /// Values that mean open.
+    /// Values that mean "open".
     pub open: Vec<f64>,
-    /// Limits of its readings; after the largest age the state is unknown.
+    /// Limits of its readings. After the maximum age, the state is unknown.
     pub limits: Limits,
 }
 
 /// Checked settings of the sample stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleConfig {
-    /// Estimated cells (1 with [`VoltageSource::PackTotal`]), 1 to [`crate::quantity::MAX_CELLS`].
+    /// Number of estimated cells (1 with [`VoltageSource::PackTotal`]), 1 to [`crate::quantity::MAX_CELLS`].
     pub cells: u16,
     /// Source of the voltages.
     pub voltage_source: VoltageSource,
-    /// Parallel strings that share the pack current equally.
+    /// Number of parallel strings, which share the pack current equally.
     pub strings: u16,
     /// Limits of the pack current (per pack, not per string), A.
     pub current: Limits,
@@ -53,17 +54,17 @@ pub struct SampleConfig {
     pub voltage: Limits,
     /// Limits of a temperature, degrees C.
     pub temperature: Limits,
-    /// Limits of the SOC the pack reports; `None` = it reports none.
+    /// Limits of the SOC reported by the pack; `None` = not reported.
     pub reported_soc: Option<Limits>,
-    /// Limits of the SOH the pack reports; `None` = it reports none.
+    /// Limits of the SOH reported by the pack; `None` = not reported.
     pub reported_soh: Option<Limits>,
-    /// The contactors; `None` = no signal, and the current is always as measured.
+    /// The contactors; `None` = no signal, the measured current always counts.
     pub contactor: Option<ContactorConfig>,
-    /// Temperature sensor of each cell; `None` = no sensor, the thermal model alone.
+    /// Temperature sensor of each cell; `None` = no sensor, only the thermal model.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
     /// Standard deviation of a voltage sensor's noise, V.
     pub voltage_noise_v: f64,
-    /// Ambient temperature without a sensor, degrees C.
+    /// Ambient temperature for cells without a sensor, degrees C.
     pub ambient_c: f64,
 }
 

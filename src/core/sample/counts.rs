@@ -1,19 +1,17 @@
-//! Counts of used readings, and of rejected ones by reason.
-//!
-//! In: outcomes of readings. Out: counts, which saturate.
+//! Saturating counts of accepted readings, and of rejected readings by reason.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::Fault;
 
-/// Readings by outcome since the first start (part of the stored state).
+/// Readings by outcome since the first start; part of the stored state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReadingCounts {
     /// Used.
     pub accepted: u64,
-    /// For channels without a use.
+    /// For channels that the configuration does not use.
     pub unused: u64,
-    /// Steps to another level, rejected at first and accepted when they stayed.
+    /// Steps to a new level, rejected at first and accepted once they persisted.
     pub levels_believed: u64,
     /// The frame was too short.
     pub short_frame: u64,
@@ -25,16 +23,16 @@ pub struct ReadingCounts {
     pub not_finite: u64,
     /// Outside its range.
     pub out_of_range: u64,
-    /// Moved too fast.
+    /// Changed too fast.
     pub rate_too_high: u64,
-    /// Unchanged although it should have moved.
+    /// Unchanged although it should have changed.
     pub stuck: u64,
     /// Times a signal became too old.
     pub stale: u64,
 }
 
 impl ReadingCounts {
-    /// Difference to the earlier counts `before`.
+    /// Difference from the earlier counts `before`.
     pub fn since(&self, before: &Self) -> Self {
         let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
         Self {
@@ -68,7 +66,7 @@ impl ReadingCounts {
         *count = count.saturating_add(1);
     }
 
-    /// Readings that were not used, by reason; the reasons' names are those of [`Fault`].
+    /// Rejected readings by reason, named like [`Fault`].
     pub fn rejected(&self) -> [(&'static str, u64); 7] {
         [
             ("short_frame", self.short_frame),

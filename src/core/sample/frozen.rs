@@ -1,60 +1,63 @@
-//! Finds a current sensor that is frozen: its reading stays the same, bit for bit, while the voltages show a changing load.
+//! Detects a frozen current sensor: its reading stays bit-identical while the voltages show a changing load.
 //!
-//! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the current is frozen; it is until its
-//! reading changes.
+//! In: good readings of the current, A, and of the cells' voltages, V. Out: whether the current is frozen. It stays
+//! frozen until its reading changes.
 //!
-//! A constant reading alone proves nothing: a parked pack, a charger and a laboratory hold a current for hours, and a coarse
-//! sensor shows one value all the while. But then the voltages rest, or drift one way. A changing load moves them to and fro:
-//! the median of the cells moves one way and turns back, by more than its noise each time, within [`MAX_TURN_S`]. Where the
-//! reading is still the same [`MIN_FROZEN_S`] later, after at least [`MIN_READINGS`] equal ones, it is not the current's: a reading
-//! that comes later than the voltages has changed by then.
+//! A constant reading alone proves nothing: a parked pack, a charger and a laboratory hold a current for hours, and a
+//! coarse sensor then shows one value throughout. But then the voltages rest, or drift in one direction. A changing
+//! load moves them back and forth: the median of the cells moves in one direction and turns back, each time by more
+//! than its noise, within [`MAX_TURN_S`]. The sensor is frozen if its reading is still the same [`MIN_FROZEN_S`] later,
+//! after at least [`MIN_READINGS`] equal readings. The delay allows for a reading that arrives later than the voltages.
 //!
-//! Limits: a load that does not turn back, or moves the voltages by less than the step, is not seen; nor a sensor whose last
-//! digits still change (its voltages then contradict the estimate).
+//! Limits: the check does not detect a load that does not turn back or moves the voltages by less than the step. It
+//! does not detect a sensor whose last digits still change either; in that case the voltages contradict the estimate.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp, bounds};
 
-/// Readings of the current that were the same.
+/// Fewest equal current readings.
 const MIN_READINGS: u32 = 20;
-/// Time for which they still are after the voltages turned back, s: no current comes that much later.
+/// Time for which the reading must remain unchanged after the voltages turned back, s. No current arrives that much
+/// later.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Longest time between an extreme voltage and the return from it, s: cells that rest, cool or balance turn more slowly.
+/// Longest time between an extreme voltage and the return from it, s. Cells that rest, cool or balance turn more
+/// slowly.
 const MAX_TURN_S: f64 = 60.0;
-/// Step that is no noise of a voltage, in its configured standard deviations.
+/// Step that exceeds a voltage's noise, in configured standard deviations.
 const STEP_SIGMA: f64 = 5.0;
-/// The same, in the median size of the latest moves from one round to the next, where these are larger than the configured noise:
-/// 8 standard deviations, so that not even two readings in a row reach it by chance within a day.
+/// The same step as a multiple of the median change of the voltage per round, used if the real noise exceeds the
+/// configured noise. Corresponds to 8 standard deviations, so that not even two readings in a row reach it by chance
+/// within a day.
 const STEP_MOVES: f64 = 8.4;
-/// Moves of which the median is taken, and the fewest.
+/// Largest and smallest number of changes for their median.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
-/// Least step, V: less may be a charger's ripple, or a load within one step of a coarse current sensor.
+/// Smallest step, V. Less may be a charger's ripple, or a load within one step of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
-/// Cells of which the median is taken: the first ones, as many as separate a glitch from a load.
+/// Number of cells for the median: the first ones, enough to tell a glitch from a load.
 const MAX_MEDIAN: usize = 15;
-/// Without a change of the current for longer than this between two readings the time in between is not judged, s.
+/// Longest time between two current readings, s. After a longer pause the check restarts.
 const MAX_PAUSE_S: f64 = 5.0;
 
-/// Turning points of a voltage.
+/// Detects turning points of a voltage.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Reversals {
-    /// Least and greatest voltage since the last turning point, V; `None` = none yet.
+    /// Lowest and highest voltage since the last turning point, V; `None` = no voltage yet.
     range_v: Option<(f64, f64)>,
-    /// The voltage rises since the last turning point, or falls.
+    /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
-    /// When it was furthest that way.
+    /// Time of the extreme voltage in this direction.
     extreme_at: Timestamp,
-    /// It has turned in one reading, which the next one has to confirm.
+    /// One reading shows a turn; the next one has to confirm it.
     is_unconfirmed: bool,
-    /// It has turned back in time.
+    /// The voltage has turned back within [`MAX_TURN_S`].
     has_turned: bool,
 }
 
 impl Reversals {
-    /// Takes a voltage.
+    /// Handles a voltage.
     fn handle(&mut self, now: Timestamp, voltage_v: f64, step_v: f64) {
         let Some((low, high)) = self.range_v else {
             (self.range_v, self.extreme_at) = (Some((voltage_v, voltage_v)), now);
@@ -89,25 +92,25 @@ impl Reversals {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct FrozenCheck {
-    /// The unchanged reading, when it came last, and how often.
+    /// The unchanged reading, the time of its latest occurrence, and their number.
     current_a: Option<f64>,
     latest: Timestamp,
     readings: u32,
     reversals: Reversals,
-    /// The first reading after the voltages turned back.
+    /// Time of the first current reading after the voltages turned back.
     turned_at: Option<Timestamp>,
-    /// Voltages of the round at hand, V, at most [`MAX_MEDIAN`]; the first cell begins a round.
+    /// Voltages of the current round, V, at most [`MAX_MEDIAN`]. The first cell starts a round.
     round_v: Vec<f64>,
-    /// The round at hand began before the reading changed.
+    /// The current round started before the current reading changed.
     is_mixed: bool,
-    /// Median of the round before, V.
+    /// Median of the previous round, V.
     median_v: f64,
-    /// Sizes of the latest moves of the median, V, at most [`MAX_MOVES`]: they stay when the current's reading changes.
+    /// Latest absolute changes of the median, V, at most [`MAX_MOVES`]. Kept when the current reading changes.
     moves_v: Vec<f64>,
     is_frozen: bool,
 }
 
-/// Step that a voltage of this noise, V, is not moved by: [`STEP_SIGMA`] standard deviations.
+/// Step that noise does not reach, V: [`STEP_SIGMA`] times the standard deviation `noise_v`, V.
 pub(super) fn step_v(noise_v: f64) -> f64 {
     (STEP_SIGMA * noise_v).max(MIN_STEP_V)
 }
@@ -119,7 +122,7 @@ impl FrozenCheck {
         self.is_frozen
     }
 
-    /// Takes a reading of the current; whether it is that of a frozen sensor.
+    /// Handles a current reading; returns whether the sensor is frozen.
     pub(super) fn handle_current(&mut self, now: Timestamp, current_a: f64) -> bool {
         let is_paused = now.since(self.latest) > MAX_PAUSE_S;
         if self.current_a != Some(current_a) || (is_paused && !self.is_frozen) {
@@ -141,7 +144,7 @@ impl FrozenCheck {
         self.is_frozen
     }
 
-    /// Takes the voltage of a cell; the first one begins a round.
+    /// Handles the voltage of a cell; the first cell starts a round.
     #[inline]
     pub(super) fn handle_voltage(&mut self, now: Timestamp, cell: usize, voltage_v: f64, step_v: f64) {
         if cell >= MAX_MEDIAN {
@@ -158,7 +161,7 @@ impl FrozenCheck {
     fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
-        // Of two middle cells the one that has moved less: a load moves both.
+        // Of the two middle cells, take the one that changed less: a load moves both.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };
@@ -181,7 +184,7 @@ impl FrozenCheck {
         *moves_v.select_nth_unstable_by(self.moves_v.len() / 2, f64::total_cmp).1
     }
 
-    /// After a gap of unknown length nothing is known.
+    /// Forgets everything, after a gap of unknown length.
     pub(super) fn restart(&mut self) {
         *self = Self::default();
     }
@@ -192,20 +195,25 @@ impl FrozenCheck {
         }
     }
 
-    /// Checks a stored state; the error is its first impossible number.
+    /// Checks a stored state; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.reversals.range_v.unwrap_or_default();
-        bounds::VOLTAGE_V.check("the voltage beside a constant current", self.median_v)?;
-        bounds::NUMBER.check_all("moves of a voltage beside a constant current", self.moves_v.iter().copied())?;
+        bounds::VOLTAGE_V.check("the median voltage of the frozen-current check", self.median_v)?;
+        bounds::NUMBER.check_all("voltage changes of the frozen-current check", self.moves_v.iter().copied())?;
         let moves = self.moves_v.len();
-        InvalidState::unless(moves <= MAX_MOVES, "the moves of a voltage", moves as f64, "at most 32")?;
+        InvalidState::unless(
+            moves <= MAX_MOVES,
+            "the number of voltage changes of the frozen-current check",
+            moves as f64,
+            "at most 32",
+        )?;
         bounds::VOLTAGE_V
-            .check_all("a voltage beside a constant current", self.round_v.iter().copied().chain([low, high]))?;
-        bounds::CURRENT_A.check_all("a constant current", self.current_a)?;
+            .check_all("a voltage of the frozen-current check", self.round_v.iter().copied().chain([low, high]))?;
+        bounds::CURRENT_A.check_all("the current of the frozen-current check", self.current_a)?;
         let cells = self.round_v.len() as f64;
         InvalidState::unless(
             self.round_v.len() <= MAX_MEDIAN,
-            "the cells beside a constant current",
+            "the number of voltages of the frozen-current check",
             cells,
             "at most 15",
         )
@@ -216,7 +224,8 @@ impl FrozenCheck {
 mod tests {
     use super::*;
 
-    /// Ten readings a second of a current and of three cells for `seconds`; when it was found frozen, s.
+    /// Simulates ten readings a second of a current and of three cells for `seconds`; returns when the current was
+    /// found frozen, s.
     fn found_s(seconds: u32, current: impl Fn(f64) -> f64, voltage: impl Fn(f64) -> f64) -> Option<f64> {
         let mut check = FrozenCheck::default();
         (0..10 * seconds).map(|k| f64::from(k) / 10.0).find(|&time_s| {
@@ -228,13 +237,13 @@ mod tests {
         })
     }
 
-    /// A drive: the load of every few seconds is another one.
+    /// A drive whose load changes every few seconds.
     fn load_a(time_s: f64) -> f64 {
         40.0 + 60.0 * libm::sin(0.7 * time_s) * libm::sin(0.11 * time_s)
     }
 
     #[test]
-    fn a_frozen_current_is_found_by_the_voltages_within_a_minute() {
+    fn frozen_current_is_found_within_a_minute() {
         for frozen_a in [0.0, 12.3] {
             let found = found_s(
                 120,
@@ -246,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_current_with_voltages_that_rest_or_drift_is_none() {
+    fn constant_current_with_drifting_voltages_is_not_frozen() {
         let noise = |time_s: f64| 0.004 * libm::sin(37.0 * time_s) + 0.004 * libm::sin(91.0 * time_s);
         for (current_a, drift_v_per_s) in [(0.0, 0.0), (5.0, -2e-4), (-5.0, 2e-4), (5.0, -5e-3)] {
             let found = found_s(600, |_| current_a, |time_s| 3.7 + drift_v_per_s * time_s + noise(time_s));
@@ -255,8 +264,8 @@ mod tests {
     }
 
     #[test]
-    fn a_current_that_comes_later_than_the_voltages_and_cells_that_turn_slowly_are_none() {
-        // The end of a charge: the voltages fall three seconds before the reading does.
+    fn late_current_and_slow_turns_are_not_frozen() {
+        // End of a charge: the voltages fall three seconds before the current reading does.
         let charge = |time_s: f64| if time_s < 100.0 { 3.6 + 2e-3 * time_s } else { 3.7 };
         assert_eq!(found_s(200, |time_s| if time_s < 103.0 { -50.0 } else { 0.0 }, charge), None);
         let found = found_s(200, |_| -50.0, charge);
@@ -265,10 +274,10 @@ mod tests {
     }
 
     #[test]
-    fn a_load_that_the_current_shows_is_none_and_glitches_are_none() {
+    fn measured_load_and_glitches_are_not_frozen() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
-        // Five times the configured noise, which a coarse sensor may have: uniform, drawn from the time.
+        // Five times the configured noise, as a coarse sensor may have; pseudorandom, uniform, derived from the time.
         let noise = |time_s: f64| {
             let bits = ((10.0 * time_s) as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             let bits = (bits ^ (bits >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -280,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reading_that_moves_again_ends_it() {
+    fn changing_reading_ends_frozen_state() {
         let mut check = FrozenCheck { current_a: Some(5.0), is_frozen: true, readings: 99, ..FrozenCheck::default() };
         assert!(check.handle_current(Timestamp::from_secs(1.0), 5.0));
         assert!(!check.handle_current(Timestamp::from_secs(2.0), 5.1));

@@ -1,11 +1,11 @@
-//! Readings that arrive at different times and rates, combined into samples for the cells' estimators.
+//! Combines readings that arrive at different times and rates into samples for the cells' estimators.
 //!
-//! In: readings (V, A with positive = discharge, degrees C) with their time. Out: one [`CellSample`] per good
-//! voltage reading, and [`SignalChange`]s when a signal turns bad or good. A bad reading changes no sample.
+//! In: readings (V, A with positive = discharge, degrees C) with their time. Out: one [`CellSample`] per good voltage
+//! reading, and a [`SignalChange`] when a signal turns bad or good. A bad reading changes no sample.
 //! * [`signal`] checks one signal: range, rate, stuck, stale;
 //! * [`charge`] counts charge and the time without a current measurement;
-//! * [`cell_sample`] is what a cell's estimator gets;
-//! * [`sampler`] holds one signal per channel and combines samples.
+//! * [`cell_sample`] defines the input of a cell's estimator;
+//! * [`sampler`] holds one signal per channel and combines them into samples.
 
 pub mod cell_sample;
 mod channels;

@@ -1,11 +1,11 @@
-//! The sampler: one signal per configured channel, the charge counter, and the samples made of them.
+//! The sampler: one signal per configured channel, the charge counter, and the samples built from them.
 //!
-//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and temperature
-//! that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage makes no sample.
-//! Readings of channels without a use are counted ([`Sampler::reading_counts`]).
+//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and
+//! temperature that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage gives no
+//! sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
 //!
-//! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records are stored
-//! together and not field by field. Nothing is allocated per reading.
+//! Memory is one record per channel, allocated at the start. A reading touches one whole record, so the records are
+//! stored as an array of structs. Handling a reading allocates nothing.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,14 +18,14 @@ use super::frozen::{self, FrozenCheck};
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
-/// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
-/// sensor at rest, below any load under which a voltage or temperature has to move.
+/// Smallest current that counts as flowing, as a fraction of the largest plausible current: above a sensor's noise and
+/// offset at rest, below any load under which a voltage or temperature must change.
 pub const FLOW_SHARE: f64 = 0.01;
 
-/// A signal that has turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
+/// A signal that turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
-    /// Channel of the signal.
+    /// The channel of the signal.
     pub channel: Channel,
     /// Its new state.
     pub state: Result<u64, Fault>,
@@ -41,9 +41,9 @@ pub struct SamplerState {
     unused_readings: u64,
     counts: ReadingCounts,
     frozen: FrozenCheck,
-    /// Parallel strings of the configuration.
+    /// Configured number of parallel strings.
     strings: u16,
-    /// Cells in series.
+    /// Configured number of cells in series.
     series: u16,
 }
 
@@ -58,17 +58,17 @@ impl SamplerState {
         self.signals.iter().try_for_each(Signal::check)
     }
 
-    /// Parallel strings, and cells in series, of the configuration.
+    /// Configured number of parallel strings and of cells in series.
     pub fn wiring(&self) -> (u16, u16) {
         (self.strings, self.series)
     }
 
-    /// Charge up to `time`, As, for the pack: the latest reading holds for at most `max_age_s`.
+    /// Pack charge up to `time`, As; the latest current reading is held for at most `max_age_s`.
     pub fn charge_as(&self, time: Timestamp, max_age_s: f64) -> f64 {
         self.charge.totals_at(time, max_age_s).charge_as
     }
 
-    /// Moves every stamp by `by_nanos`, onto another clock.
+    /// Moves every time stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));
         self.charge.rebase(by_nanos);
@@ -82,25 +82,27 @@ impl SamplerState {
 #[derive(Debug, Clone)]
 pub struct Sampler {
     config: SampleConfig,
-    /// Channels in the order of their signals: current, sensors, voltages, what the pack reports, contactors.
+    /// Channels in the order of their signals: current, temperatures, voltages, values reported by the pack,
+    /// contactors.
     channels: Vec<Channel>,
     /// Number of temperature sensors in use.
     sensors: usize,
     /// Number of voltage channels.
     voltages: usize,
     flow_a: f64,
-    /// Step of a voltage that is no noise, V.
+    /// Voltage step that noise does not reach, V.
     step_v: f64,
     state: SamplerState,
-    /// No signal becomes stale before this time; `None` = unknown.
+    /// No signal becomes stale before this time; `None` = to be computed.
     next_stale: Option<Timestamp>,
     /// Number of bad signals.
     bad_signals: usize,
-    /// Inputs shared by the readings of the latest time.
+    /// Inputs shared by readings with the same time stamp.
     shared: SharedInputs,
 }
 
-/// Inputs shared by all readings of one time, until a current arrives (for the sensor's value, until a temperature does).
+/// Inputs shared by readings with the same time stamp. A new current invalidates all of them, a new temperature only
+/// the sensor's value.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.
@@ -109,12 +111,12 @@ struct SharedInputs {
     totals: ChargeTotals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
-    /// The sensor of the last sample, and its value: neighbouring cells mostly share a sensor.
+    /// The sensor of the last sample, and its value. Neighbouring cells often share a sensor.
     sensor: Option<(SensorIndex, Option<f64>)>,
 }
 
 impl Sampler {
-    /// A sampler before its first reading.
+    /// Creates a sampler without readings.
     pub fn new(config: SampleConfig) -> Self {
         let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
         let voltages = match config.voltage_source {
@@ -146,13 +148,13 @@ impl Sampler {
     /// Replaces the limits of the same signals.
     ///
     /// # Panics
-    /// When the signals differ; the caller checks that.
+    /// If the signals differ. The caller must check that they are the same.
     pub fn reconfigure(&mut self, config: &SampleConfig) {
         let state = std::mem::replace(self, Self::new(config.clone())).state;
         self.restore(state);
     }
 
-    /// Handles a reading; returns a sample if it is a good voltage. Appends changes of the signal to `changes`.
+    /// Handles a reading; returns a sample if it is a good voltage. Appends a change of the signal to `changes`.
     pub fn handle_reading(
         &mut self,
         time: Timestamp,
@@ -179,7 +181,7 @@ impl Sampler {
         counts.levels_believed = counts.levels_believed.saturating_add(u64::from(judged.is_new_level));
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
-            // Only a good signal turns bad, and only a bad one good: the count never falls below 0.
+            // A change always alternates between good and bad, so the count never falls below 0.
             self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
             self.next_stale = None;
         }
@@ -216,17 +218,17 @@ impl Sampler {
         }
     }
 
-    /// Whether the current's reading is frozen: the voltages show another load.
+    /// Whether the current reading is frozen: the voltages show another load.
     pub fn is_current_frozen(&self) -> bool {
         self.state.frozen.is_frozen()
     }
 
-    /// Change of the pack current that is no noise of its sensor, A.
+    /// Change of the pack current that exceeds its sensor's noise, A.
     pub fn flow_a(&self) -> f64 {
         self.flow_a
     }
 
-    /// Handles the state of the contactors: with open ones no current flows, whatever its sensor reports.
+    /// Handles the state of the contactors. While they are open, no current flows, regardless of the sensor.
     fn handle_contactor(&mut self, time: Timestamp, value: f64) {
         let Some(contactor) = &self.config.contactor else { return };
         let max_age_s = self.config.current.max_age_s;
@@ -240,7 +242,7 @@ impl Sampler {
         self.shared.is_known = false;
     }
 
-    /// Checks the ages at `now`; appends signals that have become stale to `changes`.
+    /// Checks ages at `now`; appends signals that have become stale to `changes`.
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<SignalChange>) {
         let now = self.advance(now);
         if self.next_stale.is_some_and(|next| now <= next) {
@@ -264,7 +266,8 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// Handles a gap of unknown length before `time`: no value is fresh, no charge is counted over it, ages start again.
+    /// Handles a gap of unknown length before `time`: no value is fresh, no charge is counted over the gap, ages
+    /// restart.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
@@ -274,14 +277,14 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Handles the end of a sleep at `time`: values keep their age, but no signal counts as silent or stale for the time
-    /// asleep.
+    /// Handles the end of a sleep at `time`: values keep their age, but the time asleep makes no signal silent or
+    /// stale.
     pub fn wake(&mut self, time: Timestamp) {
         self.state.began = Some(time);
         self.next_stale = None;
     }
 
-    /// Pack current, A, positive = discharge, when its last good reading is fresh; 0 while the contactors are open.
+    /// Pack current, A, positive = discharge, if its last good reading is fresh; 0 while the contactors are open.
     #[inline]
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
@@ -290,7 +293,7 @@ impl Sampler {
         self.state.signals[0].fresh(now, &self.config.current)
     }
 
-    /// Current of one cell, A: the pack's shared equally by the strings.
+    /// Current of one cell, A: the pack current divided by the number of strings.
     pub fn cell_current_a(&self, now: Timestamp) -> Option<f64> {
         self.pack_current_a(now).map(|current| current / self.strings())
     }
@@ -301,40 +304,40 @@ impl Sampler {
         (totals.charge_as / self.strings(), totals.unmeasured_s)
     }
 
-    /// Temperature of a cell, degrees C, when its sensor's last good reading is fresh.
+    /// Temperature of a cell, degrees C, if its sensor's last good reading is fresh.
     pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Time since the channel's latest reading, good or bad, s (the value of the rule `input_missing`).
+    /// Time since the channel's latest reading, good or bad, s: the value of the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        // `None` < `Some`: a stamp before the start or the last waking counts from there.
+        // `None` < `Some`. Time before the start or the last waking does not count.
         let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
 
-    /// Share of bad readings on a channel, fraction, forgotten over about
+    /// Share of bad readings on a channel, fraction, averaged over about
     /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = no reading yet.
     pub fn bad_share(&self, channel: Channel) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
     }
 
-    /// The channels in use: current, sensors, voltages, values that the pack reports.
+    /// The channels in use: current, temperatures, voltages, values reported by the pack, contactors.
     pub fn channels(&self) -> &[Channel] {
         &self.channels
     }
 
-    /// The latest good reading of every channel that has had one, however old it is: channel, time, value.
+    /// The latest good reading of every channel that has one, regardless of its age: channel, time, value.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         let each = self.channels.iter().zip(&self.state.signals);
         each.filter_map(|(&channel, signal)| signal.good.map(|good| (channel, good.time, good.value())))
     }
 
-    /// For how long no reading of any input has come, s; `None` = not even `quiet_s`, or none has come at all.
+    /// Time without a reading on any channel, s; `None` = at most `quiet_s`, or no reading yet.
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;
         let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
-        // The current comes most often: mostly it answers for all.
+        // The current arrives most often: usually it alone decides.
         if received(&self.state.signals[0]).is_some_and(is_recent) {
             return None;
         }
@@ -342,7 +345,7 @@ impl Sampler {
         (!is_recent(latest)).then(|| now.since(latest))
     }
 
-    /// The latest good reading of the pack current however old it is, A; 0 while the contactors are open.
+    /// The latest good reading of the pack current, A, regardless of its age; 0 while the contactors are open.
     pub fn latest_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
             return Some(0.0);
@@ -350,7 +353,7 @@ impl Sampler {
         self.state.signals[0].good.map(|good| good.value())
     }
 
-    /// The highest fresh temperature, degrees C, and whether all sensors are fresh; `None` = no sensor is.
+    /// The highest fresh temperature, degrees C, and whether all sensors are fresh; `None` = no fresh sensor.
     pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
         let sensors = &self.state.signals[1..=self.sensors];
         let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
@@ -358,13 +361,13 @@ impl Sampler {
         Some((hottest, fresh.clone().all(|value| value.is_some())))
     }
 
-    /// The last good value of a channel, unless it is stale.
+    /// The last good value of a channel, if it is fresh.
     pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, limits(&self.config, channel)))
     }
 
-    /// Whether a channel is lost: its latest reading is bad or stale, and its last good one is stale. A single bad reading
-    /// does not lose a channel, and a channel before its first reading is not lost until it is stale.
+    /// Whether a channel is lost: its latest reading is bad or stale, and its last good reading is stale. A single bad
+    /// reading does not lose a channel. Before its first reading, a channel is lost only once it is stale.
     pub fn is_lost(&self, channel: Channel, now: Timestamp) -> bool {
         let is_bad = self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad());
         is_bad && self.reported(channel, now).is_none()
@@ -375,12 +378,12 @@ impl Sampler {
         self.has_input_since_waking(channel) && self.reported(channel, now).is_some()
     }
 
-    /// Whether the channel's latest reading, good or bad, is older than its largest age.
+    /// Whether the channel's latest reading, good or bad, is older than the channel's maximum age.
     pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
         self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
     }
 
-    /// The longest silence of a channel, s, and the largest share of bad readings; `None` when a channel is silent or has
+    /// The longest silence of a channel, s, and the largest share of bad readings; `None` = a channel is silent or has
     /// no reading yet.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;
@@ -411,7 +414,7 @@ impl Sampler {
         Some((longest_s, share))
     }
 
-    /// Whether the channel has a reading, good or bad, since the start or the last waking.
+    /// Whether the channel has had a reading, good or bad, since the start or the last waking.
     pub fn has_input_since_waking(&self, channel: Channel) -> bool {
         self.slot(channel).is_some_and(|slot| self.state.signals[slot].received >= self.state.began)
     }
@@ -434,7 +437,8 @@ impl Sampler {
         self.bad_signals > 0
     }
 
-    /// Whether a stored state has this sampler's number of signals; that of the contactors, the last, may be new.
+    /// Whether a stored state has this sampler's number of signals. Only the contactor signal, the last one, may be
+    /// missing.
     pub fn fits(&self, state: &SamplerState) -> bool {
         let (own, stored) = (self.state.signals.len(), state.signals.len());
         stored == own || (self.config.contactor.is_some() && stored + 1 == own)
@@ -451,10 +455,10 @@ impl Sampler {
         SamplerState { strings, series, ..self.state.clone() }
     }
 
-    /// Restores a stored state (rebased by the caller). The downtime is unmeasured like any other hole.
-    /// The caller checks that it [`fits`](Self::fits).
+    /// Restores a stored state, whose times the caller has rebased and which [`fits`](Self::fits). The downtime is
+    /// unmeasured like any other hole.
     pub fn restore(&mut self, state: SamplerState) {
-        assert!(self.fits(&state), "a state of other signals");
+        assert!(self.fits(&state), "the stored state must have the same signals");
         let signals = self.state.signals.len();
         self.state = state;
         self.state.signals.resize_with(signals, Signal::default);
@@ -465,7 +469,7 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// The present moment, for voltages of now that arrive later.
+    /// The current moment, for voltages that are measured now and arrive later.
     pub fn moment(&mut self, now: Timestamp) -> Moment {
         let time = self.advance(now);
         self.refresh_shared_inputs(time);
@@ -516,7 +520,8 @@ impl Sampler {
         self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
     }
 
-    /// Advances the clock to `time`; returns the latest time so far, should `time` have gone back.
+    /// Advances the clock to `time` and returns the latest time so far, which is later than `time` if the clock went
+    /// back.
     #[inline]
     fn advance(&mut self, time: Timestamp) -> Timestamp {
         if self.state.began.is_none() {
@@ -532,7 +537,7 @@ impl Sampler {
         f64::from(self.config.strings.max(1))
     }
 
-    /// Divisor from a reading to a cell's value: a total voltage is shared by the cells in series.
+    /// Divisor from a reading to a cell's value: a total voltage is divided by the number of cells in series.
     #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
         match self.config.voltage_source {

@@ -2,15 +2,16 @@
 //!
 //! In: readings in the channel's unit, with their time. Out: the value or its fault, and changes between good and bad.
 //!
-//! * **Range**: outside the limits is bad.
-//! * **Rate**: further from the last good value than the fastest plausible change allows is bad, unless
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other: then the step was real (or the last good value was
-//!   wrong), and rejecting it would lock out a healthy sensor.
-//! * **Stuck**: exactly the same value for too long while it should move is bad until it moves. The caller passes
-//!   a clock that runs only while the value should move.
+//! * **Range**: a value outside the limits is bad.
+//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change, unless
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other. Then the step was real or the last good value was
+//!   wrong, and rejecting the value would lock out a healthy sensor.
+//! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
+//!   caller passes a clock that runs only while the value should change.
 //! * **Stale**: no good value for too long.
 //!
-//! A fault found by the decoder is passed on. A bad reading never becomes the value.
+//!
+//! A fault found by the decoder is passed on. A bad reading never becomes the signal's value.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,14 +19,14 @@ use super::config::Limits;
 use crate::quantity::bounds;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
-/// Consecutive readings that must agree on a new level: two could be one disturbance.
+/// Number of consecutive readings that must agree on a new level. Two could be one disturbance.
 pub const ACCEPT_AFTER: u32 = 3;
 
-/// Shortest interval for the rate check, s: stamps of neighbouring frames jitter by about this much, and the rate over
-/// no time would be infinite.
+/// Shortest interval for the rate check, s. Time stamps of consecutive frames jitter by about this much, and the rate
+/// over a zero interval would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
-/// Readings after which an old one has lost most of its weight in the share of bad readings.
+/// Number of readings after which an old one has lost most of its weight in the share of bad readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
 /// A value and its time.
@@ -45,32 +46,32 @@ impl TimedValue {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {
     pub(super) good: Option<TimedValue>,
-    /// Latest reading rejected for its rate.
+    /// Latest reading rejected because of its rate.
     refused: Option<TimedValue>,
-    /// Consecutive readings that agree with it.
+    /// Number of consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// Unchanged value.
+    /// The value that has not changed.
     rests_at: Option<f64>,
-    /// Stuck clock when the value became unchanged, s.
+    /// Stuck clock at the last change of the value, s.
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]
     pub(super) received: Option<Timestamp>,
-    /// Present fault of the signal.
+    /// Current fault of the signal.
     fault: Option<Fault>,
-    /// Bad readings since it turned bad.
+    /// Bad readings since the signal turned bad.
     bad_readings: u64,
-    /// Readings so far, up to [`BAD_SHARE_READINGS`].
+    /// Number of readings so far, up to [`BAD_SHARE_READINGS`].
     readings: u32,
     bad_share: f64,
 }
 
-/// Outcome of a reading: the checked value, and the signal's new state if it changed (`Ok` = good again, with the number
-/// of bad readings before).
+/// Outcome of a reading: the checked value, and the signal's new state if it changed (`Ok` = good again, with the
+/// number of bad readings before).
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
-    /// A step to another level, rejected before, is accepted now.
+    /// Whether a step to a new level, rejected so far, is accepted now.
     pub(super) is_new_level: bool,
 }
 
@@ -101,7 +102,7 @@ impl Signal {
         Fault::Stale
     }
 
-    /// Time from which the signal is stale without a good reading; its age counts from `began` at the earliest.
+    /// Time from which the signal is stale if no good reading arrives; its age starts at `began` at the earliest.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
@@ -111,7 +112,7 @@ impl Signal {
         self.fault.is_some()
     }
 
-    /// The last good value, unless it is stale.
+    /// The last good value, if it is fresh.
     #[inline]
     pub(super) fn fresh(&self, now: Timestamp, limits: &Limits) -> Option<f64> {
         self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
@@ -123,12 +124,12 @@ impl Signal {
         Some((self.received.filter(|&received| received >= began)?, self.bad_share))
     }
 
-    /// Share of bad readings, recent ones weighted most; `None` before the first reading.
+    /// Share of bad readings, weighted towards recent ones; `None` = no reading yet.
     pub(super) fn bad_share(&self) -> Option<f64> {
         (self.readings > 0).then_some(self.bad_share)
     }
 
-    /// Handles a gap of unknown length: forgets all values and times, keeps the fault and the share of bad readings.
+    /// Handles a gap of unknown length: forgets values and times, keeps the fault and the share of bad readings.
     pub(super) fn handle_gap(&mut self) {
         *self = Self {
             fault: self.fault,
@@ -139,7 +140,7 @@ impl Signal {
         };
     }
 
-    /// Checks a stored signal; the error is its first impossible number.
+    /// Checks a stored signal; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
         InvalidState::unless_numbers("a signal", values.chain(self.rests_at))?;

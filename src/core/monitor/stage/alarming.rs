@@ -69,7 +69,7 @@ impl Alarming {
 
     /// Whether the value of a rule comes from a cell whose channel is faulty.
     pub(crate) fn depends_on_faulty_channel(&self, rule: Rule, cell: Option<CellIndex>) -> bool {
-        rule.is_of_cell_voltage() && cell.is_some_and(|cell| self.faulty_channels.contains(&cell))
+        rule.depends_on_cell_voltage() && cell.is_some_and(|cell| self.faulty_channels.contains(&cell))
     }
 
     /// What continues.

@@ -1,4 +1,4 @@
-//! Scenarios over the whole sample stage; the charge counter has its own tests.
+//! Scenarios for the whole sample stage; the charge counter has its own tests.
 
 use proptest::prelude::*;
 
@@ -34,7 +34,7 @@ fn config() -> SampleConfig {
 const CELL: Channel = Channel::CellVoltage(CellIndex(0));
 const SENSOR: Channel = Channel::Temperature(SensorIndex(0));
 
-/// A sampler and the changes that it reported.
+/// A sampler and the changes it reported.
 struct Bench {
     sampler: Sampler,
     changes: Vec<SignalChange>,
@@ -59,23 +59,23 @@ impl Bench {
 }
 
 #[test]
-fn a_sample_carries_what_is_fresh_at_the_time_of_its_voltage() {
+fn sample_carries_values_fresh_at_voltage_time() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, SENSOR, 25.0);
     bench.ok(0.0, Channel::Current, 2.0);
     bench.ok(1.0, Channel::Current, 4.0);
-    let sample = bench.ok(1.5, CELL, 3.7).expect("a good voltage makes a sample");
-    assert_eq!(sample.charge_as, 5.0, "3 As by trapezoid and half a second of 4 A");
+    let sample = bench.ok(1.5, CELL, 3.7).expect("a good voltage gives a sample");
+    assert_eq!(sample.charge_as, 5.0, "3 As by the trapezoid plus half a second of 4 A");
     assert_eq!(
         (sample.cell, sample.time, sample.voltage_v, sample.current_a, sample.temperature_c, sample.unmeasured_s),
         (CellIndex(0), at(1.5), 3.7, Some(4.0), Some(25.0), 0.0)
     );
     let other = bench.ok(1.5, Channel::CellVoltage(CellIndex(1)), 3.6).expect("a sample");
-    assert_eq!((other.cell, other.temperature_c), (CellIndex(1), None), "no sensor serves cell 1");
+    assert_eq!((other.cell, other.temperature_c), (CellIndex(1), None), "cell 1 has no sensor");
 }
 
 #[test]
-fn open_contactors_mean_no_current_and_no_charge_measured_or_not() {
+fn open_contactors_force_zero_current_and_charge() {
     let limits = limits(f64::NEG_INFINITY, f64::INFINITY, 10.0);
     let contactor = Some(ContactorConfig { open: vec![0.0, 3.0], limits });
     let mut bench = Bench::new(SampleConfig { contactor, ..config() });
@@ -84,10 +84,14 @@ fn open_contactors_mean_no_current_and_no_charge_measured_or_not() {
     bench.ok(2.0, Channel::Current, 5.0);
     let open = bench.ok(9.0, CELL, 3.7).expect("a sample");
     assert_eq!((open.current_a, open.charge_as, open.offset_s, open.unmeasured_s), (Some(0.0), 2.0, 1.0, 0.0));
-    // Bad readings do not close them, nor does time up to their largest age.
+    // Neither bad readings nor time up to the maximum age close them.
     bench.give(9.5, Channel::Contactor, Err(Fault::NotAvailable));
     let late = bench.ok(12.0, CELL, 3.7).expect("a sample");
-    assert_eq!((late.current_a, late.unmeasured_s), (None, 1.0), "not known, and the current's reading is too old");
+    assert_eq!(
+        (late.current_a, late.unmeasured_s),
+        (None, 1.0),
+        "contactors unknown, and the current reading is too old"
+    );
     bench.ok(13.0, Channel::Contactor, 0.0);
     bench.ok(14.0, Channel::Current, 4.0);
     bench.ok(15.0, Channel::Contactor, 1.0);
@@ -96,7 +100,7 @@ fn open_contactors_mean_no_current_and_no_charge_measured_or_not() {
 }
 
 #[test]
-fn stale_values_are_left_out_and_the_hole_is_unmeasured() {
+fn stale_values_are_omitted_and_hole_is_unmeasured() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, SENSOR, 25.0);
     bench.ok(0.0, Channel::Current, 1.0);
@@ -109,7 +113,7 @@ fn stale_values_are_left_out_and_the_hole_is_unmeasured() {
 }
 
 #[test]
-fn measured_glitches_make_no_sample_and_are_reported_once() {
+fn recorded_glitches_give_no_sample_and_one_report() {
     // As in the NASA files: samples of 8.4 V, and empty fields.
     let mut bench = Bench::new(config());
     assert!(bench.ok(0.0, CELL, 3.9).is_some());
@@ -123,7 +127,7 @@ fn measured_glitches_make_no_sample_and_are_reported_once() {
 }
 
 #[test]
-fn a_bad_current_is_neither_used_nor_integrated() {
+fn bad_current_is_neither_used_nor_integrated() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     for (time, bad) in [(0.5, Ok(500.0)), (1.0, Ok(f64::NAN)), (1.2, Err(Fault::ShortFrame))] {
@@ -135,22 +139,22 @@ fn a_bad_current_is_neither_used_nor_integrated() {
 }
 
 #[test]
-fn a_jump_is_rejected_and_a_step_that_stays_is_accepted() {
+fn jump_is_rejected_and_lasting_step_accepted() {
     let mut config = config();
     config.voltage.max_rate_per_s = Some(0.1);
     let mut bench = Bench::new(config);
     assert!(bench.ok(0.0, CELL, 3.9).is_some());
     assert!(bench.ok(1.0, CELL, 3.3).is_none(), "one jump");
-    assert!(bench.ok(2.0, CELL, 3.9).is_some(), "and back");
+    assert!(bench.ok(2.0, CELL, 3.9).is_some(), "back at the old level");
     assert!(bench.ok(3.0, CELL, 3.3).is_none());
     assert!(bench.ok(4.0, CELL, 3.31).is_none());
-    assert!(bench.ok(5.0, CELL, 3.32).is_some(), "the third that agrees");
+    assert!(bench.ok(5.0, CELL, 3.32).is_some(), "the third reading that agrees");
     assert!(bench.ok(6.0, CELL, 3.33).is_some());
     assert_eq!(bench.states(), [Err(Fault::RateTooHigh), Ok(1), Err(Fault::RateTooHigh), Ok(2)]);
 }
 
 #[test]
-fn jumps_that_do_not_agree_are_never_accepted() {
+fn disagreeing_jumps_are_never_accepted() {
     let mut config = config();
     config.voltage.max_rate_per_s = Some(0.01);
     let mut bench = Bench::new(config);
@@ -162,7 +166,7 @@ fn jumps_that_do_not_agree_are_never_accepted() {
 }
 
 #[test]
-fn two_readings_with_one_stamp_have_a_finite_rate() {
+fn readings_with_equal_time_have_finite_rate() {
     let mut config = config();
     config.voltage.max_rate_per_s = Some(10.0);
     let mut bench = Bench::new(config);
@@ -170,7 +174,7 @@ fn two_readings_with_one_stamp_have_a_finite_rate() {
     assert!(bench.ok(0.0, CELL, 3.905).is_some());
 }
 
-/// Current and a voltage once a second; returns the first second with a rejected voltage.
+/// Simulates current and a voltage once a second; returns the first second with a rejected voltage.
 fn first_stuck_second(current_a: f64, voltage: impl Fn(u32) -> f64) -> Option<u32> {
     let mut config = config();
     config.voltage.stuck_after_s = Some(60.0);
@@ -182,15 +186,15 @@ fn first_stuck_second(current_a: f64, voltage: impl Fn(u32) -> f64) -> Option<u3
 }
 
 #[test]
-fn a_voltage_that_rests_under_load_is_stuck_and_one_at_rest_or_held_by_a_charger_is_not() {
+fn voltage_is_stuck_only_if_constant_under_discharge() {
     assert_eq!(first_stuck_second(2.0, |_| 3.7), Some(60));
     assert_eq!(first_stuck_second(0.01, |_| 3.7), None, "rest");
     assert_eq!(first_stuck_second(-2.0, |_| 4.2), None, "constant-voltage charge");
-    assert_eq!(first_stuck_second(2.0, |second| 3.7 - 0.001 * f64::from(second / 50)), None, "moves every 50 s");
+    assert_eq!(first_stuck_second(2.0, |second| 3.7 - 0.001 * f64::from(second / 50)), None, "changes every 50 s");
 }
 
 #[test]
-fn a_stuck_signal_is_good_again_when_it_moves() {
+fn stuck_signal_recovers_when_it_changes() {
     let mut config = config();
     config.voltage.stuck_after_s = Some(5.0);
     let mut bench = Bench::new(config);
@@ -203,7 +207,7 @@ fn a_stuck_signal_is_good_again_when_it_moves() {
 }
 
 #[test]
-fn silence_turns_each_signal_stale_once_at_its_own_age() {
+fn silent_signals_turn_stale_at_their_own_age() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(0.0, CELL, 3.7);
@@ -223,7 +227,7 @@ fn silence_turns_each_signal_stale_once_at_its_own_age() {
     assert_eq!(bench.states(), [Ok(0)]);
     bench.changes.clear();
     bench.sampler.poll(at(46.5), &mut bench.changes);
-    assert_eq!(bench.states(), [stale], "and stale again");
+    assert_eq!(bench.states(), [stale], "stale again");
 }
 
 #[test]
@@ -242,7 +246,7 @@ fn silence_counts_all_readings() {
 }
 
 #[test]
-fn an_unknown_gap_is_not_integrated_and_leaves_nothing_fresh() {
+fn gap_is_not_integrated_and_ends_freshness() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, SENSOR, 25.0);
     bench.ok(0.0, Channel::Current, 3.0);
@@ -254,7 +258,7 @@ fn an_unknown_gap_is_not_integrated_and_leaves_nothing_fresh() {
 }
 
 #[test]
-fn strings_share_the_current_and_a_total_voltage_is_shared_by_the_cells() {
+fn strings_share_current_and_cells_share_total_voltage() {
     let mut config = config();
     config.cells = 1;
     config.strings = 2;
@@ -270,7 +274,7 @@ fn strings_share_the_current_and_a_total_voltage_is_shared_by_the_cells() {
 }
 
 #[test]
-fn readings_without_a_use_are_counted() {
+fn unused_readings_are_counted() {
     let mut bench = Bench::new(config());
     for channel in [Channel::PackVoltage, Channel::CellVoltage(CellIndex(2)), Channel::Temperature(SensorIndex(1))] {
         assert!(bench.ok(0.0, channel, 3.7).is_none());
@@ -280,7 +284,7 @@ fn readings_without_a_use_are_counted() {
 }
 
 #[test]
-fn time_that_goes_back_counts_as_the_latest() {
+fn backward_time_counts_as_latest_time() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(2.0, Channel::Current, 1.0);
@@ -289,7 +293,7 @@ fn time_that_goes_back_counts_as_the_latest() {
 }
 
 #[test]
-fn a_restored_sampler_counts_the_downtime_as_unmeasured() {
+fn restored_sampler_counts_downtime_as_unmeasured() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(1.0, CELL, 3.7);
@@ -307,7 +311,7 @@ fn a_restored_sampler_counts_the_downtime_as_unmeasured() {
 }
 
 #[test]
-fn a_state_without_contactors_fits_a_configuration_that_has_them_and_open_ones_are_forgotten_with_them() {
+fn contactor_signal_may_be_added_or_removed_on_restore() {
     let limits = config().voltage;
     let with = || SampleConfig { contactor: Some(ContactorConfig { open: vec![0.0], limits }), ..config() };
     let mut bench = Bench::new(config());
@@ -327,7 +331,7 @@ fn a_state_without_contactors_fits_a_configuration_that_has_them_and_open_ones_a
 }
 
 #[test]
-fn every_channel_leads_to_its_own_slot() {
+fn every_channel_has_its_own_slot() {
     let mut config = config();
     config.cells = 1024;
     config.sensor_of_cell = (0..1024).map(|cell| Some(SensorIndex(cell / 12))).collect();
@@ -337,7 +341,7 @@ fn every_channel_leads_to_its_own_slot() {
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }
 
-/// Random readings of a cell, most of them ordinary.
+/// Random readings of a cell, most of them plausible.
 fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
     let volts = prop_oneof![
         8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),
@@ -354,7 +358,7 @@ fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
 
 proptest! {
     #[test]
-    fn the_count_of_bad_signals_agrees_with_the_signals(
+    fn bad_signal_count_agrees_with_signals(
         readings in prop::collection::vec((reading(), 0_i32..80), 1..100),
     ) {
         let mut bench = Bench::new(config());
