@@ -1,37 +1,37 @@
-//! Passive balancing: a BMS that bleeds the cells whose voltage is above the lowest one's.
+//! Passive balancing: a BMS that bleeds cells whose voltage is above that of the lowest cell.
 //!
-//! It bleeds near the end of a charge and in the first rest after one, also while the buses sleep. A drive in between stops
-//! it for as long as it lasts. It compares voltages as its own channels see them, with their constant offsets and without
-//! their noise: a BMS averages.
+//! The BMS bleeds near the end of a charge and during the first rest after it, also while the buses sleep. A drive
+//! between the charge and that rest pauses the balancing. The BMS compares voltages as its own channels measure them,
+//! with their constant offsets but without noise, because a BMS averages.
 
 use super::truth::Pack;
 
-/// How a BMS balances.
+/// Settings of a BMS's balancing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Balancing {
     /// Current of a balancing resistor, A.
     pub bleed_a: f64,
-    /// A cell is bled from this far above the lowest, V.
+    /// Bleeding starts at this voltage above the lowest cell, V.
     pub start_v: f64,
-    /// A cell is bled until it is this far above the lowest, V.
+    /// Bleeding stops at this voltage above the lowest cell, V.
     pub stop_v: f64,
-    /// A charge is near its end when the fullest cell has this SOC.
+    /// A charge is near its end if the fullest cell has at least this SOC.
     pub from_soc: f64,
 }
 
 impl Balancing {
-    /// A usual BMS of a pack of `capacity_ah`: a thousandth of an hour's current (60 mA at 60 Ah), 10 mV, hysteresis 5 mV.
+    /// A typical BMS for a pack of `capacity_ah`: 1 mA per Ah (60 mA at 60 Ah), 10 mV, hysteresis 5 mV.
     pub fn usual(capacity_ah: f64) -> Self {
         Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
     }
 }
 
-/// The BMS while it runs.
+/// State of the balancing.
 #[derive(Debug, Clone)]
 pub(crate) struct Balancer {
     settings: Balancing,
     charging_s: f64,
-    /// A charge came near its end and no rest has followed yet, or it lasts.
+    /// A charge is or was near its end, and the first rest after it has not ended yet.
     is_armed: bool,
     has_rested: bool,
 }
@@ -41,12 +41,13 @@ impl Balancer {
         Self { settings, charging_s: 0.0, is_armed: false, has_rested: false }
     }
 
-    /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` gives a channel's offset.
+    /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` returns a channel's
+    /// offset.
     pub(crate) fn update(&mut self, pack: &mut Pack, current_a: f64, dt_s: f64, offset_v: impl Fn(usize) -> f64) {
-        // Largest current at rest, capacities per hour.
+        // Largest current that counts as rest: 0.002 C.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        // Shortest charge, s: regeneration is none.
+        // Shortest charge, s: regenerative braking does not count.
         let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);

@@ -1,6 +1,6 @@
-//! The course of the current: the scenario's next demand, from the pack's true state.
+//! The course of the current: a scenario's next demand, given the pack's true state.
 //!
-//! Each course is called once per current sample and returns the current that flows until the next one.
+//! Each course is called once per current sample and returns the current until the next sample.
 
 mod cycle;
 mod demand;
@@ -35,7 +35,7 @@ impl Course {
         }
     }
 
-    /// The demand for the next `dt_s` seconds. Completes a cycle of the pack where it ends.
+    /// The demand for the next `dt_s` seconds. At the end of a cycle, completes the pack's cycle.
     pub(crate) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
         match self {
             Self::Cycle(course) => course.next(pack, dt_s),

@@ -1,20 +1,20 @@
 //! Faults that a simulation injects: cells, contacts, a replaced module, sensors.
 //!
-//! A fault begins at a time of the simulation and stays. Faults of cells change the truth ([`Pack`](super::Pack)); faults of
-//! sensors change only what is read. The text form is `KIND:...@WHEN` ([`Fault`]'s `FromStr`); cells and temperature sensors
-//! count from 1 there and from 0 inside.
+//! A fault starts at a given time of the simulation and stays. Faults of cells change the true state
+//! ([`Pack`](super::Pack)); faults of sensors change only the readings. The text form is `KIND:...@WHEN` ([`Fault`]'s
+//! `FromStr`). In the text, cells and temperature sensors count from 1; internally, from 0.
 
 mod parse;
 pub(crate) mod sensed;
 
 use crate::quantity::{CellIndex, SensorIndex};
 
-/// One fault and when it begins.
+/// One fault and its start.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fault {
     /// Kind, place and size.
     pub kind: FaultKind,
-    /// Begins this long after the start of the simulation, s.
+    /// Start, in s after the start of the simulation.
     pub from_s: f64,
 }
 
@@ -23,7 +23,7 @@ pub struct Fault {
 pub enum Leak {
     /// A constant current, A.
     Current(f64),
-    /// A soft short of this resistance, ohm: the current is the unloaded cell voltage over it.
+    /// A soft short circuit with this resistance, ohm: the current is the unloaded cell voltage divided by it.
     Resistance(f64),
 }
 
@@ -39,36 +39,37 @@ pub enum ContactResistance {
 /// Kind, place and size of a fault. Changes are relative: 0.1 = 10 % more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
-    /// The cell loses charge all the time, also at rest.
+    /// The cell loses charge continuously, also at rest.
     Leak {
         /// The cell.
         cell: CellIndex,
         /// Its leak.
         leak: Leak,
     },
-    /// A resistance in series with the cell, between its two voltage taps. It has no temperature law, and its heat
-    /// warms no cell.
+    /// A resistance in series with the cell, between its two voltage taps. It does not depend on temperature, and its
+    /// heat warms no cell.
     Contact {
         /// The cell.
         cell: CellIndex,
         /// Its size.
         resistance: ContactResistance,
     },
-    /// The cell's capacity changes; its SOC stays.
+    /// The cell's capacity changes, its SOC does not.
     Weak {
         /// The cell.
         cell: CellIndex,
         /// Change of the capacity.
         change: f64,
     },
-    /// All resistances of the cell change; they keep following the model's temperature law.
+    /// All resistances of the cell change; they still follow the model's temperature dependence.
     Resistance {
         /// The cell.
         cell: CellIndex,
         /// Change of the resistance.
         change: f64,
     },
-    /// Several cells are replaced: capacity changed, resistance as new, SOC the mean of the cells they replace.
+    /// Several cells are replaced: their capacity changes, their resistance is as new, and each gets the mean SOC of
+    /// the replaced cells.
     Module {
         /// First cell.
         first: CellIndex,
@@ -81,7 +82,7 @@ pub enum FaultKind {
     CurrentOffset(f64),
     /// The current sensor's gain changes by this, relative.
     CurrentGain(f64),
-    /// The current's value is frozen.
+    /// The current reading is frozen.
     CurrentStuck,
     /// The offset of a voltage channel changes.
     VoltageOffset {
@@ -90,33 +91,33 @@ pub enum FaultKind {
         /// Change, V.
         offset_v: f64,
     },
-    /// The value of a voltage channel is frozen.
+    /// The reading of a voltage channel is frozen.
     VoltageStuck {
         /// The channel.
         cell: CellIndex,
     },
-    /// Two voltage channels are exchanged.
+    /// Two voltage channels are swapped.
     Swap(CellIndex, CellIndex),
-    /// The second voltage channel shows the first one's value.
+    /// Two voltage channels show the same cell.
     Double {
-        /// The channel that is shown twice.
+        /// The channel whose cell is shown twice.
         shown: CellIndex,
-        /// The channel that is not shown.
+        /// The channel whose own cell is not shown.
         hidden: CellIndex,
     },
-    /// The value of a temperature sensor is frozen.
+    /// The reading of a temperature sensor is frozen.
     TemperatureStuck(SensorIndex),
-    /// A temperature sensor fell off: it shows the surroundings.
+    /// A temperature sensor has fallen off and measures the ambient temperature.
     TemperatureOff(SensorIndex),
 }
 
-/// A fault that cannot be read or that the pack cannot have.
+/// A fault that cannot be parsed or does not fit the pack.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{what} = {found}, must be {allowed}")]
 pub struct FaultError {
     /// The part of the fault.
     pub what: &'static str,
-    /// Its text.
+    /// The found text.
     pub found: String,
     /// What is allowed.
     pub allowed: String,
@@ -149,10 +150,10 @@ impl FaultKind {
         }
     }
 
-    /// Checks that the pack has the cells and sensors the fault names.
+    /// Checks that the pack has the cells and sensors that the fault names.
     ///
     /// # Errors
-    /// The first one that it does not have.
+    /// The first cell or sensor that the pack does not have.
     pub fn check(&self, cells: u16, temperature_sensors: u16) -> Result<(), FaultError> {
         if let Some(cell) = self.cells().into_iter().flatten().find(|cell| cell.0 >= cells) {
             return Err(FaultError::new("cell", u32::from(cell.0) + 1, format!("1 to {cells}")));
@@ -160,7 +161,7 @@ impl FaultKind {
         match *self {
             Self::TemperatureStuck(sensor) | Self::TemperatureOff(sensor) if sensor.0 >= temperature_sensors => {
                 let allowed = match temperature_sensors {
-                    0 => "absent: the configuration has none".to_owned(),
+                    0 => "absent: the configuration has no temperature sensors".to_owned(),
                     n => format!("1 to {n}"),
                 };
                 Err(FaultError::new("temperature sensor", u32::from(sensor.0) + 1, allowed))

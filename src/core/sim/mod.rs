@@ -1,15 +1,16 @@
 //! The simulator: a pack with a known true state, its sensors, and the scenarios that load it.
 //!
-//! In: a cell model, settings and a seed. Out: readings (as a BMS would measure them) at their sampling times, and the true
-//! state. All randomness is seeded and all functions are `libm`'s: one seed gives the same bytes on every machine.
+//! In: a cell model, settings and a seed. Out: readings at their sampling times, as a BMS would measure them, and the
+//! true state. All randomness is seeded and all functions come from `libm`: the same seed gives the same bytes on every
+//! machine.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | [`truth`] | the true cells: circuit, hysteresis, heat, ageing, spread |
 //! | [`sensor`] | sensor errors: gain, offset, noise, resolution, dropout; qualities |
-//! | `noise` | the seeded generator |
+//! | `noise` | the seeded random numbers |
 //! | [`scenario`] | the named scenarios and their settings |
-//! | `course` | the current a scenario demands next |
+//! | `course` | the current that a scenario demands next |
 //! | [`fault`] | injected faults of cells, contacts, modules and sensors |
 //! | [`balancing`] | passive balancing by the BMS |
 //! | [`run`] | the loop: truth, course and sensors stepped together |

@@ -1,14 +1,14 @@
 //! Seeded random numbers that are bit-identical on every machine.
 //!
-//! Generator: ChaCha with 8 rounds, key from the seed, one stream per use, so that more cells or another scenario do not
-//! change the numbers of other streams. Uniform: the upper 53 bits of a 64-bit word over 2^53, in [0, 1). Normal:
-//! Box-Muller (both values of a pair are used) with `libm`'s ln, sin and cos.
+//! Generator: ChaCha with 8 rounds, keyed by the seed, with one stream per use, so that more cells or another scenario
+//! do not change the numbers of other streams. Uniform: the upper 53 bits of a 64-bit word divided by 2^53, in [0, 1).
+//! Normal: Box-Muller (both values of a pair are used) with `ln`, `sin` and `cos` of `libm`.
 
 use rand::Rng;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Use of a stream of random numbers. Its number is part of the reproducible result and never reused.
+/// Use of a stream of random numbers. Its number affects results, so it is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     /// Spread of the cells.
@@ -46,14 +46,14 @@ pub(crate) struct Noise {
 }
 
 impl Noise {
-    /// The numbers of one stream of `seed`.
+    /// Creates the stream of `seed` for one use.
     pub(crate) fn new(seed: u64, stream: Stream) -> Self {
         Self::of_number(seed, stream.number())
     }
 
-    /// The numbers of the constant errors of a sensor whose noise is `stream`.
+    /// Creates the stream for the constant errors of a sensor whose noise uses `stream`.
     pub(crate) fn of_channel(seed: u64, stream: Stream) -> Self {
-        // Number of the first stream of constant errors of sensors; the streams of noise are all below.
+        // First stream number for constant errors; the numbers of the noise streams are all lower.
         Self::of_number(seed, 0x10_0000 + stream.number())
     }
 
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_seed_and_stream_always_gives_the_same_numbers() {
+    fn same_seed_and_stream_repeat_numbers() {
         let mut noise = Noise::new(1, Stream::Current);
         let first = [noise.normal(), noise.normal(), noise.uniform()];
         let mut again = Noise::new(1, Stream::Current);
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn normal_has_mean_0_deviation_1_and_the_tails_of_a_gaussian() {
+    fn normal_numbers_have_gaussian_mean_deviation_and_tails() {
         let mut noise = Noise::new(7, Stream::CellVoltage(3));
         let n = 200_000;
         let values: Vec<f64> = (0..n).map(|_| noise.normal()).collect();

@@ -1,9 +1,9 @@
-//! The simulation's loop: truth, course and sensors stepped together, readings out.
+//! The simulation's loop: steps true state, course and sensors together, and returns readings.
 //!
-//! At each moment the current that will flow until the next moment is known; the readings and the truth of that moment
-//! belong together (the voltage has that current's drop in it). Cells are stepped at their own sampling period with
-//! the mean current over it: charge is exact, and a branch voltage differs from stepping at every current sample by
-//! less than half a period over its time constant, relative.
+//! At each moment, the current until the next moment is known. The readings and the true state of a moment belong
+//! together: the voltage includes that current's drop. Cells are stepped at their own sampling period with the mean
+//! current over it. The charge is exact. The relative difference of a branch voltage from stepping at every current
+//! sample is less than half a period divided by the branch's time constant.
 
 use super::balancing::{Balancer, Balancing};
 use super::course::{Course, Demand};
@@ -19,9 +19,9 @@ use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 /// Wiring and sensors of the pack.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wiring {
-    /// Parallel strings: the pack current is this times the cell current.
+    /// Number of parallel strings: the pack current is the cell current times this.
     pub strings: u16,
-    /// For each temperature sensor, the cell it sits on; `None` = the surroundings.
+    /// The cell of each temperature sensor; `None` = measures the ambient temperature.
     pub temperature_at: Vec<Option<CellIndex>>,
 }
 
@@ -37,13 +37,13 @@ impl Wiring {
 pub struct Moment {
     /// Time since the start.
     pub time: Timestamp,
-    /// True cell current from now on, A, positive = discharge.
+    /// True cell current from this moment on, A, positive = discharge.
     pub current_a: f64,
-    /// Whether the cells were sampled too.
+    /// Whether the cells were sampled, too.
     pub cells_sampled: bool,
 }
 
-/// The sensors of the pack, each with its own noise.
+/// The sensors of the pack, each with its own random errors.
 #[derive(Debug, Clone)]
 struct PackSensors {
     current: Sensor,
@@ -68,7 +68,7 @@ impl PackSensors {
     }
 }
 
-/// A sleep of the buses, in steps.
+/// A sleep of the buses, simulated in steps.
 #[derive(Debug, Clone, Copy)]
 struct Asleep {
     from: Timestamp,
@@ -94,11 +94,11 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge, A s, and time, ns, since the last step of the cells.
+    /// Charge, As, and time, ns, since the last step of the cells.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
-    /// Faults that have not begun, the next one last.
+    /// Faults that have not started, the next one last.
     coming: Vec<Fault>,
     sensor_faults: SensorFaults,
     balancer: Option<Balancer>,
@@ -109,7 +109,8 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// A simulation at its start. The pack's cells have `settings.pack.capacity_ah`; all else follows `model`.
+    /// Creates a simulation at its start. The cells have the capacity `settings.pack.capacity_ah`; everything else
+    /// follows `model`.
     pub fn new(model: CellModel, settings: Settings, wiring: Wiring) -> Self {
         Self {
             pack: Pack::new(model, settings.pack, settings.seed),
@@ -132,7 +133,7 @@ impl Simulation {
         }
     }
 
-    /// Injects faults. Their cells and sensors must be the pack's ([`FaultKind::check`](super::FaultKind::check)).
+    /// Injects faults. The pack must have their cells and sensors ([`FaultKind::check`](super::FaultKind::check)).
     #[must_use]
     pub fn with_faults(mut self, faults: &[Fault]) -> Self {
         self.coming.extend(faults.iter().rev());
@@ -140,15 +141,15 @@ impl Simulation {
         self
     }
 
-    /// Lets the BMS balance the cells.
+    /// Enables balancing by the BMS.
     #[must_use]
     pub fn with_balancing(mut self, balancing: Balancing) -> Self {
         self.balancer = Some(Balancer::new(balancing));
         self
     }
 
-    /// Lets the BMS report which cells it bleeds: 1 = it does. It reports them with the voltages, and every minute while it bleeds cells
-    /// of a vehicle that sleeps, up to the first time when none is bled.
+    /// Makes the BMS report for each cell whether it is bled (1) or not (0). It reports these bits with the voltages,
+    /// and during sleep every minute while it bleeds any cell, ending with one report that no cell is bled.
     #[must_use]
     pub fn with_balancing_bits(mut self) -> Self {
         self.has_bits = true;
@@ -184,12 +185,12 @@ impl Simulation {
         Some(Moment { time: self.time, current_a: self.current_a, cells_sampled })
     }
 
-    /// Readings of the latest moment; `None` = dropped out.
+    /// Readings of the latest moment; `None` as a value = dropped out.
     pub fn readings(&self) -> &[(Channel, Option<f64>)] {
         &self.readings
     }
 
-    /// Constant errors of the sensors, faults apart: of the current, A, and of a cell's voltage, V.
+    /// Constant errors of the sensors, without injected faults: of the current, A, and of each cell's voltage, V.
     pub fn sensor_offsets(&self) -> (f64, Vec<f64>) {
         (self.sensors.current.offset(), self.sensors.voltages.iter().map(Sensor::offset).collect())
     }
@@ -226,12 +227,12 @@ impl Simulation {
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
         self.current_a = 0.0;
-        // Longest step of the truth during sleep, s: the resolution of tables and temperature.
+        // Longest step during sleep, s: limits the error from changing resistances and temperatures.
         let steps = (duration_s / 60.0).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 
-    /// Sleeps on; whether there are bits to report before the sleep is over.
+    /// Continues a sleep; returns whether there are bits to report before it ends.
     fn sleep(&mut self) -> bool {
         while let Some(asleep) = &mut self.asleep {
             let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));
@@ -263,7 +264,7 @@ impl Simulation {
         self.readings.extend(bits.map(|(cell, bit)| (Channel::Balancing(cell), Some(bit))));
     }
 
-    /// `current_a` flows for `dt_s` seconds; then the BMS switches its resistors.
+    /// Steps the cells with `current_a` for `dt_s` seconds; then the BMS switches its resistors.
     fn step_cells(&mut self, current_a: f64, dt_s: f64) {
         self.pack.step(current_a, dt_s);
         if let Some(balancer) = &mut self.balancer {
@@ -303,7 +304,7 @@ impl Simulation {
         }
     }
 
-    /// A contact's resistance is between the taps: its drop is in the cell's channel and in the pack voltage.
+    /// A contact's resistance is between the taps, so its drop appears in the cell's channel and in the pack voltage.
     fn measure_voltages(&mut self) {
         self.sensed_v.clear();
         let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());

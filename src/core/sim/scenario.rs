@@ -1,15 +1,15 @@
 //! The named scenarios and their settings.
 //!
-//! Amounts are stated for the cell of the source (its nominal capacity below) and scale with the capacity of the
-//! cell model at hand, so that any configuration can be driven; with a cell of the nominal capacity they are the
-//! source's own numbers.
+//! Amounts are given for the cell of the source (nominal capacity below) and scale with the capacity of the configured
+//! cell model, so that any configuration can be simulated. For a cell of the nominal capacity, they are the source's
+//! own numbers.
 //!
 //! | scenario | nominal | source | course |
 //! | --- | --- | --- | --- |
 //! | `paper` | 2.6 Ah | the paper's own run | 1.325 A both ways between SOC 0.3 and 0.9, 0.05 Ah lost per cycle, until 0.25 Ah: 48 cycles, 2.23e5 s |
 //! | `reference` | 30 Ah | the published example | discharge by random pulses (15 A mean), charge by 15 A, 0.3 to 0.9, 1 Ah lost per cycle |
 //! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | 5 min loads of -4.5 to 4.5 A within 3.2 to 4.2 V; two reference cycles after every 1,500 of them |
-//! | `ev-day` | 50 Ah | own | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
+//! | `ev-day` | 50 Ah | packwatch | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
 
 use super::sensor::{SensorError, Sensors};
 use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
@@ -27,10 +27,10 @@ pub enum Scenario {
     EvDay,
 }
 
-/// All settings of a simulation: the defaults of [`Settings::of`], then changed by the caller.
+/// All settings of a simulation. [`Settings::of`] gives the defaults.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Scenario: course of the current.
+    /// The scenario, which determines the course of the current.
     pub scenario: Scenario,
     /// Seed of all randomness.
     pub seed: u64,
@@ -42,20 +42,20 @@ pub struct Settings {
     pub current_period_ns: i64,
     /// Time between samples of voltages and temperatures, ns; a multiple of `current_period_ns`.
     pub cell_period_ns: i64,
-    /// Ends after this many cycles (of the scenario's own kind); `None` = not by cycles.
+    /// Ends after this many cycles, as the scenario defines them; `None` = no limit.
     pub cycles: Option<u32>,
-    /// Ends after this time, s; `None` = not by time.
+    /// Ends after this time, s; `None` = no limit.
     pub duration_s: Option<f64>,
-    /// Ends when the weakest cell would fall below this capacity, Ah; 0 = never.
+    /// Ends when the weakest cell would fall below this capacity, Ah; 0 = no limit.
     pub end_capacity_ah: f64,
-    /// Cycling scenarios: SOC at which charging and discharging start.
+    /// SOC at which charging and discharging start, in the cycling scenarios.
     pub soc_window: (f64, f64),
-    /// Random walk: loads between two reference measurements.
+    /// Number of loads between two reference measurements, in the random walk.
     pub walk_steps: u32,
 }
 
 impl Scenario {
-    /// Capacity of the cell for which the scenario's source states its amounts, Ah.
+    /// Capacity of the cell for which the scenario's amounts are given, Ah.
     pub const fn nominal_ah(self) -> f64 {
         match self {
             Self::Paper => 2.6,
@@ -85,7 +85,7 @@ impl Settings {
                 leakage_a: 0.0,
                 ambient_c: 25.0,
             },
-            // Sensor errors of the paper's scenario in the accuracy requirement.
+            // Sensor errors that the accuracy requirement assumes for the paper's scenario.
             sensors: Sensors {
                 current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::NONE },
                 voltage: SensorError { noise_std: 0.005, ..SensorError::NONE },
@@ -101,7 +101,7 @@ impl Settings {
         };
         match scenario {
             Scenario::Paper => {}
-            // One sensor error: the voltage noise that the example's filter assumes (R = 1e-3: 32 mV).
+            // The only sensor error is the voltage noise that the example's filter assumes (R = 1e-3: 32 mV).
             Scenario::Reference => {
                 s.pack.initial_soc = 1.0;
                 s.pack.ageing.capacity_loss_ah_per_cycle = scale;
@@ -109,8 +109,8 @@ impl Settings {
                 s.sensors = Sensors { voltage, ..Sensors::default() };
                 (s.end_capacity_ah, s.cycles) = (0.0, Some(10));
             }
-            // Ageing so that one block of 1,500 loads (about 310 Ah) costs some 5 % capacity and 10 % resistance, as the
-            // measured cells lost.
+            // Ageing at which one block of 1,500 loads (about 310 Ah) costs about 5 % capacity and 10 % resistance, as
+            // in the measured cells.
             Scenario::RandomWalk => {
                 s.pack.ageing = Ageing {
                     capacity_loss_ah_per_ah: 3.4e-4,
@@ -124,7 +124,8 @@ impl Settings {
         s
     }
 
-    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV, cells within 1 %.
+    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV noise, capacities within 1
+    /// %.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;
@@ -135,7 +136,8 @@ impl Settings {
         let (noise_std, offset) = (0.002 * capacity_ah, 0.0005 * capacity_ah);
         self.sensors.current = SensorError { noise_std, offset, gain: 0.005, ..SensorError::default() };
         self.sensors.voltage.noise_std = 0.001;
-        self.sensors.temperature.noise_std = 0.02; // at ten samples a second more would look like a jump of 5 K/s
+        // At ten samples a second, more noise would look like a change of 5 K/s.
+        self.sensors.temperature.noise_std = 0.02;
         (self.current_period_ns, self.cell_period_ns) = (SECOND_NS / 100, SECOND_NS / 10);
         (self.end_capacity_ah, self.duration_s) = (0.0, Some(86_400.0));
     }

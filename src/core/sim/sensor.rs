@@ -1,8 +1,8 @@
 //! Sensors: readings of true values with errors.
 //!
-//! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`, n normal and independent from sample to
-//! sample; or no reading at all with probability `dropout`. Resolution 0 leaves quantisation to the signal's own
-//! encoding in the DBC. Each channel adds its own constant error, drawn once from the seed.
+//! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`. n is normally distributed and independent
+//! from sample to sample. With the probability `dropout` there is no reading. Resolution 0 leaves quantisation to the
+//! signal's encoding in the DBC. Each channel adds its own constant errors, drawn once from the seed.
 
 use super::noise::{Noise, Stream};
 
@@ -13,15 +13,15 @@ pub struct SensorError {
     pub noise_std: f64,
     /// Constant error.
     pub offset: f64,
-    /// Relative error of the slope.
+    /// Relative gain error.
     pub gain: f64,
-    /// Step of the converter; 0 = none.
+    /// Resolution of the converter; 0 = unlimited.
     pub resolution: f64,
     /// Probability that a sample is missing.
     pub dropout: f64,
-    /// Standard deviation of the offset from channel to channel.
+    /// Standard deviation of the offset across channels.
     pub offset_std: f64,
-    /// Standard deviation of the relative error of the slope from channel to channel.
+    /// Standard deviation of the gain error across channels.
     pub gain_std: f64,
 }
 
@@ -31,7 +31,7 @@ impl SensorError {
         Self { noise_std: 0.0, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0, offset_std: 0.0, gain_std: 0.0 };
 }
 
-/// Constant errors beyond this many standard deviations are cut off.
+/// Constant errors are clipped at this many standard deviations.
 const CHANNEL_LIMIT: f64 = 2.0;
 
 /// Errors of all sensors of a pack.
@@ -39,7 +39,7 @@ const CHANNEL_LIMIT: f64 = 2.0;
 pub struct Sensors {
     /// Pack current, A.
     pub current: SensorError,
-    /// Cell voltages, V (the pack voltage has the same relative to its cells: noise times the root of their number).
+    /// Cell voltages, V. The pack voltage has the noise times the square root of the number of cells, and no offset.
     pub voltage: SensorError,
     /// Temperatures, degrees C.
     pub temperature: SensorError,
@@ -53,20 +53,20 @@ pub struct Sensors {
 /// | `Usual` | 5 mV | 1 mV | 0.5 % + 50 mA | 10 mA | 1 K |
 /// | `Poor` | 15 mV | 5 mV | 2 % + 300 mA | 60 mA | 3 K |
 ///
-/// The errors are standard deviations over channels, cut off at two of them, and constant in time. The noise per sample is one step.
-/// Temperatures have steps of 0.1 K and noise of 0.02 K.
+/// The errors are standard deviations across channels, clipped at two standard deviations, and constant in time. The
+/// noise per sample is one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SensorQuality {
-    /// A laboratory's, or the best of a vehicle's.
+    /// Laboratory equipment, or the best vehicles.
     Good,
-    /// Those of most vehicles.
+    /// Most vehicles.
     Usual,
-    /// Cheap or old ones.
+    /// Cheap or old sensors.
     Poor,
 }
 
 impl Sensors {
-    /// The sensors of a quality.
+    /// Sensors of the given quality.
     pub fn of_quality(quality: SensorQuality) -> Self {
         let (voltage, current, temperature_c) = match quality {
             SensorQuality::Good => ((0.001, 0.0001), (0.001, 0.005, 0.001), 0.3),
@@ -90,7 +90,7 @@ impl Sensors {
     }
 }
 
-/// One sensor with its own stream of noise.
+/// One sensor with its own noise stream.
 #[derive(Debug, Clone)]
 pub(crate) struct Sensor {
     error: SensorError,
@@ -106,12 +106,12 @@ impl Sensor {
         Self { error, noise: Noise::new(seed, stream) }
     }
 
-    /// The constant error of the channel.
+    /// The constant offset of the channel.
     pub(crate) fn offset(&self) -> f64 {
         self.error.offset
     }
 
-    /// The reading of `truth`; `None` = dropped out. Draws the same random numbers either way.
+    /// Measures `truth`; `None` = dropped out. Both outcomes draw the same number of random numbers.
     pub(crate) fn read(&mut self, truth: f64) -> Option<f64> {
         let e = self.error;
         let value = truth * (1.0 + e.gain) + e.offset + e.noise_std * self.noise.normal();
@@ -133,12 +133,12 @@ mod tests {
     }
 
     #[test]
-    fn without_errors_the_truth_is_read() {
+    fn ideal_sensor_reads_true_value() {
         assert_eq!(readings(SensorError::default(), 3.7, 3), vec![Some(3.7); 3]);
     }
 
     #[test]
-    fn noise_offset_and_gain_have_the_stated_size() {
+    fn noise_offset_and_gain_match_settings() {
         let error = SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::default() };
         let values: Vec<f64> = readings(error, 2.0, 100_000).into_iter().flatten().collect();
         let n = values.len() as f64;
@@ -149,13 +149,13 @@ mod tests {
     }
 
     #[test]
-    fn resolution_leaves_only_whole_steps() {
+    fn resolution_quantises_to_whole_steps() {
         let error = SensorError { noise_std: 0.1, resolution: 0.25, ..SensorError::default() };
         assert!(readings(error, 1.1, 100).into_iter().flatten().all(|v| (v * 4.0).fract() == 0.0));
     }
 
     #[test]
-    fn dropouts_come_as_often_as_stated() {
+    fn dropout_rate_matches_setting() {
         let error = SensorError { dropout: 0.1, ..SensorError::default() };
         let missing = readings(error, 1.0, 50_000).iter().filter(|v| v.is_none()).count();
         assert!((4_700..5_300).contains(&missing), "{missing}");

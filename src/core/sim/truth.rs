@@ -1,27 +1,27 @@
-//! The true pack, which the estimator must infer from readings.
+//! True state of the pack, which the estimator must infer from readings.
 //!
-//! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that the
-//! estimator does not model. Current positive = discharge. Over one step of `dt` seconds the current and the tables'
-//! values are constant, and within that every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`; it is not clamped: 0 and 1 are open-circuit voltages, not limits;
-//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance, time constants stay;
+//! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
+//! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current and the
+//! values from the tables are constant; under this condition every equation is solved exactly:
+//! * `SOC -= (I + I_leak) dt / (3600 C)`; not clamped, because 0 and 1 are open-circuit voltages, not limits;
+//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance but no time constant;
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
 //!
 //! Terminal voltage `V = OCV(SOC, T) + M h - sum U_i - I R0`.
-//! Ageing changes capacity and resistance; the SOC fraction stays (the reference example's plant does so too).
+//! Ageing changes capacity and resistance, but not the SOC as a fraction (like the plant of the reference example).
 
 use super::fault::{ContactResistance, FaultKind, Leak};
 use super::noise::{Noise, Stream};
 use crate::cell::{CellModel, MAX_BRANCHES};
 use crate::quantity::CellIndex;
 
-/// Open-circuit hysteresis the estimator does not model.
+/// Hysteresis of the open-circuit voltage, which the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hysteresis {
-    /// Distance of the settled discharge and charge curves from the OCV, V; 0 = none.
+    /// Distance of the settled charge and discharge curves from the OCV, V; 0 = none.
     pub magnitude_v: f64,
-    /// Speed of a change of direction: e-foldings per full charge moved.
+    /// How fast the voltage changes to the other curve: e-foldings per full charge moved.
     pub rate: f64,
 }
 
@@ -44,7 +44,7 @@ pub struct Ageing {
     pub resistance_growth_per_ah: f64,
 }
 
-/// Standard deviations from cell to cell.
+/// Standard deviations across cells.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Spread {
     /// Capacity, relative.
@@ -55,7 +55,7 @@ pub struct Spread {
     pub soc: f64,
 }
 
-/// A pack of cells in series, equal except for their spread.
+/// Settings of a pack of cells in series that are equal except for their spread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PackSettings {
     /// Cells in series, at least 1.
@@ -76,7 +76,7 @@ pub struct PackSettings {
     pub ambient_c: f64,
 }
 
-/// Spread beyond this many standard deviations is cut off, so that no cell gets a negative capacity.
+/// The spread is clipped at this many standard deviations, so that no cell gets a negative capacity.
 const SPREAD_LIMIT: f64 = 3.0;
 
 /// True state of one cell.
@@ -86,13 +86,13 @@ pub struct TruthCell {
     pub soc: f64,
     /// Branch voltages, V; 0 beyond the model's branches.
     pub branch_v: [f64; MAX_BRANCHES],
-    /// Hysteresis state, -1 (discharged into) to 1 (charged into).
+    /// Hysteresis state, from -1 (after discharge) to 1 (after charge).
     pub hysteresis: f64,
     /// Temperature, degrees C.
     pub temperature_c: f64,
     /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Resistance relative to the model.
+    /// Resistance relative to the cell model.
     pub resistance_ratio: f64,
     /// Charge moved so far in either direction, Ah.
     pub throughput_ah: f64,
@@ -100,7 +100,7 @@ pub struct TruthCell {
     pub leak: Option<Leak>,
     /// Current of the balancing resistor, A; 0 = off.
     pub bleed_a: f64,
-    /// Resistance of an injected fault between the cell and its voltage taps, ohm; not part of the cell's own voltage.
+    /// Contact resistance of an injected fault, ohm, between the cell and its voltage taps; not part of `voltage_v`.
     pub contact_ohm: f64,
     floor_ah: f64,
 }
@@ -108,7 +108,7 @@ pub struct TruthCell {
 impl TruthCell {
     fn new(settings: &PackSettings, noise: &mut Noise) -> Self {
         let mut spread = |std: f64| std * noise.normal().clamp(-SPREAD_LIMIT, SPREAD_LIMIT);
-        // A capacity never falls below this fraction of the new one: SOC divides by it.
+        // Lower limit of the capacity, because SOC divides by it: 1 % of the new capacity.
         let floor_ah = settings.capacity_ah * 0.01;
         Self {
             capacity_ah: (settings.capacity_ah * (1.0 + spread(settings.spread.capacity))).max(floor_ah),
@@ -137,7 +137,8 @@ impl TruthCell {
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
-    /// Current of the injected leak, A. It ends in an empty cell, and is too small for a drop in the terminal voltage.
+    /// Current of the injected leak, A. It stops when the cell is empty. Its drop in the terminal voltage is
+    /// negligible.
     pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         match self.leak {
             None => 0.0,
@@ -201,7 +202,7 @@ pub struct Pack {
 }
 
 impl Pack {
-    /// A pack at rest; the spread of its cells follows from `seed`.
+    /// Creates a pack at rest, with the spread of its cells drawn from `seed`.
     pub fn new(model: CellModel, settings: PackSettings, seed: u64) -> Self {
         assert!(settings.cells > 0, "a pack has at least one cell");
         let mut noise = Noise::new(seed, Stream::Spread);
@@ -209,7 +210,7 @@ impl Pack {
         Self { model, settings, cells, cycles: 0 }
     }
 
-    /// `current_a` flows through every cell for `dt_s` seconds.
+    /// Steps all cells with `current_a` for `dt_s` seconds.
     pub fn step(&mut self, current_a: f64, dt_s: f64) {
         for cell in &mut self.cells {
             cell.step(&self.model, &self.settings, current_a, dt_s);
@@ -225,22 +226,22 @@ impl Pack {
         }
     }
 
-    /// Changes the ageing from now on: fade is rarely a straight line.
+    /// Changes the ageing from now on, because fade is rarely linear.
     pub fn set_ageing(&mut self, ageing: Ageing) {
         self.settings.ageing = ageing;
     }
 
-    /// Changes the temperature of the surroundings, degrees C; the cells follow where their model has heat.
+    /// Changes the ambient temperature, degrees C. The cells follow if their model has a thermal part.
     pub fn set_ambient(&mut self, ambient_c: f64) {
         self.settings.ambient_c = ambient_c;
     }
 
-    /// Begins a fault of a cell, a contact or a module; one of a sensor changes no truth.
+    /// Starts a fault of a cell, a contact or a module; a fault of a sensor does not change the true state.
     pub(crate) fn begin_fault(&mut self, fault: FaultKind) {
         match fault {
             FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
             FaultKind::Contact { cell, resistance } => {
-                // Where the resistance of a contact is compared with the cell's: SOC, and temperature in degrees C.
+                // A contact's resistance is relative to the cell's at this SOC and temperature, degrees C.
                 let place = self.model.grid_position(0.5, 25.0);
                 let cell = &mut self.cells[cell.index()];
                 cell.contact_ohm += match resistance {
@@ -324,7 +325,7 @@ impl Pack {
         self.voltages_v(current_a).fold((f64::INFINITY, f64::NEG_INFINITY), widen)
     }
 
-    /// The current, A, at which the highest cell has `voltage_v`.
+    /// The current, A, at which the highest cell voltage is `voltage_v`.
     pub fn current_at_highest_a(&self, voltage_v: f64) -> f64 {
         let at = |cell: &TruthCell| cell.current_at_a(&self.model, &self.settings.hysteresis, voltage_v);
         self.cells.iter().map(at).fold(f64::NEG_INFINITY, f64::max)

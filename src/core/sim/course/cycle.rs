@@ -5,12 +5,12 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Discharge pulses of the example, A for 30 Ah: uniform in this range, 15 A mean.
+/// Discharge pulses of the example, A for 30 Ah: uniformly distributed in this range, mean 15 A.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 /// Length of a pulse, s.
 const PULSE_S: f64 = 60.0;
 
-/// Discharge of a cycle.
+/// Discharge current of a cycle.
 #[derive(Debug, Clone)]
 enum Load {
     Constant { current_a: f64 },
@@ -42,7 +42,7 @@ impl Load {
     }
 }
 
-/// Discharges to the low SOC, charges to the high one, ages, repeats.
+/// Discharges to the low SOC, charges to the high SOC, ages the pack, and repeats.
 #[derive(Debug, Clone)]
 pub(crate) struct CycleCourse {
     load: Load,
@@ -56,14 +56,15 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        // Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
+        // Current of the paper's scenario in both directions, A for 2.6 Ah. At this current, 48 cycles take the paper's
+        // 2.23e5 s.
         let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
     }
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        // Charging current of the example, A for 30 Ah (the source states a constant without its size; half the capacity per hour).
+        // Charging current of the example, A for 30 Ah: 0.5 C. The source gives a constant current without its value.
         Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }
 
@@ -92,7 +93,8 @@ impl CycleCourse {
         Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
     }
 
-    /// Half a loss of tolerance: 47 losses of 0.05 Ah do not add up to 2.35 Ah in binary.
+    /// Whether the current cycle is the last. Allows half a loss of tolerance, because 47 losses of 0.05 Ah do not add
+    /// up to exactly 2.35 Ah in binary.
     fn is_last_cycle(&self, pack: &Pack) -> bool {
         self.cycles.is_some_and(|cycles| pack.cycles() + 1 >= cycles)
             || pack.lowest_capacity_ah() - 0.5 * self.loss_ah < self.end_capacity_ah

@@ -1,4 +1,4 @@
-//! The demand of a course: the current until the next sample, sleep, or the end.
+//! What a course demands: a current until the next sample, sleep, or the end.
 
 /// Next demand of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,7 +1,7 @@
 //! A day of an electric car: drive, park asleep, fast charge.
 //!
-//! The car is a point mass that follows random target speeds with bounded acceleration; its electric power is scaled
-//! from a 60 kWh car to the pack at hand, so that every cell sees the same share of its capacity per hour.
+//! The car is a point mass that follows random target speeds with bounded acceleration. Its electric power is scaled
+//! from a 60 kWh car to the simulated pack, so that every cell has the same C-rate.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;
@@ -9,13 +9,13 @@ use crate::sim::truth::Pack;
 
 /// Power of all other consumers, W.
 const AUXILIARY_W: f64 = 600.0;
-/// Strongest acceleration and braking, m/s^2.
+/// Largest acceleration and deceleration, m/s^2.
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
-/// Limits of the power electronics, capacities per hour: regeneration and traction.
+/// Limits of the power electronics, C: regeneration and traction.
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
-/// Fast charging ends here.
+/// SOC at which fast charging ends.
 const CHARGE_TO_SOC: f64 = 0.80;
-/// Fast charging current, capacities per hour: up to SOC 0.4, then falling in a line to the second at 0.8.
+/// Fast charging current, C: the first up to SOC 0.4, then falling linearly to the second at SOC 0.8.
 const CHARGE_C: (f64, f64) = (1.5, 0.6);
 
 /// One part of the day.
@@ -24,7 +24,7 @@ enum DayPhase {
     Drive {
         left_s: f64,
     },
-    /// Asleep until this second of the day.
+    /// Asleep until this time of the day, s.
     Park {
         until_s: f64,
     },
@@ -34,7 +34,7 @@ enum DayPhase {
 /// Length of a day, s.
 const DAY_S: f64 = 86_400.0;
 
-/// The plan of a day that begins at 7:30: to work, back at 17:00 with a stop at the charger, night.
+/// Plan of a day that starts at 7:30: drive to work, drive back at 17:00 with a stop at the charger, park overnight.
 const DAY: [DayPhase; 6] = [
     DayPhase::Drive { left_s: 3300.0 },
     DayPhase::Park { until_s: 9.5 * 3600.0 },
@@ -63,7 +63,7 @@ impl DayCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        // A drive ends at this SOC with a charge, before its planned end.
+        // Below this SOC a drive ends early with a charge.
         if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < 0.10 {
             self.phase = DayPhase::FastCharge;
         }
@@ -83,7 +83,7 @@ impl DayCourse {
                 Demand::Current(self.charge_a(pack))
             }
             DayPhase::Park { until_s } => {
-                // Shortest sleep, s, when drives and charges have used up the time.
+                // Shortest sleep, s, if drives and charges took longer than planned.
                 let duration_s = (until_s - self.day_s).max(60.0);
                 self.day_s += duration_s;
                 self.advance_plan(pack);
@@ -113,13 +113,13 @@ impl DayCourse {
             self.hold_s = self.noise.between(15.0, 120.0);
         }
         self.hold_s -= dt_s;
-        let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // 1 s to close the last difference
+        let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // a small difference is closed over 1 s
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
-        // Energy of the pack these numbers are for, Wh.
+        // The power belongs to a pack of this energy, Wh.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        // Voltage at which that energy is stated, V per cell.
+        // Cell voltage for which that energy is stated, V.
         let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {
@@ -141,9 +141,10 @@ fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
     if speed_m_s == 0.0 {
         return AUXILIARY_W;
     }
-    // 1900 kg with two people; rolling resistance 1 % of the weight; density of air, drag coefficient and frontal area.
+    // Mass 1900 kg including two people; rolling resistance 1 % of the weight; air density, drag coefficient, frontal
+    // area.
     let force_n = 1900.0 * (acceleration_m_s2 + 9.81 * 0.010) + (0.5 * 1.2 * 0.25 * 2.3) * speed_m_s * speed_m_s;
     let wheel_w = force_n * speed_m_s;
-    // Efficiency from battery to wheel, and back.
+    // Efficiency from battery to wheel, and from wheel to battery.
     AUXILIARY_W + if wheel_w > 0.0 { wheel_w / 0.90 } else { wheel_w * 0.70 }
 }

@@ -1,11 +1,11 @@
-//! The random walk: 5-minute loads of random strength within voltage limits, and reference cycles in between.
+//! Random walk: 5-minute loads of random current within voltage limits, with reference cycles in between.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// The loads, A for 2.1 Ah.
+/// Load currents, A for 2.1 Ah.
 const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
 /// Voltage range of the walk, V (narrowed to the cell's own limits).
 const RANGE_V: (f64, f64) = (3.2, 4.2);
@@ -22,7 +22,7 @@ enum WalkPhase {
     Rest { is_full: bool, cycles_left: u32, left_s: f64 },
 }
 
-/// Blocks of random loads, each followed by reference cycles; a block with its reference is the cycle that counts.
+/// Blocks of random loads, each followed by reference cycles. A block with its reference cycles counts as one cycle.
 #[derive(Debug, Clone)]
 pub(crate) struct WalkCourse {
     phase: WalkPhase,
@@ -60,7 +60,7 @@ impl WalkCourse {
                     return self.enter(WalkPhase::Charge { cycles_left: 2 }, pack, dt_s);
                 }
                 let current_a = self.draw_load(pack, low_v, high_v);
-                // Length of a load that no voltage limit cuts short, s.
+                // Length of a load if no voltage limit ends it earlier, s.
                 self.phase = WalkPhase::Walk { steps_left: steps_left - 1, current_a, left_s: 300.0 - dt_s };
                 Demand::Current(current_a)
             }
@@ -108,7 +108,8 @@ impl WalkCourse {
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
-        // Most draws for a load within the voltage range, then a rest: 12 loads, half of them of either sign.
+        // Draws until a load stays within the voltage range, at most 32 times; then rests. Half of the 12 loads have
+        // either sign.
         (0..32)
             .map(|_| self.scale * self.noise.choose(&LOADS_A))
             .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)

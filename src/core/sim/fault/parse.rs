@@ -1,19 +1,20 @@
 //! The text form of a fault: `KIND:...@WHEN`.
 //!
-//! WHEN is `day3` or `3d` (three days after the start), `12h`, `900s`, or absent: from the start.
+//! WHEN is `day3` or `3d` (three days after the start), `12h` or `900s`. Without `@WHEN`, the fault starts with the
+//! simulation.
 
 use std::str::FromStr;
 
 use super::{ContactResistance, Fault, FaultError, FaultKind, Leak};
 use crate::quantity::{CellIndex, MAX_CELLS, SensorIndex};
 
-/// The forms of all kinds, for errors and help.
+/// The text forms of all kinds, for errors and help.
 const KINDS: &str = "leak:CELL:20mA, leak:CELL:1kohm, contact:CELL:0.4mohm, contact:CELL:+20%, weak:CELL:-10%, \
      resistance:CELL:+20%, module:FIRST-LAST:+15%, current-offset:50mA, current-gain:+1%, current-stuck, \
      voltage-offset:CELL:10mV, voltage-stuck:CELL, swap:CELL:CELL, double:CELL:CELL, temperature-stuck:SENSOR or \
-     temperature-off:SENSOR, each with @WHEN behind it or not";
+     temperature-off:SENSOR, each optionally followed by @WHEN";
 
-/// Latest beginning, s: ten years.
+/// Latest start, s: ten years.
 const LATEST_S: f64 = 10.0 * 365.0 * 86_400.0;
 
 type Unit = (&'static str, f64);
@@ -67,7 +68,7 @@ fn parse_kind(text: &str) -> Result<FaultKind, FaultError> {
     })
 }
 
-/// A number that counts from 1, as an index from 0.
+/// Parses a number that counts from 1; returns it as an index from 0.
 fn number(what: &'static str, text: &str) -> Result<u16, FaultError> {
     let number = text.parse::<u16>().ok().filter(|n| (1..=MAX_CELLS).contains(&usize::from(*n)));
     number.map(|n| n - 1).ok_or_else(|| FaultError::new(what, text, format!("a number from 1 to {MAX_CELLS}")))
@@ -80,7 +81,7 @@ fn cell(text: &str) -> Result<CellIndex, FaultError> {
 fn two_cells(first: &str, second: &str) -> Result<(CellIndex, CellIndex), FaultError> {
     let (first_cell, second_cell) = (cell(first)?, cell(second)?);
     if first_cell == second_cell {
-        return Err(FaultError::new("second cell", second, "another cell than the first"));
+        return Err(FaultError::new("second cell", second, "different from the first cell"));
     }
     Ok((first_cell, second_cell))
 }
@@ -91,7 +92,7 @@ fn module(cells: &str, change: f64) -> Result<FaultKind, FaultError> {
     };
     let (first, last) = (cell(first)?, cell(last)?);
     if last < first {
-        return Err(FaultError::new("cells of the module", cells, "FIRST-LAST with FIRST at most LAST"));
+        return Err(FaultError::new("cells of the module", cells, "FIRST-LAST, with FIRST not above LAST"));
     }
     Ok(FaultKind::Module { first, last, change })
 }
@@ -111,7 +112,7 @@ fn contact(text: &str) -> Result<ContactResistance, FaultError> {
     ohm.or_else(share).ok_or_else(|| FaultError::new("contact resistance", text, ALLOWED))
 }
 
-/// A relative change from -90 to +900 %.
+/// Parses a relative change from -90 to +900 %.
 fn change(what: &'static str, text: &str) -> Result<f64, FaultError> {
     let found = measured(text, PERCENT).filter(|x| (-0.9..=9.0).contains(x) && *x != 0.0);
     found.ok_or_else(|| FaultError::new(what, text, "-90% to +900% and not 0, such as -10%"))
@@ -124,7 +125,7 @@ fn quantity(what: &'static str, text: &str, units: &[Unit], limit: f64) -> Resul
     })
 }
 
-/// A finite number with one of `units` behind it, in the basic unit.
+/// Parses a finite number followed by one of `units`; returns it in the base unit.
 fn measured(text: &str, units: &[Unit]) -> Option<f64> {
     let (number, factor) = units.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, factor)))?;
     let number = number.parse::<f64>().ok().filter(|x| x.is_finite())?;
@@ -135,5 +136,5 @@ fn parse_when(text: &str) -> Result<f64, FaultError> {
     const UNITS: &[Unit] = &[("d", 86_400.0), ("h", 3600.0), ("s", 1.0)];
     let days = text.strip_prefix("day").map(|days| days.parse::<f64>().ok().map(|days| days * 86_400.0));
     let from_s = days.unwrap_or_else(|| measured(text, UNITS)).filter(|s| (0.0..=LATEST_S).contains(s));
-    from_s.ok_or_else(|| FaultError::new("beginning", text, "day3, 3d, 12h or 900s, at most 10 years"))
+    from_s.ok_or_else(|| FaultError::new("start of the fault", text, "day3, 3d, 12h or 900s, at most 10 years"))
 }

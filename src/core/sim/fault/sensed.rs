@@ -1,18 +1,18 @@
-//! What faults of sensors change: true values before they are read, and readings.
+//! Effects of sensor faults on true values before they are measured, and on readings.
 
 use super::FaultKind;
 use crate::quantity::{Channel, SensorIndex};
 
-/// The faults of sensors that have begun.
+/// The sensor faults that have started.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SensorFaults {
     begun: Vec<FaultKind>,
-    /// Value of each frozen channel; `None` until its first reading after the beginning.
+    /// Value of each frozen channel; `None` = no reading since the start of the fault.
     frozen: Vec<(Channel, Option<f64>)>,
 }
 
 impl SensorFaults {
-    /// Begins a fault; one of a cell changes nothing here.
+    /// Starts a fault; faults of cells have no effect here.
     pub(crate) fn begin(&mut self, fault: FaultKind) {
         let frozen = match fault {
             FaultKind::CurrentStuck => Some(Channel::Current),
@@ -24,7 +24,7 @@ impl SensorFaults {
         self.begun.push(fault);
     }
 
-    /// The current that the sensor sees, A.
+    /// The current at the sensor, A.
     pub(crate) fn current_a(&self, truth_a: f64) -> f64 {
         self.begun.iter().fold(truth_a, |current_a, fault| match fault {
             FaultKind::CurrentOffset(offset_a) => current_a + offset_a,
@@ -33,12 +33,12 @@ impl SensorFaults {
         })
     }
 
-    /// The temperature that `sensor` sees, degrees C.
+    /// The temperature at `sensor`, degrees C.
     pub(crate) fn temperature_c(&self, sensor: SensorIndex, truth_c: f64, ambient_c: f64) -> f64 {
         if self.begun.contains(&FaultKind::TemperatureOff(sensor)) { ambient_c } else { truth_c }
     }
 
-    /// Makes of the voltages at the taps those at the channels, V.
+    /// Converts voltages at the taps to voltages at the channels, V, in place.
     pub(crate) fn distort_voltages(&self, voltages_v: &mut [f64]) {
         for fault in &self.begun {
             match *fault {
@@ -49,7 +49,7 @@ impl SensorFaults {
         }
     }
 
-    /// Freezes and doubles readings. A frozen channel has no dropouts.
+    /// Freezes and duplicates readings. A frozen channel has no dropouts.
     pub(crate) fn distort_readings(&mut self, readings: &mut [(Channel, Option<f64>)]) {
         for (channel, frozen) in &mut self.frozen {
             for (_, value) in readings.iter_mut().filter(|(of, _)| of == channel) {

@@ -1,4 +1,4 @@
-//! Text forms, and what each fault changes of truth and readings.
+//! Text forms of faults, and their effects on true state and readings.
 
 use super::super::truth::tests::{plain_model, plain_settings};
 use super::super::{Balancing, Moment, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
@@ -9,7 +9,7 @@ fn fault(text: &str) -> Fault {
     text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
-/// Four equal cells with perfect sensors under 1.325 A each way, sensor 1 on cell 1.
+/// Four equal cells with ideal sensors at 1.325 A in both directions, sensor 1 on cell 1.
 fn settings() -> Settings {
     let mut settings = Settings::of(Scenario::Paper, 2.6);
     settings.pack = crate::sim::PackSettings { cells: 4, ..plain_settings() };
@@ -35,7 +35,7 @@ fn voltage_v(sim: &Simulation, cell: u16) -> f64 {
     reading(sim, Channel::CellVoltage(CellIndex(cell)))
 }
 
-/// Runs a pack with and without `faults`; `each` sees both at each moment.
+/// Runs a pack with and without `faults`; calls `each` with both at each moment.
 fn compare(faults: &[&str], mut each: impl FnMut(Moment, &Simulation, &Simulation)) -> (Simulation, Simulation) {
     let (mut faulty, mut healthy) = (simulation(faults), simulation(&[]));
     while let Some((moment, _)) = faulty.advance().zip(healthy.advance()) {
@@ -45,7 +45,7 @@ fn compare(faults: &[&str], mut each: impl FnMut(Moment, &Simulation, &Simulatio
 }
 
 #[test]
-fn every_kind_is_read_with_its_units_and_beginning() {
+fn every_kind_parses_with_units_and_start() {
     let cell = CellIndex(6);
     for (text, kind, from_s) in [
         ("leak:7:20mA@day3", FaultKind::Leak { cell, leak: Leak::Current(0.02) }, 3.0 * 86_400.0),
@@ -71,7 +71,7 @@ fn every_kind_is_read_with_its_units_and_beginning() {
 }
 
 #[test]
-fn a_bad_form_is_an_error_with_what_is_found_and_allowed() {
+fn malformed_fault_error_states_found_and_allowed() {
     for (text, says) in [
         ("leek:7:20mA", "fault = leek:7:20mA, must be leak:CELL:20mA, "),
         ("leak:7", "fault = leak:7, must be "),
@@ -84,13 +84,13 @@ fn a_bad_form_is_an_error_with_what_is_found_and_allowed() {
         ("weak:7:-95%", "change of capacity = -95%, must be -90% to +900%"),
         ("resistance:7:nan%", "change of resistance = nan%"),
         ("module:7:+15%", "cells of the module = 7, must be FIRST-LAST"),
-        ("module:7-3:+15%", "cells of the module = 7-3, must be FIRST-LAST with FIRST at most LAST"),
+        ("module:7-3:+15%", "cells of the module = 7-3, must be FIRST-LAST, with FIRST not above LAST"),
         ("current-offset:0A", "current offset = 0A, must be a number in mA or A, not 0, at most 1000 A"),
         ("voltage-offset:7:10", "voltage offset = 10, must be a number in mV or V"),
-        ("swap:3:3", "second cell = 3, must be another cell than the first"),
+        ("swap:3:3", "second cell = 3, must be different from the first cell"),
         ("temperature-off:x", "temperature sensor = x"),
-        ("current-stuck@yesterday", "beginning = yesterday, must be day3, 3d, 12h or 900s"),
-        ("current-stuck@-1d", "beginning = -1d"),
+        ("current-stuck@yesterday", "start of the fault = yesterday, must be day3, 3d, 12h or 900s"),
+        ("current-stuck@-1d", "start of the fault = -1d"),
     ] {
         let message = text.parse::<Fault>().expect_err(text).to_string();
         assert!(message.contains(says), "{text}: {message}");
@@ -98,7 +98,7 @@ fn a_bad_form_is_an_error_with_what_is_found_and_allowed() {
 }
 
 #[test]
-fn a_fault_of_a_cell_or_sensor_the_pack_does_not_have_is_refused() {
+fn fault_of_missing_cell_or_sensor_is_rejected() {
     let refusal = |text: &str| fault(text).kind.check(4, 1).err().map(|error| error.to_string());
     assert_eq!(refusal("leak:5:20mA").as_deref(), Some("cell = 5, must be 1 to 4"));
     assert_eq!(refusal("module:3-6:+15%").as_deref(), Some("cell = 6, must be 1 to 4"));
@@ -108,7 +108,7 @@ fn a_fault_of_a_cell_or_sensor_the_pack_does_not_have_is_refused() {
 }
 
 #[test]
-fn a_leak_takes_its_charge_from_its_cell_alone_from_its_beginning() {
+fn leak_discharges_only_its_cell_from_its_start() {
     let (faulty, healthy) = compare(&["leak:2:20mA@1000s", "leak:3:100ohm@1000s"], |_, _, _| {});
     let lost_ah = |i: usize| (healthy.pack().cells()[i].soc - faulty.pack().cells()[i].soc) * 2.6;
     assert!((lost_ah(1) - 0.02 * 2000.0 / 3600.0).abs() < 2e-5, "{}", lost_ah(1));
@@ -119,7 +119,7 @@ fn a_leak_takes_its_charge_from_its_cell_alone_from_its_beginning() {
 }
 
 #[test]
-fn a_leak_takes_charge_while_the_buses_sleep() {
+fn leak_discharges_cell_while_buses_sleep() {
     let mut settings = Settings::of(Scenario::EvDay, 2.6);
     settings.pack = crate::sim::PackSettings { cells: 2, ..plain_settings() };
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
@@ -129,7 +129,7 @@ fn a_leak_takes_charge_while_the_buses_sleep() {
         end_s = moment.time.secs();
     }
     let cells = sim.pack().cells();
-    // The simulation ends with the night, of which no moment is left.
+    // The simulation ends with a night, in which there are no sampling moments.
     assert!(end_s < 80_000.0);
     assert!(
         ((cells[0].soc - cells[1].soc) * 2.6 - 0.01 * 22.0).abs() < 1e-3,
@@ -139,7 +139,7 @@ fn a_leak_takes_charge_while_the_buses_sleep() {
 }
 
 #[test]
-fn a_contact_drops_the_measured_voltage_by_current_times_resistance_and_leaves_the_cell() {
+fn contact_resistance_lowers_only_measured_voltage() {
     let (faulty, healthy) = compare(&["contact:2:4mohm@1000s", "contact:3:+20%"], |moment, faulty, healthy| {
         let drop_v = |cell| voltage_v(healthy, cell) - voltage_v(faulty, cell);
         let ohm = if moment.time >= at_s(1000) { 0.004 } else { 0.0 };
@@ -153,7 +153,7 @@ fn a_contact_drops_the_measured_voltage_by_current_times_resistance_and_leaves_t
 }
 
 #[test]
-fn weak_and_resistive_cells_change_at_once_and_keep_their_soc() {
+fn weak_and_resistive_cells_keep_their_soc() {
     let (mut before, mut at) = ([0.0; 4], [0.0; 4]);
     let (faulty, _) = compare(&["weak:2:-10%@1000s", "resistance:3:+20%@1000s"], |moment, faulty, _| {
         let into = if moment.time < at_s(1000) { &mut before } else { &mut at };
@@ -164,12 +164,12 @@ fn weak_and_resistive_cells_change_at_once_and_keep_their_soc() {
     let cells = faulty.pack().cells();
     assert!((cells[1].capacity_ah - 2.34).abs() < 1e-12 && cells[0].capacity_ah == 2.6);
     assert!((cells[2].resistance_ratio - 1.2).abs() < 1e-12 && cells[1].resistance_ratio == 1.0);
-    // One second's step lies between the two.
+    // The two differ by one step of a second.
     assert!((before[1] - at[1] - (before[0] - at[0])).abs() < 1e-12);
 }
 
 #[test]
-fn a_replaced_module_has_new_cells_of_one_soc() {
+fn replaced_module_has_new_cells_of_equal_soc() {
     let faults = ["leak:2:500mA", "resistance:3:+50%", "module:2-3:+15%@2000s"];
     let (faulty, healthy) = compare(&faults, |_, _, _| {});
     let cells = faulty.pack().cells();
@@ -178,7 +178,7 @@ fn a_replaced_module_has_new_cells_of_one_soc() {
         assert_eq!((cell.resistance_ratio, cell.leak, cell.soc), (1.0, None, cells[1].soc));
     }
     assert_eq!(cells[3], healthy.pack().cells()[3]);
-    // Half of what the leak had taken, and the smaller swing of 15 % more capacity.
+    // Half of the leaked charge, and the smaller SOC swing because of 15 % more capacity.
     let missing = healthy.pack().cells()[3].soc - cells[1].soc;
     let moved = 1.325 * 1000.0 / 3600.0 / 2.6;
     let expected = 0.5 * 0.5 * 2000.0 / 3600.0 / 2.6 - moved * (1.0 - 1.0 / 1.15);
@@ -186,7 +186,7 @@ fn a_replaced_module_has_new_cells_of_one_soc() {
 }
 
 #[test]
-fn the_current_sensor_reads_an_offset_and_a_gain_too_many() {
+fn current_sensor_faults_add_offset_and_gain() {
     compare(&["current-offset:50mA@100s", "current-gain:-2%@200s"], |moment, faulty, _| {
         let offset_a = if moment.time >= at_s(100) { 0.05 } else { 0.0 };
         let gain = if moment.time >= at_s(200) { -0.02 } else { 0.0 };
@@ -197,7 +197,7 @@ fn the_current_sensor_reads_an_offset_and_a_gain_too_many() {
 }
 
 #[test]
-fn stuck_channels_keep_the_value_of_their_beginning_and_the_truth_moves() {
+fn stuck_channels_keep_their_value_while_truth_changes() {
     let faults = ["current-stuck@500s", "voltage-stuck:2@500s", "temperature-stuck:1@500s"];
     let channels = [Channel::Current, Channel::CellVoltage(CellIndex(1)), Channel::Temperature(SensorIndex(0))];
     let mut frozen = [f64::NAN; 3];
@@ -217,7 +217,7 @@ fn stuck_channels_keep_the_value_of_their_beginning_and_the_truth_moves() {
 }
 
 #[test]
-fn voltage_channels_are_offset_exchanged_or_doubled_and_the_pack_voltage_is_not() {
+fn voltage_channel_faults_leave_pack_voltage_unchanged() {
     let distinct = "weak:1:-20%";
     let with = |text: &str, expected: fn([f64; 4]) -> [f64; 4]| {
         let (mut faulty, mut healthy) =
@@ -235,7 +235,7 @@ fn voltage_channels_are_offset_exchanged_or_doubled_and_the_pack_voltage_is_not(
 }
 
 #[test]
-fn a_temperature_sensor_that_fell_off_shows_the_surroundings() {
+fn detached_temperature_sensor_reads_ambient() {
     let mut warmest_c = 25.0;
     compare(&["temperature-off:1@500s"], |moment, faulty, healthy| {
         let channel = Channel::Temperature(SensorIndex(0));
@@ -247,7 +247,7 @@ fn a_temperature_sensor_that_fell_off_shows_the_surroundings() {
 }
 
 #[test]
-fn balancing_bleeds_the_fuller_cells_in_the_night_and_not_while_driving() {
+fn balancing_bleeds_fuller_cells_only_at_night() {
     let mut settings = Settings::of(Scenario::EvDay, 60.0);
     settings.pack = crate::sim::PackSettings { cells: 4, capacity_ah: 60.0, ..plain_settings() };
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
@@ -271,7 +271,7 @@ fn balancing_bleeds_the_fuller_cells_in_the_night_and_not_while_driving() {
 }
 
 #[test]
-fn a_quality_has_constant_errors_within_two_deviations_and_whole_steps() {
+fn sensor_quality_limits_errors_and_quantises_readings() {
     let mut settings = settings();
     settings.pack.cells = 400;
     settings.sensors = Sensors::of_quality(SensorQuality::Usual);
@@ -287,6 +287,6 @@ fn a_quality_has_constant_errors_within_two_deviations_and_whole_steps() {
         }
     }
     let rms_v = (errors_v.iter().map(|v| v * v).sum::<f64>() / 400.0).sqrt();
-    assert!((0.004..0.0055).contains(&rms_v), "{rms_v}"); // cut off at two deviations: 0.96 of them
+    assert!((0.004..0.0055).contains(&rms_v), "{rms_v}"); // clipping at 2 sigma leaves 0.96 of 5 mV
     assert!(errors_v.iter().all(|v| v.abs() < 0.0115));
 }

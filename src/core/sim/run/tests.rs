@@ -1,4 +1,4 @@
-//! Whole scenarios, run without any file.
+//! Whole scenarios, run in memory.
 
 use super::super::balancing::Balancing;
 use super::super::scenario::Scenario;
@@ -51,10 +51,10 @@ fn run(sim: &mut Simulation) -> Course {
 }
 
 #[test]
-fn paper_scenario_takes_the_papers_time_and_ends_at_its_capacity() {
+fn paper_scenario_matches_time_and_final_capacity() {
     let mut sim = simulation(Settings::of(Scenario::Paper, 2.6));
     let course = run(&mut sim);
-    assert_eq!(sim.pack().cycles(), 47); // the 48th, at 0.25 Ah, is the last and loses nothing
+    assert_eq!(sim.pack().cycles(), 47); // the 48th, at 0.25 Ah, is the last and loses no capacity
     assert!((sim.pack().lowest_capacity_ah() - 0.25).abs() < 1e-9);
     assert!((course.end_s / 2.23e5 - 1.0).abs() < 0.01, "{} s", course.end_s);
     let one_sample = 1.325 / (3600.0 * 0.25);
@@ -63,7 +63,7 @@ fn paper_scenario_takes_the_papers_time_and_ends_at_its_capacity() {
 }
 
 #[test]
-fn reference_scenario_loses_1_ah_per_cycle_under_pulses_of_15_a_mean() {
+fn reference_scenario_loses_1_ah_per_cycle() {
     let mut sim = simulation(Settings::of(Scenario::Reference, 30.0));
     let course = run(&mut sim);
     assert!((sim.pack().lowest_capacity_ah() - 21.0).abs() < 1e-9);
@@ -73,7 +73,7 @@ fn reference_scenario_loses_1_ah_per_cycle_under_pulses_of_15_a_mean() {
 }
 
 #[test]
-fn random_walk_stays_within_its_voltages_and_measures_by_two_reference_cycles() {
+fn random_walk_stays_within_limits_with_reference_cycles() {
     let mut settings = Settings::of(Scenario::RandomWalk, 2.1);
     settings.walk_steps = 60;
     (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
@@ -104,14 +104,14 @@ fn ev_day_drives_regenerates_sleeps_and_charges() {
 }
 
 #[test]
-fn a_bms_that_bleeds_asleep_sends_its_bits_every_minute_until_none_is_bled() {
+fn sleeping_bms_reports_bits_while_bleeding() {
     let mut settings = Settings::of(Scenario::EvDay, 50.0);
     settings.pack.cells = 3;
     settings.pack.spread = Spread { soc: 0.05, ..Spread::default() };
     (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
     let mut nights = 0;
-    // Not every drive home goes without a stop, which counts as the rest after the charge.
+    // Some drives home include a stop, which counts as the rest after the charge.
     for seed in 1..=20 {
         settings.seed = seed;
         let run = |has_bits: bool| {
@@ -127,7 +127,7 @@ fn a_bms_that_bleeds_asleep_sends_its_bits_every_minute_until_none_is_bled() {
             (asleep, sim.pack().cells().to_vec())
         };
         let ((asleep, with), (none, without)) = (run(true), run(false));
-        assert!(none.is_empty() && with == without, "the bits change nothing");
+        assert!(none.is_empty() && with == without, "the bits must not change the simulation");
         for pair in asleep.windows(2) {
             let [(before_s, was_bled), (after_s, _)] = pair else { unreachable!() };
             assert!(
@@ -137,11 +137,11 @@ fn a_bms_that_bleeds_asleep_sends_its_bits_every_minute_until_none_is_bled() {
         }
         nights += asleep.iter().filter(|(_, is_bled)| !is_bled).count();
     }
-    assert!(nights > 0, "no sleep in which a cell was bled");
+    assert!(nights > 0, "no cell was bled during any sleep");
 }
 
 #[test]
-fn cells_are_sampled_at_their_own_period_and_see_the_mean_current() {
+fn cells_step_at_own_period_with_mean_current() {
     let mut settings = Settings::of(Scenario::EvDay, 50.0);
     settings.pack.cells = 1;
     settings.pack.spread = Default::default();
@@ -162,7 +162,7 @@ fn cells_are_sampled_at_their_own_period_and_see_the_mean_current() {
 }
 
 #[test]
-fn a_seed_gives_the_same_readings_again_and_another_seed_others() {
+fn readings_repeat_for_same_seed_only() {
     let readings = |seed| {
         let mut settings = Settings::of(Scenario::Reference, 30.0);
         (settings.seed, settings.duration_s) = (seed, Some(500.0));
@@ -186,7 +186,7 @@ fn scenarios_scale_with_the_cell() {
 }
 
 #[test]
-fn pack_current_is_strings_times_cell_current_and_pack_voltage_the_sum() {
+fn pack_current_scales_and_pack_voltage_sums() {
     let mut settings = Settings::of(Scenario::Paper, 2.6);
     settings.pack.cells = 4;
     settings.sensors = Default::default();

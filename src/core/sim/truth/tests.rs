@@ -1,9 +1,9 @@
-//! Closed forms of the truth model.
+//! Closed-form solutions of the true state.
 
 use super::*;
 use crate::cell::{Branch, Table, Thermal};
 
-/// A flat-resistance cell: closed forms hold over any swing.
+/// A cell with constant resistances, so that closed-form solutions hold for any swing.
 pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
     let k = capacity_ah / 2.6;
     let flat = |value: f64| Table { values: vec![vec![value; 5]] };
@@ -43,7 +43,7 @@ fn plain_pack() -> Pack {
 }
 
 #[test]
-fn constant_current_moves_soc_linearly_and_u1_exponentially_whatever_the_step() {
+fn constant_current_matches_closed_form_for_any_step() {
     for dt in [0.1, 1.0, 10.0] {
         let mut pack = plain_pack();
         for _ in 0..(600.0 / dt) as u32 {
@@ -62,12 +62,12 @@ fn temperature_settles_where_losses_equal_cooling() {
     for i in 0..20_000 {
         pack.step(if i % 2 == 0 { 3.0 } else { -3.0 }, 1.0);
     }
-    let losses_w = 9.0 * 0.03; // the branch voltage stays near 0 with alternating current
+    let losses_w = 9.0 * 0.03; // with alternating current, the branch voltage stays near 0
     assert!((pack.cells()[0].temperature_c - (25.0 + 8.0 * losses_w)).abs() < 0.01);
 }
 
 #[test]
-fn cut_off_current_gives_the_requested_voltage() {
+fn cut_off_current_reaches_requested_voltage() {
     let mut pack = plain_pack();
     pack.step(-2.0, 300.0);
     let current = pack.current_at_highest_a(4.2);
@@ -75,7 +75,7 @@ fn cut_off_current_gives_the_requested_voltage() {
 }
 
 #[test]
-fn hysteresis_parts_the_curves_by_its_magnitude_and_is_off_by_default() {
+fn hysteresis_separates_curves_by_its_magnitude() {
     let mut settings = plain_settings();
     settings.hysteresis = Hysteresis { magnitude_v: 0.02, rate: 50.0 };
     let mut pack = Pack::new(plain_model(2.6), settings, 1);
@@ -91,7 +91,7 @@ fn hysteresis_parts_the_curves_by_its_magnitude_and_is_off_by_default() {
 }
 
 #[test]
-fn ageing_per_cycle_and_per_charge_add_up_and_keep_the_soc() {
+fn cycle_and_charge_ageing_add_and_keep_soc() {
     let mut settings = plain_settings();
     settings.ageing = Ageing {
         capacity_loss_ah_per_cycle: 0.05,
@@ -123,7 +123,7 @@ fn leakage_discharges_a_resting_cell() {
 }
 
 #[test]
-fn spread_has_the_stated_size_and_follows_from_the_seed() {
+fn spread_matches_setting_and_depends_on_seed() {
     let mut settings = plain_settings();
     settings.cells = 1000;
     settings.spread = Spread { capacity: 0.02, resistance: 0.1, soc: 0.01 };
