@@ -1,6 +1,6 @@
 //! `packwatch discover`: finds the signals of the traction battery in a log.
 //!
-//! Exit code 1: a file cannot be read, or the log has no frames. Finding nothing is no failure: the page says so.
+//! Exit code 1: a file cannot be read, or the log has no frames. If no signals are found, the page says so; exit code 0.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -25,45 +25,45 @@ use packwatch_host::failure::Failure;
 /// Arguments of `discover`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Signals of the DBC files and of the OBDb signal set that are in the log are ranked by name, unit, range and behaviour. Answers to \
-diagnostic requests that no definition describes are searched for rows of cell voltages, pack voltage, current and temperatures; their \
-scales are guesses from plausible values. A log of a drive shows more than one of a car at rest.")]
+Ranks the signals of the DBC files and the OBDb signal set that occur in the log, by name, unit, range and behaviour. Diagnostic answers \
+without a definition are searched for series of cell voltages, pack voltage, current and temperatures; their scales are guesses from \
+plausible values. A log of a drive shows more than a log of a parked car.")]
 pub(crate) struct Args {
-    /// Log: a journal or a candump log, also .gz or .zst; - is standard input
+    /// Journal or candump log, also .gz or .zst; - reads standard input
     #[arg(value_name = "LOG")]
     log: PathBuf,
-    /// DBC file; repeat it for several
+    /// DBC file; repeat for several
     #[arg(long = "dbc", value_name = "FILE.dbc")]
     dbc: Vec<PathBuf>,
-    /// OBDb signal set of the car model: its diagnostic answers
+    /// OBDb signal set of the car model, which describes its diagnostic answers
     #[arg(long, value_name = "FILE.json")]
     obdb: Option<PathBuf>,
-    /// Model year, for the OBDb signal set
+    /// Model year, selects commands of the OBDb signal set
     #[arg(long, value_name = "YEAR", requires = "obdb", value_parser = clap::value_parser!(i64).range(1980..=2100))]
     year: Option<i64>,
-    /// Print all candidates as one JSON document
+    /// Print all candidates as JSON
     #[arg(long)]
     json: bool,
-    /// Write a configuration of the best candidates, and beside it PACK.dbc with fields that no DBC describes; existing files are replaced
+    /// Write a configuration with the best candidates, and PACK.dbc with the fields that no DBC describes; replaces existing files
     #[arg(long, value_name = "PACK.toml", requires = "model")]
     write: Option<PathBuf>,
-    /// Cell model for --write
+    /// Cell model for the written configuration
     #[arg(long, value_name = "CELL.toml")]
     model: Option<PathBuf>,
-    /// Cells in series for --write, where the log has the total voltage alone
+    /// Cells in series for the written configuration; needed if the log has only the pack voltage
     #[arg(long, value_name = "N", requires = "write", value_parser = clap::value_parser!(u16).range(1..=1024))]
     cells: Option<u16>,
-    /// What a positive current means, for --write, where the log does not show it
+    /// Meaning of a positive current for the written configuration; needed if the log does not show it
     #[arg(long, value_enum, requires = "write")]
     positive: Option<Positive>,
 }
 
-/// Sign of a current on the command line.
+/// Sign of the current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Positive {
-    /// Positive charges
+    /// Positive current charges the pack
     Charge,
-    /// Positive discharges
+    /// Positive current discharges the pack
     Discharge,
 }
 
@@ -81,7 +81,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let interfaces = feed(args, &mut discoverer)?;
     let discovery = discoverer.finish(&interfaces);
     if discovery.frames == 0 {
-        return Err(Failure::new(format!("{}: has no frames, must be a log of frames", args.log.display())));
+        return Err(Failure::new(format!(
+            "{}: has no CAN frames; give a journal or a candump log",
+            args.log.display()
+        )));
     }
     match args.json {
         true => unless_closed(print_json(&json!({ "version": 1, "discovery": discovery })))?,
@@ -93,7 +96,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// Writes the configuration if it is a valid one.
+/// Writes the configuration if it is valid.
 fn write(
     args: &Args,
     discoverer: &Discoverer,
@@ -114,7 +117,9 @@ fn write(
             Positive::Discharge => PositiveDirection::Discharge,
         }),
     };
-    let failed = |what: &str| Failure::new(format!("{}: not written:\n{what}", file.display()));
+    let failed = |what: &str| {
+        Failure::new(format!("{}: not written, because the configuration would be invalid:\n{what}", file.display()))
+    };
     let pack = discoverer.configuration(discovery, &settings).map_err(|error| failed(&error.to_string()))?;
     let own = file.with_extension("dbc");
     let read = |path: &Path| match &pack.database {
@@ -130,7 +135,7 @@ fn write(
         eprintln!("{} written: fields that no DBC describes", own.display());
     }
     write_whole(file, &pack.text)?;
-    eprintln!("{} written; the log does not decide:", file.display());
+    eprintln!("{} written; please check what the log does not show:", file.display());
     pack.open.iter().for_each(|question| eprintln!("  {question}"));
     Ok(())
 }
@@ -143,7 +148,7 @@ fn write_whole(file: &Path, text: &str) -> Result<(), Failure> {
     written.map_err(failure)
 }
 
-/// Passes every frame on; returns the names of the interfaces.
+/// Passes every frame to the discoverer; returns the names of the interfaces.
 fn feed(args: &Args, discoverer: &mut Discoverer) -> Result<Vec<String>, Failure> {
     let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
@@ -187,7 +192,7 @@ fn page(discovery: &Discovery) -> String {
         let found = discovery.candidates.iter().filter(|candidate| candidate.quantity == quantity);
         let rows: Vec<Vec<String>> = found.take(3).map(row).collect();
         text += &match rows.is_empty() {
-            true => "  no candidate\n".to_owned(),
+            true => "  no candidates\n".to_owned(),
             false => table(&["  ", "signal", "interface", "values", "reason"], rows, 5),
         };
     }
@@ -203,7 +208,7 @@ fn row(candidate: &Candidate) -> Vec<String> {
     vec![rank, candidate.signal.clone(), candidate.interface.clone(), values, candidate.reasons.join("; ")]
 }
 
-/// At most three decimals.
+/// Formats with at most three decimals.
 fn number(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()

@@ -1,4 +1,4 @@
-//! `packwatch export`: estimates, half-cycles and alarms of many logs as Parquet or CSV.
+//! `packwatch export`: writes estimates, half-cycles and alarms of many logs as Parquet or CSV.
 
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ use packwatch_host::failure::Failure;
 /// Version of the JSON document.
 const VERSION: u32 = 1;
 
-/// Forms of the tables by name.
+/// Table formats by name.
 const FORMATS: [NamedValue<TableFormat>; 2] = [
     ("parquet", TableFormat::Parquet, "Apache Parquet, compressed with Snappy"),
     ("csv", TableFormat::Csv, "CSV with a heading"),
@@ -25,28 +25,28 @@ const FORMATS: [NamedValue<TableFormat>; 2] = [
 /// Arguments of `export`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json per log. All logs of a fleet in one \
-                  query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Tables that are there already are \
-                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others continue; the exit code is then 1. The \
-                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv next to it."
+    after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json for each log. To query all logs: \
+    select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Existing tables are replaced when the \
+    new ones are complete. If a log fails, its tables are not replaced, the other logs continue, and the exit code is 1. Sections of a \
+    CSV get their times from --start-times, else from NAME_cycles.csv next to the CSV."
 )]
 pub(crate) struct Args {
-    /// Print the columns with their types and units as Markdown, and do nothing else
+    /// Print the columns with types and units as Markdown
     #[arg(long, exclusive = true)]
     columns_page: bool,
-    /// Configuration
+    /// Configuration file
     #[arg(short, long, value_name = "FILE", required_unless_present = "columns_page")]
     config: Option<PathBuf>,
-    /// Form of the tables
+    /// Format of the tables
     #[arg(long, value_parser = one_of(&FORMATS), default_value = "parquet")]
     format: TableFormat,
-    /// Folder for the logs' folders; created when it does not exist
+    /// Folder for the results, with a folder per log; created if needed
     #[arg(short, long, value_name = "DIR", required_unless_present = "columns_page")]
     out: Option<PathBuf>,
-    /// Period in which at most one estimate per cell is exported, the first; 0 = every estimate
+    /// Export at most one estimate per cell in this period, the first; 0 exports all
     #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = period)]
     period: f64,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -60,7 +60,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     args.logs.check()?;
     let (Some(config), Some(out)) = (&args.config, &args.out) else {
-        return Err(Failure::new("--config and --out must be given"));
+        return Err(Failure::new("give --config FILE and --out DIR"));
     };
     let config = config::load(config)?;
     let open = |config: &Config, logs: &[PathBuf]| args.logs.open(config, logs);

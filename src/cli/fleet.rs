@@ -1,4 +1,4 @@
-//! `packwatch fleet`: the vehicles of a fleet, replayed in parts on any machines, and the tables of all.
+//! `packwatch fleet`: replays the vehicles of a fleet in shards, on any machines, and merges their tables.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -32,54 +32,54 @@ pub(crate) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum FleetCommand {
-    /// List the vehicles with their logs: the manifest
+    /// Write a manifest: the list of vehicles and their logs
     Plan(PlanArgs),
-    /// Replay the vehicles of a manifest, or a part of them
+    /// Replay the vehicles of a manifest, or a shard of them
     Run(RunArgs),
-    /// Put the tables of all parts together
+    /// Merge the tables of all shards
     Merge(MergeArgs),
 }
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "The manifest has a JSON document on each line: vehicle (its name), bytes (the size of its logs), logs, and if you add it config, the \
-                  configuration of this vehicle."
+    after_help = "Each line of the manifest is a JSON document with vehicle (its name), bytes (size of its logs), logs and optionally config, the \
+    configuration of this vehicle."
 )]
 struct PlanArgs {
-    /// A log, which is a vehicle of its own, or a folder with the logs of one vehicle, in the order of their names
+    /// Log of one vehicle, or folder with the logs of one vehicle, read in the order of their names
     #[arg(required = true, value_name = "LOG|DIR")]
     logs: Vec<PathBuf>,
-    /// File to write; - is standard output
+    /// Manifest to write; - writes standard output
     #[arg(short, long, value_name = "MANIFEST", default_value = "-")]
     out: PathBuf,
 }
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet and, with --estimates, estimates.parquet; vehicle.json is the last. A vehicle that has \
-                  it is not replayed again, so a run that was stopped continues. A vehicle that fails is reported and the others continue; a further run tries it \
-                  again. The exit code is 0 when every vehicle was replayed or has failed for a reason that is written down."
+    after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet, with --estimates estimates.parquet, and last vehicle.json. Vehicles that have \
+    vehicle.json are not replayed again, so a stopped run can be continued. If a vehicle fails, the run reports it and continues; the next run tries \
+    it again. The exit code is 0 if every vehicle was replayed or its failure was recorded."
 )]
 struct RunArgs {
-    /// Manifest
+    /// Manifest to read
     #[arg(value_name = "MANIFEST")]
     manifest: PathBuf,
-    /// Configuration of the vehicles that name none
+    /// Configuration of vehicles without their own
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Folder for the vehicles' folders; created when it does not exist
+    /// Folder for the results, with a folder per vehicle; created if needed
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
-    /// The part to replay: I of N parts of like size
+    /// Shard to replay: I of N shards of similar size
     #[arg(long, value_name = "I/N", default_value = "1/1")]
     shard: Shard,
-    /// Also a table of estimates, at most one per cell in each period; 0 = every one
+    /// Also write estimates, at most one per cell in this period, s; 0 writes all
     #[arg(long, value_name = "S", value_parser = period)]
     estimates: Option<f64>,
-    /// Threads (default: one per core)
+    /// Number of threads [default: one per core]
     #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -88,20 +88,20 @@ struct RunArgs {
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, where they were exported, estimates.parquet: row groups of one vehicle each, \
-                  the vehicles by name. In whatever parts and order they were replayed, the bytes are the same."
+    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, if exported, estimates.parquet. Each vehicle has its own row group, \
+    sorted by name. The bytes do not depend on the shards or their order."
 )]
 struct MergeArgs {
-    /// Folders that `fleet run` has written
+    /// Folders written by `fleet run`
     #[arg(required = true, value_name = "DIR")]
     folders: Vec<PathBuf>,
-    /// Folder for the tables; created when it does not exist
+    /// Folder for the merged tables; created if needed
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
-    /// Manifest: every vehicle of it must be there
+    /// Manifest; fail if one of its vehicles is missing
     #[arg(long, value_name = "MANIFEST")]
     manifest: Option<PathBuf>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -135,7 +135,7 @@ fn plan(args: &PlanArgs) -> Result<(), Failure> {
 fn replay(args: &RunArgs) -> Result<(), Failure> {
     let all = vehicles::read_manifest(&args.manifest).map_err(failure)?;
     if args.input.start_times.is_some() && all.len() > 1 {
-        let text = "--start-times is a table of one vehicle; NAME_cycles.csv next to each log works as well";
+        let text = "--start-times: the manifest has several vehicles, must have 1; for several, place NAME_cycles.csv next to each log";
         return Err(Failure::new(text));
     }
     let chosen = args.shard.choose(&all);
@@ -171,7 +171,7 @@ fn document(outcomes: &[Outcome]) -> serde_json::Value {
     json!({ "version": VERSION, "vehicles": vehicles.collect::<Vec<_>>() })
 }
 
-/// The outcome's name in JSON, and the vehicle's record.
+/// Returns the outcome's name in JSON and the vehicle's record.
 fn named(outcome: &Outcome) -> (&'static str, &VehicleRecord) {
     match outcome {
         Outcome::Replayed(record) => ("replayed", record),
@@ -198,7 +198,7 @@ fn summary(outcomes: &[Outcome], shard: Shard) -> io::Result<()> {
     let Shard { number, of } = shard;
     writeln!(
         out,
-        "part {number} of {of}: {replayed} vehicles replayed, {complete} complete before, {failed} failed; {days:.1} days in all"
+        "shard {number} of {of}: {replayed} vehicles replayed, {complete} already complete, {failed} failed; {days:.1} days in total"
     )
 }
 

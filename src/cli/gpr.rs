@@ -23,13 +23,13 @@ pub(crate) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum GprCommand {
-    /// Predict every row from a model fitted without it, and report the errors
+    /// Cross-validate: predict every row from a model fitted without it, and report the errors
     Cv(Box<CvArgs>),
     /// Fit a model to all rows and save it
     Train(Box<TrainArgs>),
     /// Predict rows with a saved model
     Predict(PredictArgs),
-    /// Forecast future rows from past rows, without inputs of the future
+    /// Forecast future rows from past rows, without future inputs
     Forecast(Box<forecast::ForecastArgs>),
 }
 
@@ -41,7 +41,7 @@ struct CvArgs {
     files: FileArgs,
     #[command(flatten)]
     columns: ColumnArgs,
-    /// Covariance functions, a comma between them; each is an experiment of its own
+    /// Covariance functions, separated by commas; each is validated separately
     #[arg(
         long,
         value_name = "KERNEL,..",
@@ -49,18 +49,18 @@ struct CvArgs {
         default_value = "exponential,squared_exponential,matern52,rational_quadratic"
     )]
     kernel: Vec<Kernel>,
-    /// Parts the rows are cut into at random; each is predicted from the others
+    /// Number of random folds; each is predicted from the others
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<2, 1000>)]
     folds: usize,
     #[command(flatten)]
     model: ModelArgs,
-    /// Write the prediction of every row
+    /// Write the prediction of every row to this file
     #[arg(long, value_name = "FILE.csv")]
     predictions: Option<PathBuf>,
-    /// Draw predicted against measured, a stretch with its interval, and errors, as SVG, into this folder
+    /// Write SVG plots into this folder: predicted against measured, a stretch with its interval, and errors
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -78,10 +78,10 @@ struct TrainArgs {
     kernel: Kernel,
     #[command(flatten)]
     model: ModelArgs,
-    /// Model to write; it holds the rows it learned from
+    /// Model file to write; contains the training rows
     #[arg(short, long, value_name = "MODEL.json")]
     out: PathBuf,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -89,36 +89,36 @@ struct TrainArgs {
 /// Arguments of `gpr predict`.
 #[derive(Debug, clap::Args)]
 struct PredictArgs {
-    /// Model as `gpr train` wrote it
+    /// Model file written by `gpr train`
     #[arg(value_name = "MODEL.json")]
     model: PathBuf,
     #[command(flatten)]
     files: FileArgs,
-    /// Where to: CSV with file, line, inputs, the output where it is known, its mean, standard deviation and the ends of its
-    /// 95 % interval; - is standard output (the summary then goes to standard error)
+    /// File to write: CSV with file, line, inputs, the output where known, its predicted mean and standard deviation, and the ends of
+    /// the 95 % interval; - writes standard output and prints the summary on standard error
     #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
     out: PathBuf,
-    /// Threads [default: one per core]
+    /// Number of threads [default: one per core]
     #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]
     threads: Option<usize>,
-    /// Print one JSON document of the errors
+    /// Print the errors as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// The predicted column and its inputs.
+/// The predicted column and its input columns.
 #[derive(Debug, clap::Args)]
 struct ColumnArgs {
-    /// Column that is predicted, by its name, or without its unit: voltage finds voltage_v
+    /// Column to predict. The unit may be omitted: voltage finds voltage_v
     #[arg(long, value_name = "COLUMN")]
     output: String,
-    /// Columns it is predicted from
+    /// Columns to predict from
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
     inputs: Vec<String>,
 }
 
 impl ColumnArgs {
-    /// Inputs, then the output.
+    /// Reads the inputs, then the output.
     fn table(&self, files: &FileArgs) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
         let wanted = ColumnSelection { columns: &columns, optional: &[], missing: files.missing() };
@@ -126,12 +126,14 @@ impl ColumnArgs {
     }
 }
 
-/// Reads files; rejects a column named twice, which would predict itself.
+/// Reads files; rejects a column given twice, because it would predict itself.
 fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<ColumnTable, Failure> {
     let table = ColumnTable::read(files, wanted, part).map_err(failure)?;
     let names = &table.names[..wanted.columns.len()];
     if let Some((_, twice)) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
-        return Err(Failure::new(format!("column {twice} is named twice, must be an input or an output, once")));
+        return Err(Failure::new(format!(
+            "column {twice} is given twice; give each column once, as an input or as the output"
+        )));
     }
     Ok(table)
 }
@@ -195,7 +197,7 @@ fn train(args: &TrainArgs) -> Result<(), Failure> {
 fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let to_stdout = args.out == Path::new("-");
     if args.json && to_stdout {
-        return Err(Failure::new("--json: needs --out FILE.csv, for both would be written to standard output"));
+        return Err(Failure::new("--json and the predictions cannot both go to standard output; add --out FILE.csv"));
     }
     args.files.check_result(&args.out)?;
     let trained = TrainedModel::load(&args.model, args::threads(args.threads)).map_err(failure)?;
@@ -204,7 +206,7 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let table = ColumnTable::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
-        // The reader of the output has closed it: no failure.
+        // The reader has closed the output early; not an error.
         Err(error) if to_stdout && error.to_string().contains("Broken pipe") => return Ok(()),
         written => written.map_err(failure)?,
     }

@@ -1,4 +1,4 @@
-//! `packwatch history`: the history in the store as a table, JSON or CSV, and the check of its hash chain.
+//! `packwatch history`: lists the stored history as a table, JSON or CSV, and verifies its hash chain.
 
 use std::path::PathBuf;
 
@@ -23,24 +23,24 @@ const LISTED: u32 = 100;
 pub(crate) struct Args {
     #[command(subcommand)]
     what: Option<HistoryCommand>,
-    /// Folder of state and history (default: $STATE_DIRECTORY, else /var/lib/packwatch, or where there is none, that of a daemon from a shell)
+    /// Folder of state and history [default: $STATE_DIRECTORY, else /var/lib/packwatch, else the user's folder that `packwatch run` uses]
     #[arg(long, value_name = "DIR", global = true)]
     state: Option<PathBuf>,
     #[command(flatten)]
     wanted: RowArgs,
-    /// Print one JSON document (cells from 0, times in ns since 1970)
+    /// Print JSON (cells from 0, times in ns since 1970)
     #[arg(long)]
     json: bool,
-    /// Print at most this number of rows, the latest; 0 = all
+    /// Print at most this many rows, the latest; 0 prints all
     #[arg(long, value_name = "N", default_value_t = LISTED)]
     limit: u32,
 }
 
 #[derive(Debug, clap::Subcommand)]
 enum HistoryCommand {
-    /// Write rows as CSV
+    /// Write the rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over all rows; names the first segment (the rows of a day) that was changed
+    /// Verify the hash chain over all rows; reports the first changed segment (the rows of a day)
     Verify(VerifyArgs),
 }
 
@@ -48,35 +48,35 @@ enum HistoryCommand {
 struct ExportArgs {
     #[command(flatten)]
     wanted: RowArgs,
-    /// Output file; - is standard output
+    /// File to write; - writes standard output
     #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
     out: PathBuf,
 }
 
 #[derive(Debug, clap::Args)]
 struct VerifyArgs {
-    /// End of the chain as the daemon logged it ("end of the history's chain"): a history that was written again since does not
-    /// fit it
+    /// Head of the chain as logged by the daemon ("end of the history's chain"). If the history was rewritten since, verification
+    /// fails
     #[arg(long, value_name = "ROWS:HASH")]
     noted: Vec<NotedHead>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-/// A selection of rows.
+/// Selection of rows.
 #[derive(Debug, clap::Args)]
 struct RowArgs {
-    /// Rows of these kinds (default: all)
+    /// Select rows of these kinds [default: all]
     #[arg(long, value_name = "KIND", value_parser = one_of(&KINDS), value_delimiter = ',')]
     kind: Vec<HistoryTable>,
-    /// Rows of this cell, counted from 1
+    /// Select rows of this cell, counted from 1
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MAX_CELLS as i64))]
     cell: Option<u16>,
-    /// Rows from this wall-clock time on, as 2026-04-02T13:08:17 (UTC) or seconds since 1970
+    /// Select rows from this time on: 2026-04-02T13:08:17 (UTC) or seconds since 1970
     #[arg(long, value_name = "WHEN", value_parser = when)]
     since: Option<Timestamp>,
-    /// Rows up to this wall-clock time
+    /// Select rows up to this time
     #[arg(long, value_name = "WHEN", value_parser = when)]
     until: Option<Timestamp>,
 }
@@ -85,11 +85,11 @@ struct RowArgs {
 const KINDS: [NamedValue<HistoryTable>; 7] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
-    ("loss-modes", HistoryTable::LossModes, "Lithium and active material that cells have lost"),
-    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell whose life ends first"),
-    ("model", HistoryTable::Model, "Changes of the cell model that is learned on board"),
+    ("loss-modes", HistoryTable::LossModes, "Lost lithium and active material of cells"),
+    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell that ends first"),
+    ("model", HistoryTable::Model, "Changes of the cell model learned on board"),
     ("alarm", HistoryTable::Alarm, "Alarms"),
-    ("reset", HistoryTable::Reset, "Resets, other packs, damages"),
+    ("reset", HistoryTable::Reset, "Resets, pack replacements, damaged files"),
 ];
 
 impl RowArgs {
@@ -105,7 +105,8 @@ impl RowArgs {
 }
 
 fn when(text: &str) -> Result<Timestamp, String> {
-    stamp::parse_stamp(text).ok_or_else(|| "must be seconds or like 2026-04-02T13:08:17".to_owned())
+    stamp::parse_stamp(text)
+        .ok_or_else(|| "must be seconds since 1970, or a time such as 2026-04-02T13:08:17".to_owned())
 }
 
 /// Runs the command.
@@ -137,13 +138,13 @@ fn list(reader: &HistoryReader, args: &Args) -> Result<(), Failure> {
 
 fn line(entry: &HistoryEntry) -> String {
     let time = stamp::format_utc(Timestamp::from_nanos(entry.wall_ns));
-    // Cells count from 1 in tables.
+    // Tables count cells from 1.
     let cell =
         entry.values.first().and_then(Value::as_u64).map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
     format!("{time:<26}  {:>4}  {:<14}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), describe(entry))
 }
 
-/// The values of a row in words.
+/// Describes the values of a row.
 fn describe(entry: &HistoryEntry) -> String {
     let value = |name: &str| {
         let column = entry.kind.columns().iter().position(|column| *column == name);
@@ -188,7 +189,7 @@ fn describe(entry: &HistoryEntry) -> String {
     filled(words, &value)
 }
 
-/// The words with the values of their fields: `{name:2}` is a number with two decimals, `{name%1}` one in per cent, `{name}` a text.
+/// Fills in fields: `{name:2}` is a number with two decimals, `{name%1}` one in percent, `{name}` a text.
 fn filled<'v>(words: &str, value: &impl Fn(&str) -> &'v Value) -> String {
     let mut parts = words.split('{');
     let mut text = parts.next().unwrap_or_default().to_owned();
@@ -220,7 +221,7 @@ fn document(entry: &HistoryEntry) -> Value {
     row
 }
 
-/// Columns of every row in a CSV.
+/// Columns that every row of a CSV has.
 const OWN_COLUMNS: [&str; 7] = ["kind", "seq", "wall_ns", "utc", "time_ns", "boot", "pack"];
 
 fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
@@ -251,7 +252,7 @@ fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
     file.finish().map_err(|error| fail(&error))
 }
 
-/// Whether the reader of the output has closed the pipe.
+/// Whether the reader has closed the pipe.
 fn is_broken_pipe(error: &csv::Error) -> bool {
     matches!(error.kind(), csv::ErrorKind::Io(error) if error.kind() == std::io::ErrorKind::BrokenPipe)
 }

@@ -1,4 +1,4 @@
-//! `packwatch model`: a cell model as a table, a picture or a file, and two of them compared.
+//! `packwatch model`: shows, plots and writes a cell model, and compares two.
 
 mod compare;
 mod page;
@@ -26,14 +26,14 @@ pub(crate) struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum ModelCommand {
-    /// Show curve, resistances and capacity with their standard deviations, and which measurement would help most
+    /// Show curve, resistances and capacity with their standard deviations, and the most useful next measurement
     Show(ShowArgs),
-    /// Draw curve, slope and resistances with their bands
+    /// Plot curve, slope and resistances with their uncertainty bands
     #[cfg(feature = "lab")]
     Plot(PlotArgs),
-    /// Write a cell model file, which pack.cell_model and score --cell read
+    /// Write a cell model file, for `pack.cell_model` and `score --cell`
     Export(ExportArgs),
-    /// Compare two cell models: curve, resistances, and what their difference means for the SOC
+    /// Compare two cell models: curve, resistances, and the effect on the SOC
     Compare(CompareArgs),
 }
 
@@ -41,7 +41,7 @@ enum ModelCommand {
 struct ShowArgs {
     #[command(flatten)]
     source: SourceArgs,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -51,7 +51,7 @@ struct ShowArgs {
 struct PlotArgs {
     #[command(flatten)]
     source: SourceArgs,
-    /// Picture to write
+    /// SVG file to write
     #[arg(short, long, value_name = "FILE.svg")]
     out: PathBuf,
 }
@@ -60,20 +60,20 @@ struct PlotArgs {
 struct ExportArgs {
     #[command(flatten)]
     source: SourceArgs,
-    /// Cell model to write; - is standard output
+    /// Cell model file to write; - writes standard output
     #[arg(short, long, value_name = "FILE.toml", default_value = "-")]
     out: PathBuf,
 }
 
 #[derive(Debug, clap::Args)]
 struct CompareArgs {
-    /// The first model: as SOURCE of `model show`
+    /// First model; accepts the same as SOURCE of `model show`
     #[arg(value_name = "A")]
     first: PathBuf,
     /// The second model
     #[arg(value_name = "B")]
     second: PathBuf,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }

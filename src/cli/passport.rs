@@ -1,4 +1,4 @@
-//! `packwatch passport`: the JSON of a battery passport, from a store or a replay, with the manufacturer's part merged in.
+//! `packwatch passport`: writes a battery passport as JSON from a store or a replay, merged with the manufacturer's part.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -22,7 +22,7 @@ use crate::replay::{OutputSink, Sinks};
 use crate::store::HistoryReader;
 use packwatch_host::failure::Failure;
 
-/// Largest manufacturer's part, bytes: a passport has some ten thousand.
+/// Largest file with the manufacturer's part, bytes; a passport has about 10 kB.
 const MAX_STATIC_BYTES: u64 = 16 << 20;
 
 /// Standards by name.
@@ -38,39 +38,39 @@ const STANDARDS: [NamedValue<Standard>; 2] = [
 /// Arguments of `passport`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "A value that is not known is left out. Where the standard requires it, nothing is written, and each missing value is \
-                  listed with the reason and with what makes it known. The static part may state everything that packwatch does \
-                  not measure; a value that both have is a fault."
+    after_help = "Unknown values are left out. If the standard requires an unknown value, nothing is written; the error lists \
+    each missing value with the reason and a remedy. The static part may state everything that packwatch does not \
+    measure; a value that both parts have is an error."
 )]
 pub(crate) struct Args {
-    /// Configuration of the pack
+    /// Configuration file of the pack
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst, read one after another as one record
+    /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst; read in this order as one record
     #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
     logs: Vec<PathBuf>,
-    /// Folder of state and history to use instead, also one that a daemon is using
+    /// Folder of state and history to use instead of logs; a running daemon may use it
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     /// Standard of the passport
     #[arg(long, value_name = "STANDARD", value_parser = one_of(&STANDARDS), default_value = "product-condition")]
     form: Standard,
-    /// The part of the passport that no record holds, in the form of the standard: manufacturer, materials, accidents
+    /// Manufacturer's part in the form of the standard: what cannot be measured, such as manufacturer, materials, accidents
     #[arg(long = "static", value_name = "FILE.json")]
     manufacturer: Option<PathBuf>,
-    /// Usable energy of the pack at its certification, kWh; without it there is no state of certified energy (SOCE)
+    /// Usable energy of the pack at certification, kWh; needed for the state of certified energy (SOCE)
     #[arg(long, value_name = "KWH", value_parser = above_0)]
     certified_energy_kwh: Option<f64>,
-    /// Charge that the pack had moved, charged and discharged, before the record began, Ah: 0 for a battery recorded since new
+    /// Charge throughput (charge plus discharge) before the record began, Ah; 0 if the battery was recorded from new
     #[arg(long, value_name = "AH", value_parser = at_least_0)]
     throughput_before_ah: Option<f64>,
-    /// Charge that the pack has moved in all, charged and discharged, Ah, as its own counter says: instead of the record's sum
+    /// Total charge throughput (charge plus discharge) from the pack's own counter, Ah; replaces the sum of the record
     #[arg(long, value_name = "AH", value_parser = at_least_0, conflicts_with = "throughput_before_ah")]
     throughput_ah: Option<f64>,
-    /// Passport to write; - is standard output
+    /// Passport file to write; - writes standard output
     #[arg(short, long, value_name = "FILE.json", default_value = "-")]
     out: PathBuf,
-    /// Write each value's standard deviation, unit and definition, and why values are absent
+    /// Write standard deviation, unit and definition of each value, and the reasons for missing values, to this file
     #[arg(long, value_name = "FILE.json")]
     details: Option<PathBuf>,
     #[command(flatten)]
@@ -113,7 +113,7 @@ impl Args {
             check_place(out, inputs()).map_err(Failure::new)?;
         }
         if self.details.as_ref() == Some(&self.out) {
-            return Err(named(&self.out, "named for two results"));
+            return Err(named(&self.out, "given for two results; each needs its own file"));
         }
         Ok(())
     }
@@ -132,7 +132,7 @@ fn read_static(path: &Path) -> Result<Value, Failure> {
     let file = File::open(path).map_err(|error| named(path, error))?;
     file.take(MAX_STATIC_BYTES + 1).read_to_end(&mut bytes).map_err(|error| named(path, error))?;
     if u64::try_from(bytes.len()).is_ok_and(|length| length > MAX_STATIC_BYTES) {
-        return Err(named(path, format!("more than {MAX_STATIC_BYTES} bytes")));
+        return Err(named(path, format!("larger than {MAX_STATIC_BYTES} bytes")));
     }
     serde_json::from_slice(&bytes).map_err(|error| named(path, error))
 }
@@ -141,7 +141,7 @@ fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity),
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let vehicle = reader.vehicle().map_err(Failure::new)?;
     if vehicle.is_stated() && config.vehicle.is_stated() && vehicle != config.vehicle {
-        return Err(named(folder, format!("is of {vehicle}, the configuration is of {}", config.vehicle)));
+        return Err(named(folder, format!("belongs to {vehicle}, but the configuration to {}", config.vehicle)));
     }
     let record = Record::of_store(&reader).map_err(|error| named(folder, error))?;
     Ok((record, vehicle))
@@ -155,8 +155,8 @@ fn of_replay(args: &Args, config: &Config) -> Result<Record, Failure> {
     let Replayed { source, summary, snapshot } = replaying::replay(&args.logs, &args.input, config, sinks)?;
     if source.has_moved_stamps() {
         return Err(Failure::new(
-            "a log begins before the end of the log before it, so its times are not known: the logs are not in their order, or \
-             one of them counts from its own start",
+            "a log begins before the end of the previous log, so its times are unknown; give the logs in their order, and only logs \
+            that use the same clock",
         ));
     }
     let mut record = record.take();
@@ -179,7 +179,7 @@ fn reading_limits(config: &Config) -> ReadingLimits {
     }
 }
 
-/// Writes a document, indented.
+/// Writes an indented document.
 fn write(path: &Path, document: &Value) -> Result<(), Failure> {
     let mut bytes = Vec::new();
     document.serialize(&mut serde_json::Serializer::pretty(&mut bytes)).map_err(failure)?;

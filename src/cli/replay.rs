@@ -1,4 +1,4 @@
-//! `packwatch replay`: records through the same core as live, or onto an interface.
+//! `packwatch replay`: replays records through the same core as live data, or onto an interface.
 
 mod args;
 mod each;
@@ -37,7 +37,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => replay_all(args, &mut source, config, settings),
     };
     match result {
-        // The reader of our output has closed it: no failure.
+        // The reader has closed our output early; not an error.
         Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         result => result.map_err(failure),
     }
@@ -78,7 +78,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
 }
 
 fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
-    // Onto an interface the frames keep their own time; through the core only the result matters.
+    // Frames played onto an interface keep their timing; a replay through the core need not.
     let speed = args.speed.or(args.to.is_some().then_some(1.0));
     Ok(ReplaySettings {
         speed: speed.filter(|speed| speed.is_finite()),
@@ -96,7 +96,7 @@ fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
     })
 }
 
-/// Settings for the wanted part, as fast as possible, with nothing stored.
+/// Settings for the selected part, at full speed, with nothing stored.
 fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
     let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     ReplaySettings { from: args.from, until: args.until, ..plain }
@@ -106,7 +106,7 @@ fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
     path.map(ResultFile::create).transpose()
 }
 
-/// A file of events, which begins with the vehicle as that of `run` does.
+/// Creates a file of events; it begins with the vehicle, as the one of `run`.
 fn events_file(path: Option<&Path>, config: &Config) -> io::Result<Option<ResultFile>> {
     let mut file = create(path)?;
     if let Some(file) = &mut file {

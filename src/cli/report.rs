@@ -1,4 +1,4 @@
-//! `packwatch report`: a page on the condition and history of a battery, from a store's history or from a replay.
+//! `packwatch report`: writes an HTML page on the condition and history of a battery, from a store or a replay.
 
 use std::cell::RefCell;
 use std::fs;
@@ -22,27 +22,27 @@ use crate::store::HistoryReader;
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Configuration; with --state it gives limits and rated capacity, and may be left out
+    /// Configuration file. Optional with --state; then it adds limits and the rated capacity
     #[arg(short, long, value_name = "FILE", required_unless_present = "state")]
     config: Option<PathBuf>,
-    /// Journals, candump logs or CSV files to replay, also .gz or .zst, read one after another; - is standard input
+    /// Journals, candump logs or CSV files to replay, also .gz or .zst, read in this order as one record; - reads standard input
     #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
     logs: Vec<PathBuf>,
-    /// Folder of state and history to report on instead, also one that a daemon is using
+    /// Folder of state and history to report on instead of logs; a running daemon may use it
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
-    /// Page to write; - is standard output
+    /// HTML file to write; - writes standard output
     #[arg(short, long, value_name = "FILE.html", default_value = "report.html")]
     out: PathBuf,
-    /// Write every picture as SVG into this folder as well
+    /// Also write every plot as SVG into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Truth to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
-    /// or both, and time_s (s), start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data; with a column
-    /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
+    /// True values to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah), soc (fraction), or
+    /// both, and the time in the clock of the data: time_s (s), or start or date (such as 2008-04-02T13:08:17, UTC). If it has a column
+    /// cell (as the truth of simulate), the capacity is from full to empty; otherwise it was measured under load
     #[arg(long, value_name = "TABLE.csv")]
     reference: Option<PathBuf>,
-    /// Title of the page [default: the vehicle, else the name of the log or folder]
+    /// Title of the page [default: vehicle, else name of the log or folder]
     #[arg(long)]
     title: Option<String>,
     #[command(flatten)]
@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let (data, provenance, vehicle, snapshot) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
-        (None, None) => return Err(Failure::new("neither --state nor -c with logs, one must be given")),
+        (None, None) => return Err(Failure::new("give --state DIR, or --config FILE and logs")),
     };
     let mut provenance = provenance;
     provenance.extend(vehicle.is_stated().then(|| ("Vehicle".to_owned(), vehicle.to_string())));
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     report::write_plots(folder, &data, &context).map(drop).map_err(failure)
 }
 
-/// The configuration as it is written; with drop-ins, merged.
+/// Text of the configuration, merged with its drop-ins.
 fn config_text(path: &Path) -> Result<String, Failure> {
     match ConfigFiles::find(path)?.drop_ins.is_empty() {
         true => fs::read_to_string(path).map_err(failure),
@@ -90,7 +90,7 @@ fn config_text(path: &Path) -> Result<String, Failure> {
 }
 
 impl Args {
-    /// Checks the arguments that depend on each other.
+    /// Checks arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
         let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
         check_place(&self.out, inputs).map_err(Failure::new)
@@ -107,7 +107,7 @@ impl Args {
     }
 }
 
-/// What a report is made of: data, provenance, vehicle and the last state.
+/// Data, provenance, vehicle and last state of a report.
 type Parts = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
 
 /// Lines of the provenance: name and value.
@@ -142,7 +142,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
     });
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let Replayed { summary, snapshot, .. } = replaying::replay(&args.logs, &args.input, config, sinks)?;
-    // The replay has ended and with it the closure that shared the data.
+    // The replay has ended, and with it the closure that shared the data.
     let mut data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     data.set_current_offset(summary.current_offset_a.zip(summary.current_offset_std_a));
     Ok((data, provenance(args, &summary), config.vehicle.clone(), snapshot))
@@ -152,7 +152,7 @@ fn provenance(args: &Args, summary: &ReplaySummary) -> Provenance {
     let mut lines: Provenance =
         args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
     lines.push(("Frames used".to_owned(), summary.log.frames.to_string()));
-    lines.push(("Bad readings of signals that came back".to_owned(), summary.bad_readings.to_string()));
+    lines.push(("Bad readings of signals that later recovered".to_owned(), summary.bad_readings.to_string()));
     lines.extend(summary.notes.iter().map(|note| ("Note".to_owned(), note.clone())));
     lines
 }

@@ -1,4 +1,4 @@
-//! `packwatch rul`: remaining useful life from measured capacity histories, now or at parts of the life.
+//! `packwatch rul`: forecasts the remaining useful life from measured capacity histories, now or at points of the life.
 
 mod report;
 
@@ -14,35 +14,36 @@ use packwatch_host::failure::Failure;
 /// Arguments of `rul`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "A file with a type column counts its discharges as full cycles; without one its days count, and any of \
-                  them may have been rest. The end of life is where the non-increasing line of least squares through all \
-                  capacities passes the threshold: a passing recovery after a rest neither delays nor hastens it. Forecasts at \
-                  parts of the life use no later reading."
+    after_help = "If a file has a type column, life is counted in full cycles, one per discharge; otherwise in days, which \
+    include rest. The end of life is where a non-increasing least-squares line through all capacities crosses \
+    the threshold, so a temporary recovery after a rest does not change it. Forecasts within the life use no \
+    later readings."
 )]
 pub(crate) struct Args {
-    /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, rising), capacity_ah or
-    /// capacity_ah_source (Ah), and where there are type (charge, discharge) and duration_s
+    /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, ascending), capacity_ah or capacity_ah_source
+    /// (Ah), and optionally type (charge, discharge) and duration_s
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Capacity at the end of life, Ah, or per cent of the file's first: 1.4 or "70 %"; several make a forecast each
+    /// Capacity at the end of life: Ah, or percent of the first capacity in the file, for example 1.4 or "70 %". Several give a
+    /// forecast each
     #[arg(long, value_name = "AH|PERCENT", required = true, value_delimiter = ',', value_parser = Threshold::from_str)]
     end_of_life: Vec<Threshold>,
-    /// Parts of the life, per cent, at which forecasts are made and judged: 40,50,60,70,80 [default: one forecast, now]
+    /// Points of the life at which to forecast and score, percent: 40,50,60,70,80 [default: one forecast, now]
     #[arg(long, value_name = "PERCENT,..", value_delimiter = ',', value_parser = part)]
     at: Vec<f64>,
-    /// How far the median may be from the truth to pass, fraction of what truly remained
+    /// Largest allowed error of the median, as a fraction of the true remaining life
     #[arg(long, value_name = "FRACTION", default_value_t = 0.2, value_parser = fraction)]
     alpha: f64,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    // One per per cent.
+    // At most one for each percent.
     if args.at.len() > 99 {
-        return Err(Failure::new(format!("--at: {} parts, must be at most 99", args.at.len())));
+        return Err(Failure::new(format!("--at: {} points, must be at most 99", args.at.len())));
     }
     check_distinct(&args.files)?;
     let shown = if args.at.is_empty() {
@@ -72,14 +73,14 @@ fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> R
     Ok(all)
 }
 
-/// Per cent above 0 and below 100, as a fraction.
+/// Parses a percentage above 0 and below 100 to a fraction.
 fn below_100(percent: &str) -> Option<f64> {
     finite(percent).ok().filter(|percent| *percent > 0.0 && *percent < 100.0).map(|percent| percent / 100.0)
 }
 
-/// Per cent to a part.
+/// Parses a percentage to a fraction.
 fn part(text: &str) -> Result<f64, String> {
-    below_100(text.trim().trim_end_matches('%')).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
+    below_100(text.trim().trim_end_matches('%')).ok_or_else(|| "must be a percentage above 0 and below 100".to_owned())
 }
 
 #[cfg(test)]
@@ -87,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thresholds_are_ampere_hours_or_per_cent() {
+    fn threshold_accepts_ampere_hours_or_percent() {
         for (text, expected) in [
             ("1.4", Threshold::AmpereHours(1.4)),
             ("1.4 Ah", Threshold::AmpereHours(1.4)),

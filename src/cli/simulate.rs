@@ -1,8 +1,8 @@
-//! `packwatch simulate`: a pack with a known true state, as frames of the configured DBC.
+//! `packwatch simulate`: simulates a pack with known true state, as frames of the configured DBC.
 //!
-//! Out: a candump log (`-o`, compressed when the name ends in `.gz`) or frames onto an interface (`--to`), and the
-//! truth as CSV (`--truth`). One seed gives the same bytes on every machine. Frames of one moment follow each other at the
-//! pace of a 1 Mbit/s bus, or closer where the next sample requires it.
+//! Output: a candump log (`-o`, compressed if the name ends in `.gz`) or frames on an interface (`--to`), and the truth as
+//! CSV (`--truth`). The same seed gives the same bytes on every machine. Frames of the same sample are spaced as on a 1 Mbit/s
+//! bus, or closer if the next sample requires it.
 
 mod output;
 mod player;
@@ -28,25 +28,25 @@ const FRAME_SPACING_NS: i64 = 130_000;
 /// Arguments of `simulate`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Scenario of the load
+    /// Load scenario
     #[arg(value_parser = one_of(&settings::SCENARIOS))]
     scenario: Scenario,
-    /// Configuration whose DBC, cell model and number of cells are used
+    /// Configuration file with the DBC, the cell model and the number of cells
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Candump log to write; compressed when the name ends in .gz; - for standard output
+    /// Candump log to write, compressed if the name ends in .gz; - writes standard output
     #[arg(short, long, value_name = "LOG", required_unless_present = "to", conflicts_with = "to")]
     out: Option<PathBuf>,
-    /// Play the frames onto this CAN interface instead
+    /// Send the frames on this CAN interface instead
     #[arg(long, value_name = "INTERFACE")]
     to: Option<String>,
-    /// How many times faster than real time frames are played; 0 = as fast as the bus takes them
+    /// Play frames this many times faster than real time; 0 = as fast as the bus accepts them
     #[arg(long, default_value_t = 1.0, value_parser = settings::non_negative, requires = "to")]
     speed: f64,
-    /// CSV to write the true state to; compressed when the name ends in .gz
+    /// Write the true state to this CSV, compressed if the name ends in .gz
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Seconds between rows of the truth
+    /// Time between rows of the truth, s
     #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = settings::positive)]
     truth_period: f64,
     /// Unix time of the first frame, s
@@ -70,7 +70,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let settings = settings_for(args, &config)?;
     let monitor = &config.monitor;
     if !monitor.modules.is_empty() {
-        return Err(Failure::new("[[pack.module]] cannot be simulated: all simulated cells are of one kind"));
+        return Err(Failure::new(
+            "[[pack.module]] cannot be simulated, because all simulated cells are of one kind; remove it from the configuration",
+        ));
     }
     let wiring = wiring(&monitor.sample);
     let sensors = u16::try_from(wiring.temperature_at.len()).unwrap_or(u16::MAX);
@@ -123,7 +125,7 @@ impl Sink {
                 let names = config.interface_names();
                 Ok(Self::Log(LogWriter::create(path, names)?))
             }
-            (None, None) => Err(Failure::new("neither --out nor --to, one must be given")),
+            (None, None) => Err(Failure::new("give --out LOG or --to INTERFACE")),
         }
     }
 
@@ -142,7 +144,7 @@ impl Sink {
     }
 }
 
-/// The scenario's defaults for the configured cell, with what the command line changes.
+/// Settings of the scenario for the configured cell, with the changes from the command line.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
     let mut settings = Settings::of(args.scenario, capacity_ah);
@@ -152,7 +154,9 @@ fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     args.changes.apply(&mut settings)?;
     if settings.pack.cells > series {
         let (found, file) = (settings.pack.cells, args.config.display());
-        return Err(Failure::new(format!("--cells {found}, {file} has signals for {series}")));
+        return Err(Failure::new(format!(
+            "--cells {found}, must be at most {series}, because {file} has signals for {series} cells"
+        )));
     }
     Ok(settings)
 }
@@ -164,7 +168,7 @@ fn cells_in_series(sample: &SampleConfig) -> u16 {
     }
 }
 
-/// A temperature sensor sits on the first cell it serves.
+/// Places each temperature sensor on the first cell it serves.
 fn wiring(sample: &SampleConfig) -> Wiring {
     let sensors = sample.sensor_of_cell.iter().flatten().map(|s| s.0 + 1).max().unwrap_or(0);
     let cell_of = |sensor| {
@@ -174,7 +178,7 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
 }
 
-/// Makes the frames of a moment, those with the current first: the voltages contain its drop.
+/// Encodes the frames of a moment. Frames with the current come first, because the voltages contain its drop.
 struct FrameMaker {
     encoder: InputEncoder,
     protector: InputProtector,

@@ -23,52 +23,53 @@ use packwatch_host::failure::{EXIT_CONFIG, Failure};
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum EndOfLifeArg {
     Ah(f64),
-    /// Part of the rated capacity.
+    /// Fraction of the rated capacity.
     Part(f64),
 }
 
 /// Arguments of `whatif`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Each log is replayed once for all settings of alarms, and once more per combination of other settings \
-                  (and of input_missing). The first rows are the configuration as it is.\n\n\
-                  lead: from the first true raise to the end of life. missed: the end came without a true raise. false alarm: a raise \
-                  with which the end did not come within --horizon; without --horizon, a raise in a log that has no end of life. open: \
-                  such a raise, but the log ends before the horizon does. false raise: capacity_low raised while the true capacity of the \
-                  cell was above the threshold. flickers: clears before the end. Leads are medians over the logs (5 to 95 %).\n\n\
-                  The end of life is judged by a truth next to the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv as \
-                  score --cycles takes it, or --truth), else by the learned capacity; the table shows which. The sections of a CSV are dated by \
-                  --start-times, else by NAME_cycles.csv next to it."
+    after_help = "Each log is replayed once for all alarm settings, and once more for each combination of other settings (and of \
+    input_missing). The first rows show the configuration without changes.\n\n\
+    lead: time from the first true raise to the end of life. missed: the end of life came without a true raise. false alarm: \
+    the end of life did not follow a raise within --horizon; without --horizon, a raise in a log without end of life. open: the \
+    log ends before the horizon of a raise. false raise: capacity_low was raised while the true capacity of the cell was above \
+    the threshold. flickers: clears before the end of life. Leads are medians over the logs (5 to 95 %).\n\n\
+    The end of life comes from a truth file next to the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv of score \
+    --cycles, or --truth), else from the learned capacity; the table shows which. Sections of a CSV get their times from \
+    --start-times, else from NAME_cycles.csv next to the CSV."
 )]
 pub(crate) struct Args {
-    /// Configuration
+    /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Values to try, as capacity_low.warning=1.5,1.6: a rule's info, warning, severe (also .set, .clear), threshold (the gravest it
-    /// has), probability, debounce_s and so on, or any key, as estimator.voltage_noise_v=0.005; several make a grid
+    /// Values to try, for example capacity_low.warning=1.5,1.6. KEY is a rule with info, warning or severe (also .set, .clear),
+    /// threshold (of the highest configured severity), probability, debounce_s and so on; or any configuration key, such as
+    /// estimator.voltage_noise_v. Several options form a grid
     #[arg(long = "set", value_name = "KEY=V1,V2")]
     set: Vec<Choice>,
-    /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %" (default:
-    /// capacity.end_of_life of the configuration). A number given here is one of the usable capacity where [usable] is configured
+    /// Capacity of the weakest cell at its end of life: Ah, or percent of the rated capacity such as "70 %" [default:
+    /// capacity.end_of_life of the configuration]. If [usable] is configured, a value given here is a usable capacity
     #[arg(long, value_name = "AH|PERCENT", value_parser = end_of_life)]
     end_of_life: Option<EndOfLifeArg>,
-    /// A raise is false when the end of life does not come this soon after it: equivalent full cycles, or days as 90d (default: the
-    /// rest of the log)
+    /// A raise is false if the end of life does not follow within this time: equivalent full cycles, or days such as 90d [default:
+    /// rest of the log]
     #[arg(long, value_name = "CYCLES|DAYSd", value_parser = horizon)]
     horizon: Option<Horizon>,
-    /// CSV of the true capacities, one per log in the logs' order (default: the CSV next to the log)
+    /// CSV of true capacities, one per log in the same order [default: the CSV next to the log]
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Vec<PathBuf>,
-    /// Rules in the table (default: those of --set; all when --set names another key, or is not given)
+    /// Rules to show [default: those of --set; all if --set is absent or changes other keys]
     #[arg(long, value_name = "RULE", value_delimiter = ',', value_parser = rule_parser(), hide_possible_values = true)]
     rule: Vec<Rule>,
-    /// Show every log in addition to the summary (as for a single log)
+    /// Show every log in addition to the summary, as for a single log
     #[arg(long)]
     each: bool,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Write a row per log, setting and alarm as CSV; - is standard output
+    /// Write a row per log, setting and alarm to this CSV; - writes standard output
     #[arg(long, value_name = "FILE.csv")]
     csv: Option<PathBuf>,
     #[command(flatten)]
@@ -83,7 +84,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let plain = &grid.variants[0].config.monitor;
     let rated_ah = plain.model.rated_capacity_ah;
     if args.logs.is_stdin() && grid.replays > 1 {
-        return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
+        return Err(Failure::new(format!(
+            "-: standard input can be read only once, but these settings need {} replays; give a file",
+            grid.replays
+        )));
     }
     let open = |config: &Config, logs: &[PathBuf]| args.logs.open(config, logs);
     let settings = WhatifSettings {
@@ -93,7 +97,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             Some(EndOfLifeArg::Part(part)) => part * rated_ah,
             None => plain.health.end_of_life_ah,
         },
-        // The configured end of life is one of the capacity; for a number given here `[usable]` decides which capacity is meant.
+        // The configured end of life is a capacity; one given here is a usable capacity if `[usable]` is configured.
         judges_usable: args.end_of_life.is_some(),
         horizon: args.horizon,
         jobs: args.logs.threads(),
@@ -116,7 +120,9 @@ impl Args {
         self.logs.check()?;
         let (truths, logs) = (self.truth.len(), self.logs.logs.len());
         if truths != 0 && truths != logs {
-            return Err(Failure::new(format!("--truth given {truths} times for {logs} logs, must be once per log")));
+            return Err(Failure::new(format!(
+                "--truth is given {truths} times, must be once for each of the {logs} logs"
+            )));
         }
         if let Some(csv) = &self.csv {
             let inputs = self.logs.logs.iter().chain(&self.truth).chain([&self.config]);
@@ -138,7 +144,7 @@ impl Args {
         .collect()
     }
 
-    /// Rules in the table.
+    /// Rules to show.
     fn rules(&self, grid: &variants::VariantGrid) -> Vec<Rule> {
         let named = if self.rule.is_empty() { &grid.rules } else { &self.rule };
         let all = self.rule.is_empty() && (grid.other_keys || grid.rules.is_empty());
@@ -159,14 +165,14 @@ impl Args {
 fn end_of_life(text: &str) -> Result<EndOfLifeArg, String> {
     match text.trim().strip_suffix('%') {
         Some(digits) => percent(digits).map(|percent| EndOfLifeArg::Part(percent / 100.0)),
-        None => {
-            above_0(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned())
-        }
+        None => above_0(text)
+            .map(EndOfLifeArg::Ah)
+            .map_err(|_| "must be Ah above 0, or a percentage such as \"70 %\"".to_owned()),
     }
 }
 
 fn horizon(text: &str) -> Result<Horizon, String> {
-    let fault = |_| "must be equivalent full cycles above 0, or days like 90d".to_owned();
+    let fault = |_| "must be equivalent full cycles above 0, or days such as 90d".to_owned();
     match text.trim().strip_suffix('d') {
         Some(days) => above_0(days).map(Horizon::Days).map_err(fault),
         None => above_0(text).map(Horizon::Cycles).map_err(fault),
@@ -178,7 +184,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn end_of_life_and_horizon_have_units() {
+    fn end_of_life_and_horizon_accept_units() {
         assert_eq!((end_of_life("1.4"), end_of_life("70 %")), (Ok(EndOfLifeArg::Ah(1.4)), Ok(EndOfLifeArg::Part(0.7))));
         assert!(["0", "-1", "x", "120 %", "NaN"].iter().all(|text| end_of_life(text).is_err()));
         assert_eq!((horizon("30"), horizon("90d")), (Ok(Horizon::Cycles(30.0)), Ok(Horizon::Days(90.0))));

@@ -57,7 +57,9 @@ impl CellModel {
             let (low, high) = chemistry.usual_voltages_v();
             let Label { voltage_min_v, voltage_max_v, .. } = label;
             let name = chemistry.name();
-            data(format!("no cell of {name} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {low} and {high} V"))
+            data(format!(
+                "{voltage_min_v} to {voltage_max_v} V is not a plausible range for {name} (typical: {low} to {high} V)"
+            ))
         })
     }
 

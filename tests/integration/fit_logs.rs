@@ -122,7 +122,7 @@ fn what_a_fit_to_logs_needs_is_named() {
     let (code, _, error) = run(&[&["score", short][..], &unlike].concat());
     assert_eq!(code, Some(78), "{error}");
     assert!(
-        error.contains("no cell of lfp-graphite is empty at 3.9 V and full at 4.4 V; usual are 2.5 and 3.65 V"),
+        error.contains("3.9 to 4.4 V is not a plausible range for lfp-graphite (typical: 2.5 to 3.65 V)"),
         "{error}"
     );
 }

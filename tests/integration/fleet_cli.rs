@@ -79,7 +79,7 @@ fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
     let fleet = Fleet::new();
     let printed = fleet.run("whole", &[]);
     assert!(printed.contains("failed: broken: ") && printed.contains("logs/broken.log: holds no record"), "{printed}");
-    assert!(printed.contains("part 1 of 1: 6 vehicles replayed, 0 complete before, 1 failed"), "{printed}");
+    assert!(printed.contains("shard 1 of 1: 6 vehicles replayed, 0 already complete, 1 failed"), "{printed}");
     let whole = fleet.merged(&["whole"], "merged");
     for shard in ["3/4", "1/4", "4/4", "2/4"] {
         fleet.run(&format!("part{}", &shard[..1]), &["--shard", shard, "--jobs", "1"]);
@@ -143,20 +143,20 @@ fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
     let outcomes = document["vehicles"].as_array().unwrap();
     let count = |word: &str| outcomes.iter().filter(|vehicle| vehicle["outcome"] == word).count();
     let kept: usize =
-        printed.split(" complete before").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
+        printed.split(" already complete").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
     // The broken log may be one of those that have a record.
     assert!((before - 1..=before).contains(&kept) && kept > 0, "{before} were complete: {printed}");
     assert_eq!((count("complete"), count("failed")), (6, 1), "a vehicle that failed is tried again");
     assert!(wanted == fleet.merged(&["killed"], "continued"));
 
     // Another way of reading, other logs: replayed again.
-    assert!(fleet.run("killed", &["--sleep-gap", "1000"]).contains("6 vehicles replayed, 0 complete before"));
+    assert!(fleet.run("killed", &["--sleep-gap", "1000"]).contains("6 vehicles replayed, 0 already complete"));
     fs::write(
         fleet.path("fleet.jsonl"),
         fs::read_to_string(fleet.path("fleet.jsonl")).unwrap().replace("\"bytes\":", "\"bytes\":1"),
     )
     .unwrap();
-    assert!(fleet.run("killed", &[]).contains("6 vehicles replayed, 0 complete before"));
+    assert!(fleet.run("killed", &[]).contains("6 vehicles replayed, 0 already complete"));
 }
 
 #[test]
@@ -226,7 +226,7 @@ fn a_vehicle_may_have_a_configuration_of_its_own() {
     fs::write(fleet.path("fleet.jsonl"), &own).unwrap();
     let printed = fleet.run("out", &[]);
     assert!(printed.contains("failed: one: missing.toml"), "{printed}");
-    assert!(printed.contains("5 vehicles replayed, 0 complete before, 2 failed"), "{printed}");
+    assert!(printed.contains("5 vehicles replayed, 0 already complete, 2 failed"), "{printed}");
     fs::write(fleet.path("fleet.jsonl"), own.replace("missing.toml", config().to_str().unwrap())).unwrap();
-    assert!(fleet.run("out", &[]).contains("1 vehicles replayed, 5 complete before, 1 failed"));
+    assert!(fleet.run("out", &[]).contains("1 vehicles replayed, 5 already complete, 1 failed"));
 }

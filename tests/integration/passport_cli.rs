@@ -580,7 +580,7 @@ fn a_value_of_a_clock_that_was_not_set_is_not_dated() {
     };
     assert!(said(&["unset.log"]).contains("the record has no dates"));
     let moved = said(&["set.log", "unset.log"]);
-    assert!(moved.contains("a log begins before the end of the log before it"), "{moved}");
+    assert!(moved.contains("a log begins before the end of the previous log"), "{moved}");
 }
 
 /// What a peer says of a passport; `None`, said on the output, where there is none.

@@ -238,7 +238,7 @@ fn the_command_forecasts_now_and_says_what_it_cannot_judge() {
     assert_eq!(judged["total"]["within_alpha"], 1.0);
     let text = command(&[file, "--end-of-life", "1.5", "--at", "50"]).success();
     let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
-    assert!(text.contains("does not fall through 1.500 Ah for good (least capacity 1.610 Ah): not judged"), "{text}");
+    assert!(text.contains("does not stay below 1.500 Ah (least capacity 1.610 Ah): not scored"), "{text}");
 }
 
 #[test]

@@ -8,27 +8,27 @@ use crate::lab::gpr::MissingPolicy;
 use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_NEIGHBOURS};
 use packwatch_host::failure::Failure;
 
-/// Below the options.
+/// Text below the options.
 pub(super) const GRAMMAR: &str = "\
-KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_quadratic (a dash does for a low line), or sums and \
-products of them with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". A straight line in the \
-inputs is no kernel but a basis: --basis linear.\n\n\
-Columns are found by their name, or by their name without its unit. Length scales are in standard deviations of the inputs. The \
-95 % interval is calibrated on training rows, each predicted without itself.";
+KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_quadratic (or with dashes), or a sum or product of \
+kernels with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". For a linear trend in the inputs, use \
+--basis linear.\n\n\
+Columns are found by name, with or without unit. Length scales are in standard deviations of the inputs. The 95 % interval is \
+calibrated on training rows, each predicted without itself.";
 
 /// Files with rows.
 #[derive(Debug, clap::Args)]
 pub(super) struct FileArgs {
-    /// CSV files (.gz, .zst) with a heading; their rows follow one another
+    /// CSV files (.gz, .zst) with a heading, read in this order
     #[arg(required = true, value_name = "FILE.csv")]
     pub(super) files: Vec<PathBuf>,
-    /// Leave rows out that lack a value (empty or NaN), and report how many [default: fail with file and line]
+    /// Skip rows with a missing value (empty or NaN) and report their number [default: fail with file and line]
     #[arg(long)]
     skip_missing: bool,
 }
 
 impl FileArgs {
-    /// Checks that a result can be written and is none of these files.
+    /// Checks that the result can be written and is not an input file.
     pub(super) fn check_result(&self, result: &Path) -> Result<(), Failure> {
         check_place(result, self.files.iter()).map_err(Failure::new)
     }
@@ -38,12 +38,12 @@ impl FileArgs {
     }
 }
 
-/// Form of the model, on the command line.
+/// Form of the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum FormName {
-    /// All rows with all: up to some thousands
+    /// All rows with all rows; up to a few thousand rows
     Exact,
-    /// Every row with its nearest (Vecchia): any number of rows
+    /// Every row with its nearest rows (Vecchia); any number of rows
     Nearest,
 }
 
@@ -57,28 +57,28 @@ const BASES: [NamedValue<Basis>; 3] = [
 /// Settings of a model.
 #[derive(Debug, clap::Args)]
 pub(super) struct ModelArgs {
-    /// Mean function
+    /// Mean function of the model
     #[arg(long, value_parser = one_of(&BASES), default_value = "constant")]
     basis: Basis,
-    /// A length scale for every input instead of one for all
+    /// Fit a length scale for every input instead of a common one
     #[arg(long)]
     ard: bool,
-    /// Approximation of the covariance of many rows [default: exact up to 2000 rows, else nearest]
+    /// Form of the covariance matrix [default: exact up to 2000 rows, else nearest]
     #[arg(long, value_enum)]
     form: Option<FormName>,
-    /// Neighbours of a row in the form nearest
+    /// Neighbours of a row with --form nearest
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = whole::<1, MAX_NEIGHBOURS>)]
     neighbours: usize,
-    /// Further searches for hyperparameters, from random starts
+    /// Additional searches for hyperparameters, from random starts
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole::<0, 100>)]
     restarts: usize,
-    /// Most steps of a search
+    /// Most steps of a hyperparameter search
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = whole::<1, 10_000>)]
     max_iterations: usize,
-    /// Seed of folds, starts, and orders
+    /// Seed of folds, starts and orders
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(super) seed: u64,
-    /// Threads [default: one per core]
+    /// Number of threads [default: one per core]
     #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]
     threads: Option<usize>,
 }
@@ -100,7 +100,7 @@ impl ModelArgs {
         settings
     }
 
-    /// Whether the form follows from the number of rows.
+    /// Whether the form is chosen by the number of rows.
     pub(super) fn by_rows(&self) -> bool {
         self.form.is_none()
     }

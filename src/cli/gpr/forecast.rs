@@ -25,43 +25,43 @@ use packwatch_host::failure::Failure;
 pub(super) struct ForecastArgs {
     #[command(flatten)]
     files: FileArgs,
-    /// Columns that are forecast
+    /// Columns to forecast
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
     outputs: Vec<String>,
-    /// Further columns whose past is used; their future is not needed
+    /// Additional columns whose past is used; their future is not needed
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',')]
     inputs: Vec<String>,
-    /// Values of each column that a forecast uses: the one at the origin and those before it
+    /// Values of each column that a forecast uses, counted back from the origin
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<1, MAX_LAGS>)]
     lags: usize,
-    /// Rows ahead: forecasts of 1 to N rows, of more than 10 for 10 of them, spread evenly in ratio
+    /// Rows to forecast ahead. Up to 10: every horizon from 1 to N; more: 10 horizons, spaced geometrically
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = whole::<1, MAX_STEPS>)]
     steps: usize,
-    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast the unknown future
+    /// Rows known at the origin, percent; forecasts are scored on later rows. 100 forecasts the unknown future
     #[arg(long, value_name = "PERCENT", default_value_t = 70.0, value_parser = percent)]
     origin: f64,
-    /// Take every N-th row only (of each part)
+    /// Use only every N-th row of each part
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole::<1, 1_000_000>)]
     every: usize,
-    /// Column whose value separates parts that do not belong together; none = there is no such column [default: cycle, segment
-    /// or ref where there is one]
+    /// Column whose value separates unrelated parts; none disables the separation [default: cycle, segment or ref, if there is such a
+    /// column]
     #[arg(long, value_name = "COLUMN")]
     part: Option<String>,
     /// Covariance function
     #[arg(long, value_name = "KERNEL", default_value = "exponential")]
     kernel: Kernel,
-    /// Most past moments each forecast learns from, taken evenly from all there are
+    /// Most past moments that each forecast learns from, evenly selected
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = whole::<20, 20_000>)]
     rows: usize,
     #[command(flatten)]
     model: ModelArgs,
-    /// Write every forecast made
+    /// Write every forecast to this file
     #[arg(long, value_name = "FILE.csv")]
     predictions: Option<PathBuf>,
-    /// Draw the fan at the origin, error and coverage over the rows ahead, as SVG, into this folder
+    /// Write SVG plots into this folder: the fan at the origin, error and coverage over the horizon
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Print one JSON document
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
@@ -102,7 +102,7 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
 }
 
 impl ForecastArgs {
-    /// Outputs, inputs, and the time where there is one.
+    /// Reads outputs, inputs and, if present, the time.
     fn table(&self) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.outputs.iter().chain(&self.inputs).cloned().collect();
         let time = ["time".to_owned()];
@@ -150,7 +150,7 @@ impl ForecastReport<'_> {
                 let (median, low, high) = (short(steps.median), short(steps.range.0), short(steps.range.1));
                 writeln!(
                     out,
-                    "note: rows are not evenly apart: {} moves by {median} (5 to 95 %: {low} to {high}); a step is a row",
+                    "note: rows are unevenly spaced: {} advances by {median} (5 to 95 %: {low} to {high}); a step is one row",
                     self.time()
                 )
             }
@@ -178,7 +178,7 @@ impl ForecastReport<'_> {
     }
 }
 
-/// Prints the errors of forecasts made after the origin.
+/// Prints the errors of scored forecasts.
 fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
     let heads =
         ["ahead", "forecasts", "RMSE", "persistence", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];

@@ -17,7 +17,7 @@ pub(super) const VERSION: u32 = 1;
 /// Parts of a fold in the progress bar.
 const TICKS: usize = 100;
 
-/// A progress bar over a number of fits.
+/// Creates a progress bar over a number of fits.
 pub(super) fn fit_bar(fits: usize) -> ProgressBar {
     progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
 }
@@ -38,7 +38,7 @@ pub(super) fn show_fits(bar: &ProgressBar, fits: usize, what: &str) {
     bar.set_message(what.to_owned());
 }
 
-/// A form in words.
+/// Name of a form.
 pub(super) fn form(form: Form) -> String {
     match form {
         Form::Exact => "exact".to_owned(),
@@ -78,7 +78,7 @@ pub(super) fn score_json(s: &PredictionScore) -> Value {
     })
 }
 
-/// A number with four digits that matter.
+/// Formats a number with four significant digits.
 pub(super) fn short(value: f64) -> String {
     let digits = (3.0 - value.abs().max(1e-12).log10().floor()).clamp(0.0, 9.0) as usize;
     format!("{value:.digits$}")
@@ -98,7 +98,7 @@ fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
 
-/// Matrices with jitter, and the most of it, over the folds.
+/// Number of matrices with jitter, and the largest jitter, over the folds.
 fn jitter(validated: &CrossValidation) -> Jitter {
     validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
         matrices: all.matrices + fold.jitter.matrices,
@@ -184,7 +184,7 @@ impl CvReport<'_> {
     }
 }
 
-/// A model that was trained.
+/// Report on a trained model.
 pub(super) struct TrainReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,
@@ -236,7 +236,7 @@ impl TrainReport<'_> {
     }
 }
 
-/// Predictions of a saved model.
+/// Report on predictions of a saved model.
 pub(super) struct PredictReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,

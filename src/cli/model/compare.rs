@@ -7,10 +7,10 @@ use crate::cell::model_comparison::{AtTemperature, Difference};
 use crate::cli::common::output;
 use crate::config::cell_model::SourcedModel;
 
-/// A model with its name for people.
+/// A model with its display name.
 type Named<'a> = (&'a str, &'a SourcedModel);
 
-/// As text.
+/// Formats the comparison as text.
 pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]) -> String {
     let name = |(source, sourced): Named<'_>| format!("{source}: {}", sourced.model.name);
     let mut page = format!("A  {}\nB  {}\n\nB less A\n", name(first), name(second));
@@ -22,7 +22,7 @@ pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]
     let rows = rows.into_iter().map(|(what, value)| vec![what.to_owned(), value]);
     page.push_str(&output::table::<&str>(&[], rows, 2));
     page.push_str("\nopen-circuit voltage at 25 \u{b0}C\n");
-    // Rows of the curve: every 10th of its steps of 1 %.
+    // Every tenth of the curve's steps of 1 %.
     let points = comparison.curve_v.iter().step_by(10);
     let rows = points.map(|at| vec![format!("{:.0}", 100.0 * at.soc), signed(1e3 * at.value)]);
     page.push_str(&output::table(&["SOC, %", "mV"], rows, 0));
@@ -47,12 +47,12 @@ fn difference(found: &Difference, factor: f64, unit: &str) -> String {
     format!("{:.1} {unit} rms, at worst {at_worst} at {:.0} %", factor * rms, 100.0 * worst.soc)
 }
 
-/// One decimal with a sign; a zero is positive.
+/// Formats one decimal with a sign; zero gets a plus sign.
 fn signed(value: f64) -> String {
     format!("{:+.1}", (10.0 * value).round() / 10.0 + 0.0)
 }
 
-/// As JSON.
+/// Formats the comparison as JSON.
 pub(super) fn document(comparison: &ModelComparison, named: [Named<'_>; 2]) -> Value {
     let [first, second] = named.map(|(source, sourced)| json!({"source": source, "name": sourced.model.name}));
     let summary =

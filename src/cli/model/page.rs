@@ -10,10 +10,10 @@ use crate::monitor::{ModelChange, ModelState};
 
 /// Rows of the curve: every 5 % of SOC.
 const CURVE_STEPS: u32 = 20;
-/// SOC of the columns of resistances.
+/// SOC of the resistance columns.
 const RESISTANCE_SOC: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
 
-/// What is shown of a cell model.
+/// The printed document of a cell model.
 #[derive(Debug, Serialize)]
 pub(super) struct ModelPage {
     version: u32,
@@ -36,13 +36,13 @@ pub(super) struct ModelPage {
     advice: Vec<AdviceRow>,
 }
 
-/// What a learned model is learned from.
+/// Data from which a model was learned.
 #[derive(Debug, Serialize)]
 struct LearnedRow {
     fits: u32,
     changes: Vec<ChangeRow>,
     residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better.
+    /// The chemistry that fits the voltages better.
     chemistry: Option<Chemistry>,
     soc_share: f64,
     soc_ranges: Vec<[f64; 2]>,
@@ -76,7 +76,7 @@ struct CurveRow {
 #[derive(Debug, Serialize)]
 struct ResistanceRow {
     temperature_c: f64,
-    /// Settled resistance at each SOC of the columns.
+    /// Settled resistance at each SOC of the table.
     settled: Vec<SettledResistance>,
     /// Series resistance at half charge, ohm.
     r0_ohm: f64,
@@ -99,7 +99,7 @@ struct BranchPart {
     tau_s: f64,
 }
 
-/// A measurement that would help.
+/// An advised measurement.
 #[derive(Debug, Serialize)]
 struct AdviceRow {
     measurement: String,
@@ -107,7 +107,7 @@ struct AdviceRow {
 }
 
 impl ModelPage {
-    /// The page of a model, whose source people name so.
+    /// Creates the page of a model with the display name of its source.
     pub(super) fn new(name: String, sourced: &SourcedModel) -> Self {
         let SourcedModel { model, source } = sourced;
         let bands = ModelBands::new(model);
@@ -140,7 +140,7 @@ impl ModelPage {
         }
     }
 
-    /// As text.
+    /// Formats the page as text.
     pub(super) fn text(&self) -> String {
         let mut page = self.head();
         page.push_str("\nopen-circuit voltage at 25 \u{b0}C; \u{b1} is one standard deviation, load is C/2\n");
@@ -158,14 +158,14 @@ impl ModelPage {
         let soc = RESISTANCE_SOC.iter().map(|soc| format!("{:.0} %", 100.0 * soc));
         let heads: Vec<String> = ["\u{b0}C".to_owned()].into_iter().chain(soc).chain(["known by".to_owned()]).collect();
         page.push_str(&output::table(&heads, self.resistances.iter().map(ResistanceRow::settled_cells), 0));
-        page.push_str("\nits parts at half charge, m\u{3a9}\n");
+        page.push_str("\nparts of the resistance at half charge, m\u{3a9}\n");
         let branches = self.resistances.first().map_or(0, |row| row.branches.len());
         let parts = (1..=branches).flat_map(|k| [format!("branch {k}"), "tau, s".to_owned()]);
         let heads: Vec<String> = ["\u{b0}C".to_owned(), "series".to_owned()].into_iter().chain(parts).collect();
         page.push_str(&output::table(&heads, self.resistances.iter().map(ResistanceRow::parts), 0));
         let changes = self.learned.iter().flat_map(|learned| &learned.changes);
         if changes.clone().next().is_some() {
-            page.push_str("\nits latest changes\n");
+            page.push_str("\nlatest changes of the model\n");
             let heads = ["time", "state", "capacity, Ah", "residuals, mV", ""];
             page.push_str(&output::table(&heads, changes.map(ChangeRow::cells), 2));
         }
@@ -211,16 +211,16 @@ impl ModelPage {
         format!("{}\n{}", self.name, output::table::<&str>(&[], rows, 2))
     }
 
-    /// What the model means for the SOC, and what would help.
+    /// Describes the expected SOC error, and the most useful measurement.
     fn verdict(&self) -> String {
         let Some(points) = self.soc_error_points else {
-            return "\nexpected error of the SOC in use: unknown, the model states no error; `packwatch fit` writes one\n"
+            return "\nexpected error of the SOC in use: unknown, because the model states no error; `packwatch fit` writes one\n"
                 .to_owned();
         };
         let mut text = format!("\nexpected error of the SOC in use: about {points:.1} points\n");
         match self.advice.is_empty() {
-            true => text.push_str("no single measurement would make it much smaller\n"),
-            false => text.push_str("what would help most, and what is then left\n"),
+            true => text.push_str("no single measurement would reduce it much\n"),
+            false => text.push_str("most useful measurements, and the error that remains\n"),
         }
         let rows = self
             .advice
@@ -244,7 +244,7 @@ impl LearnedRow {
         }
     }
 
-    /// Rows of the head.
+    /// Rows of the table head.
     fn rows(&self) -> Vec<(&'static str, String)> {
         let residual =
             self.residual_v.map_or("nothing fitted yet".to_owned(), |v| format!("residuals {:.1} mV", 1e3 * v));
@@ -278,7 +278,7 @@ impl ChangeRow {
 
     fn cells(&self) -> Vec<String> {
         let capacity = self.capacity_ah.zip(self.capacity_std_ah);
-        let note = if self.taken_back { "the one before holds again" } else { "" };
+        let note = if self.taken_back { "the previous model is restored" } else { "" };
         vec![
             self.time.clone(),
             state_words(self.state).to_owned(),
@@ -289,7 +289,7 @@ impl ChangeRow {
     }
 }
 
-/// Ranges in words: "10 to 40, 60 to 100 %".
+/// Formats ranges: "10 to 40, 60 to 100 %".
 fn ranges(ranges: &[[f64; 2]], factor: f64, unit: &str) -> String {
     let words = ranges.iter().map(|[low, high]| format!("{:.0} to {:.0}", factor * low, factor * high));
     format!("{} {unit}", words.collect::<Vec<_>>().join(", "))
@@ -325,7 +325,7 @@ impl ResistanceRow {
     }
 }
 
-/// Three figures of a resistance in milliohm.
+/// Formats a resistance in milliohm with three digits.
 fn milliohm(ohm: f64) -> String {
     let value = 1e3 * ohm;
     let decimals = (2.0 - value.abs().log10().floor()).clamp(0.0, 4.0) as usize;
@@ -351,7 +351,7 @@ fn resistance_row(sourced: &SourcedModel, bands: &ModelBands<'_>, temperature_c:
         ohm: model.settled_ohm(&model.grid_position(soc, temperature_c)),
         std: bands.resistance(soc, temperature_c).std(),
     });
-    // SOC of the parts of the resistance.
+    // The parts at half charge.
     let position = model.grid_position(0.5, temperature_c);
     let part =
         |i: usize| BranchPart { r_ohm: model.branch_r_ohm(i, &position), tau_s: model.branch_tau_s(i, &position) };

@@ -1,4 +1,4 @@
-//! Which cell model: a file, a configuration, a label, or what a vehicle has learned.
+//! Selects a cell model: from a file, a configuration, a label, or the learned state of a vehicle.
 
 use std::path::{Path, PathBuf};
 
@@ -12,17 +12,17 @@ use crate::monitor::Snapshot;
 use crate::store::HistoryReader;
 use packwatch_host::failure::Failure;
 
-/// Names a cell model.
+/// Selects a cell model.
 #[derive(Debug, clap::Args)]
 pub(super) struct SourceArgs {
-    /// Cell model file, configuration, snapshot, folder of a service's state, or a label as CHEMISTRY:AH, such as nca-graphite:2.9
+    /// Cell model file, configuration, snapshot, state folder of a service, or label as CHEMISTRY:AH, for example nca-graphite:2.9
     #[arg(value_name = "SOURCE", required_unless_present_any = ["config", "chemistry", "state"], conflicts_with_all = ["chemistry", "state"])]
     source: Option<PathBuf>,
-    /// Configuration: the cell model that it names, or its label; with --state or a snapshot the label of cells of which nothing is
-    /// learned yet
+    /// Configuration file whose cell model or label to use. With --state or a snapshot: label to use for cells without a learned
+    /// model
     #[arg(short, long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
-    /// Folder of state and history of a service: the model that it has learned
+    /// State folder of a service, whose learned model to use
     #[arg(long, value_name = "DIR", conflicts_with = "chemistry")]
     state: Option<PathBuf>,
     #[command(flatten)]
@@ -30,10 +30,10 @@ pub(super) struct SourceArgs {
 }
 
 impl SourceArgs {
-    /// The model, with its name for people.
+    /// Returns the model and its display name.
     ///
     /// # Errors
-    /// When it cannot be read: every fault.
+    /// All faults of the source, if it cannot be read.
     pub(super) fn load(&self) -> Result<(String, SourcedModel), Failure> {
         let config = self.config.as_deref().map(config::load).transpose()?;
         match (self.state.as_ref().or(self.source.as_ref()), config, self.label.label()) {
@@ -43,8 +43,8 @@ impl SourceArgs {
             (None, None, Some(label)) => {
                 of_label_named(format!("{}:{}", label.chemistry.name(), label.rated_ah), &label)
             }
-            // The command line is refused before.
-            (None, None, None) => Err(Failure::new("no cell model is named")),
+            // The command line parser requires one of them.
+            (None, None, None) => Err(Failure::new("give a cell model: SOURCE, --config, --chemistry or --state")),
         }
     }
 
@@ -54,19 +54,19 @@ impl SourceArgs {
     }
 }
 
-/// The model of a SOURCE, with its name for people.
+/// Returns the model of a SOURCE and its display name.
 ///
 /// # Errors
-/// When it cannot be read: every fault.
+/// All faults of the source, if it cannot be read.
 pub(super) fn load(path: &Path) -> Result<(String, SourcedModel), Failure> {
     load_with(path, None)
 }
 
-/// As [`load`]; a state of which nothing is learned yet is of the cells of `config`.
+/// As [`load`]; `config` supplies the model if the state has learned none.
 fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
     if path.is_dir() {
         let reader = HistoryReader::open(path).map_err(Failure::new)?;
-        let no_state = || Failure::new(format!("{}: holds no state, or a damaged one", path.display()));
+        let no_state = || Failure::new(format!("{}: contains no state, or a damaged one", path.display()));
         return of_snapshot(path, &reader.snapshot().ok_or_else(no_state)?, config);
     }
     if path.extension().is_some_and(|extension| extension == "json") {
@@ -74,7 +74,7 @@ fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedMode
     }
     if config.is_some() {
         return Err(Failure::new(format!(
-            "{}: is no state and no snapshot; only with these there may be a -c too",
+            "{}: neither a state folder nor a snapshot, so -c cannot be given with it",
             path.display()
         )));
     }
@@ -87,7 +87,7 @@ fn load_with(path: &Path, config: Option<Config>) -> Result<(String, SourcedMode
     of_label_text(path)
 }
 
-/// What a vehicle has learned; the model of its configuration when that is nothing.
+/// Returns the learned model of a vehicle, or the configured one if it has learned none.
 fn of_snapshot(path: &Path, snapshot: &Snapshot, config: Option<Config>) -> Result<(String, SourcedModel), Failure> {
     let label = config.as_ref().and_then(|config| config.monitor.label);
     let view = snapshot.model(label).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
@@ -96,30 +96,33 @@ fn of_snapshot(path: &Path, snapshot: &Snapshot, config: Option<Config>) -> Resu
         (Some(learned), _) => Ok((named(path), learned)),
         (None, Some(config)) => Ok((named(&config.path), of_config(config))),
         (None, None) => {
-            let what = "no cell model has been learned; name the configuration with -c to see the one in use";
+            let what = "no cell model has been learned yet; add -c FILE to see the configured one";
             Err(Failure::new(format!("{}: {what}", path.display())))
         }
     }
 }
 
-/// A label as CHEMISTRY:AH.
+/// Parses a label as CHEMISTRY:AH.
 fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
     let source = named(path);
     let Some((chemistry, rated)) = source.split_once(':') else {
         let what = "must be a cell model file, a configuration, a state, or CHEMISTRY:AH such as nca-graphite:2.9";
-        return Err(Failure::new(format!("{source}: there is no such file; {what}")));
+        return Err(Failure::new(format!("{source}: no such file; {what}")));
     };
     let names: Vec<&str> = Chemistry::ALL.iter().map(|(_, name)| *name).collect();
     let known = Chemistry::ALL.into_iter().find(|(_, name)| *name == chemistry).map(|found| found.0);
     let known = known.ok_or_else(|| {
-        Failure::new(format!("{source}: {chemistry:?} is no file and no chemistry, must be {}", names.join(" or ")))
+        Failure::new(format!(
+            "{source}: {chemistry:?} is neither a file nor a chemistry; chemistries: {}",
+            names.join(", ")
+        ))
     })?;
     let rated_ah =
         above_0(rated).map_err(|what| Failure::new(format!("{source}: rated capacity {rated:?}, {what} (Ah)")))?;
     of_label_named(source, &Label::usual(known, rated_ah))
 }
 
-/// Whether a file is a configuration: it has a table [pack]. Faults are named when it is read.
+/// Whether a file is a configuration, which has a table [pack]. Its faults are reported when it is read.
 fn is_configuration(path: &Path) -> bool {
     let text = std::fs::read_to_string(path).unwrap_or_default();
     text.parse::<toml::Table>().is_ok_and(|table| table.contains_key("pack"))
@@ -134,7 +137,7 @@ fn of_label_named(name: String, label: &Label) -> Result<(String, SourcedModel),
         let Label { chemistry, voltage_min_v, voltage_max_v, .. } = label;
         let (low, high) = chemistry.usual_voltages_v();
         Failure::new(format!(
-            "{name}: no cell of {} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {low} and {high} V",
+            "{name}: {voltage_min_v} to {voltage_max_v} V is not a plausible range for {} (typical: {low} to {high} V)",
             chemistry.name()
         ))
     })?;

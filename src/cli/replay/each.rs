@@ -1,4 +1,4 @@
-//! `packwatch replay --each`: every log by itself, several at a time, results in the logs' order.
+//! `packwatch replay --each`: replays every log separately, several at a time; results are in the order of the logs.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -50,20 +50,20 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     );
     bar.bar.finish_and_clear();
     match written {
-        // The reader of our output has closed it: no failure.
+        // The reader has closed our output early; not an error.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
         written => written.map_err(failure)?,
     }
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }
 
-/// Checks that concern several arguments.
+/// Checks arguments that depend on each other.
 fn check(args: &Args) -> Result<(), Failure> {
     if args.logs.iter().any(|log| log == Path::new("-")) {
-        return Err(Failure::new("-: standard input cannot be replayed with --each, must be files"));
+        return Err(Failure::new("-: --each cannot read standard input; give files"));
     }
     if folders(args).into_iter().flatten().any(|folder| folder == Path::new("-")) {
-        return Err(Failure::new("-: with --each the place of a result must be a folder, which gets a file per log"));
+        return Err(Failure::new("-: --each writes one file per log; give a folder, not -"));
     }
     check_distinct(&args.logs)?;
     let mut names: BTreeMap<String, &PathBuf> = BTreeMap::new();
@@ -71,7 +71,9 @@ fn check(args: &Args) -> Result<(), Failure> {
         let has_results = folders(args).into_iter().flatten().next().is_some();
         if let Some(other) = names.insert(name(log), log).filter(|_| has_results) {
             let (log, other) = (log.display(), other.display());
-            return Err(Failure::new(format!("{log}: its results would replace those of {other}")));
+            return Err(Failure::new(format!(
+                "{log}: its results would replace those of {other}, because the names are equal; rename one of them"
+            )));
         }
     }
     Ok(())
@@ -89,7 +91,7 @@ fn results(args: &Args, log: &Path) -> [Option<PathBuf>; 3] {
     [file(estimates, ".csv"), file(events, ".jsonl"), file(frames, ".log")]
 }
 
-/// A log's name without folder and endings.
+/// Name of a log without folder and suffixes.
 fn name(log: &Path) -> String {
     let packed = log.extension().is_some_and(|ending| ending == "gz" || ending == "zst");
     let stem = if packed { log.file_stem().map(Path::new).unwrap_or(log) } else { log };
@@ -116,7 +118,7 @@ fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result
     result.map(|(summary, _)| summary)
 }
 
-/// The error with the log's name, which most have already.
+/// Adds the log's name to an error, if it is missing.
 fn named(log: &Path, error: &ReplayError) -> String {
     let (name, text) = (log.display().to_string(), error.to_string());
     if text.starts_with(&name) { text } else { format!("{name}: {text}") }
@@ -140,13 +142,13 @@ fn print(args: &Args, log: &Path, result: &Result<ReplaySummary, ReplayError>) -
     out.flush()
 }
 
-/// Progress of all logs together on standard error, when that is a terminal.
+/// Progress of all logs on standard error, if that is a terminal.
 struct EachBar {
     bar: ProgressBar,
     logs: usize,
     finished: AtomicU64,
     frames: AtomicU64,
-    /// Record time, ms.
+    /// Replayed record time, ms.
     awake_ms: AtomicU64,
 }
 
@@ -179,7 +181,7 @@ impl EachBar {
     }
 }
 
-/// One log's part of the progress.
+/// Progress of one log.
 struct LogProgress<'a> {
     bar: &'a EachBar,
     began: Instant,
@@ -189,11 +191,11 @@ struct LogProgress<'a> {
 }
 
 impl LogProgress<'_> {
-    /// Adds the difference to the last call.
+    /// Adds the progress since the last call.
     fn show(&mut self, now: ReplayProgress) {
         let awake_s = (now.times_real_time * self.began.elapsed().as_secs_f64()).max(self.awake_s);
         self.bar.frames.fetch_add(now.frames.saturating_sub(self.frames), Ordering::Relaxed);
-        // Saturates; far from it in any record.
+        // Saturates, far beyond any record.
         self.bar.awake_ms.fetch_add(((awake_s - self.awake_s) * 1e3) as u64, Ordering::Relaxed);
         self.bar.bar.inc(now.bytes.saturating_sub(self.bytes));
         (self.bytes, self.frames, self.awake_s) = (now.bytes, now.frames, awake_s);

@@ -1,4 +1,4 @@
-//! Output of `replay` on the terminal: the summary.
+//! Output of `replay`: the summary.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -8,12 +8,12 @@ use crate::monitor::{Event, EventKind};
 use crate::quantity::catalogue::Quantity;
 use crate::replay::{ProtectedSummary, ReplaySummary};
 
-/// Alarms listed for people; JSON has more.
+/// Most alarms in the table; JSON has more.
 const MAX_SHOWN_ALARMS: usize = 20;
-/// Cells listed for people; JSON has all.
+/// Most cells in the table; JSON has all.
 const MAX_SHOWN_CELLS: usize = 16;
 
-/// The summary as one line of JSON that begins with the log's name.
+/// Prints the summary as a line of JSON that begins with the log's name.
 pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummary) -> io::Result<()> {
     #[derive(serde::Serialize)]
     struct Named<'a> {
@@ -25,14 +25,14 @@ pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummar
     writeln!(out)
 }
 
-/// The summary for people.
+/// Prints the summary as a table.
 pub(super) fn table(summary: &ReplaySummary, to_stderr: bool) -> io::Result<()> {
     let mut text = Vec::new();
     write_table(&mut text, summary)?;
     if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
 }
 
-/// The counts of frames played onto an interface.
+/// Prints the counts of frames sent on an interface.
 pub(super) fn played(sent: u64, interface: &str, counts: &LogCounts, as_json: bool) -> io::Result<()> {
     let mut out = io::stdout().lock();
     if as_json {
@@ -95,7 +95,7 @@ pub(super) fn write_table(out: &mut impl Write, summary: &ReplaySummary) -> io::
     Ok(())
 }
 
-/// A protected message and the statuses that were given.
+/// Describes a protected message and how often it had each status.
 fn statuses(of: &ProtectedSummary) -> String {
     let given = of.counts.iter().filter(|(_, count)| **count > 0);
     let given: Vec<_> = given.map(|(status, count)| format!("{status} {count}")).collect();
@@ -110,7 +110,7 @@ fn write_rows(out: &mut impl Write, rows: &[(&str, String)]) -> io::Result<()> {
 
 fn write_cells(out: &mut impl Write, summary: &ReplaySummary) -> io::Result<()> {
     if summary.cells.is_empty() {
-        return writeln!(out, "no estimate was made");
+        return writeln!(out, "no estimates");
     }
     let with_std = |value: f64, std: f64, digits: usize| format!("{value:.digits$} +/- {std:.digits$}");
     writeln!(

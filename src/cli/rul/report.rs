@@ -9,7 +9,7 @@ use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreT
 /// Prints forecasts at the end of the histories as a table.
 pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the recent rate of use\n")?;
+    writeln!(out, "remaining: median (5 to 95 %) from the last reading; days at the recent rate of use\n")?;
     let heads = ["file", "end of life", "readings", "capacity", "loss per unit", "cycles", "days"];
     let rows = forecasts.iter().map(|now| {
         let life = now.remaining;
@@ -36,8 +36,8 @@ pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
 pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let percent = 100.0 * alpha;
-    writeln!(out, "remaining: median (5 to 95 %); passes when the median is within {percent:.0} % of the truth")?;
-    writeln!(out, "errors are |median - truth| as a part of the life, at most {:.0} %\n", 100.0 * WORST_ERROR)?;
+    writeln!(out, "remaining: median (5 to 95 %); passes if the median is within {percent:.0} % of the truth")?;
+    writeln!(out, "errors are |median - truth| as a fraction of the life, capped at {:.0} %\n", 100.0 * WORST_ERROR)?;
     #[rustfmt::skip]
     let heads = [
         "file", "end of life", "at", "readings", "unit", "truth", "forecast", "alpha", "interval", "error", "line", "error",
@@ -51,7 +51,7 @@ pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()>
     notes(&mut out, files)?;
     match rul::total(files) {
         Some(total) => totals(&mut out, &total),
-        None => writeln!(out, "no forecast was judged"),
+        None => writeln!(out, "no forecasts were scored"),
     }
 }
 
@@ -76,19 +76,17 @@ fn judged_row(file: &HistoryScore, judged: &ForecastScore) -> Vec<String> {
     ]
 }
 
-/// Prints which files were not scored, and which forecasts are missing.
+/// Prints the files that were not scored, and the missing forecasts.
 fn notes(out: &mut impl Write, files: &[HistoryScore]) -> io::Result<()> {
     for file in files {
         let (name, threshold_ah) = (&file.name, file.threshold_ah);
         match file.end_of_life {
             None => writeln!(
                 out,
-                "{name}: does not fall through {threshold_ah:.3} Ah for good (least capacity {:.3} Ah): not judged",
+                "{name}: does not stay below {threshold_ah:.3} Ah (least capacity {:.3} Ah): not scored",
                 file.least_capacity_ah
             )?,
-            Some(end) => {
-                writeln!(out, "{name}: falls through {threshold_ah:.3} Ah after {end:.1} {}s", unit(file.axis))?
-            }
+            Some(end) => writeln!(out, "{name}: falls below {threshold_ah:.3} Ah after {end:.1} {}s", unit(file.axis))?,
         }
         for judged in &file.judged {
             if let Some(why) = &judged.refused {

@@ -1,4 +1,4 @@
-//! The simulator's files: a candump log and the truth as CSV, plain or .gz.
+//! Output files of the simulator: a candump log and the truth as CSV, plain or .gz.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::quantity::{BusIndex, Timestamp};
 use crate::sim::{Moment, Simulation};
 use packwatch_host::failure::Failure;
 
-/// A file being written, compressed where its name ends in `.gz`.
+/// An output file, compressed if its name ends in `.gz`.
 enum Target {
     Plain(ResultFile),
     Gz(GzEncoder<ResultFile>),
@@ -44,7 +44,7 @@ impl Target {
     }
 }
 
-/// Frames as candump lines with nanosecond stamps.
+/// Writes frames as candump lines with nanosecond stamps.
 pub(super) struct LogWriter {
     target: Target,
     interfaces: Vec<String>,
@@ -65,16 +65,16 @@ impl LogWriter {
     }
 }
 
-/// Columns of the truth that not every simulation has.
+/// Optional columns of the truth.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TruthColumns {
-    /// RC branches of the cell model.
+    /// Number of RC branches of the cell model.
     pub(super) branches: usize,
     /// Leak, balancing and contact resistance.
     pub(super) faults: bool,
 }
 
-/// The true state as CSV.
+/// Writes the true state as CSV.
 pub(super) struct TruthWriter {
     target: Target,
     columns: TruthColumns,
@@ -94,7 +94,7 @@ impl TruthWriter {
         Ok(Self { target, columns, period_ns: Timestamp::from_secs(period_s).nanos(), next: None })
     }
 
-    /// One row per cell when a row is due and the cells were sampled.
+    /// Writes one row per cell if a row is due and the cells were sampled.
     pub(super) fn write(&mut self, start: Timestamp, moment: &Moment, sim: &Simulation) -> Result<(), Failure> {
         if !moment.cells_sampled || self.next.is_some_and(|next| moment.time < next) {
             return Ok(());

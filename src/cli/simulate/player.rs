@@ -1,4 +1,4 @@
-//! Plays simulated frames onto a CAN interface, at their own pace or a multiple of it.
+//! Sends simulated frames on a CAN interface, in real time or a multiple of it.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,7 @@ use crate::io::socket::CanSender;
 use crate::quantity::Timestamp;
 use packwatch_host::failure::Failure;
 
-/// Sends frames at their time.
+/// Sends frames when they are due.
 pub(super) struct Player {
     sender: CanSender,
     speed: f64,
@@ -17,13 +17,13 @@ pub(super) struct Player {
 }
 
 impl Player {
-    /// Opens `interface`; speed 0 does not wait.
+    /// Opens `interface`; speed 0 sends without waiting.
     pub(super) fn open(interface: &str, fd: bool, speed: f64) -> Result<Self, Failure> {
         let sender = CanSender::open(interface, fd).map_err(failure)?;
         Ok(Self { sender, speed, started: None })
     }
 
-    /// Waits until the frame is due, then sends it; every interface of the configuration goes onto this one.
+    /// Waits until the frame is due, then sends it; frames of all configured interfaces go to this interface.
     pub(super) fn play(&mut self, time: Timestamp, frame: &Frame) -> Result<(), Failure> {
         let (start, first) = *self.started.get_or_insert_with(|| (Instant::now(), time));
         if self.speed > 0.0 {

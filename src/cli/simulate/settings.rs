@@ -1,4 +1,4 @@
-//! Changes of a scenario's settings by the command line.
+//! Command line options that change a scenario's settings.
 
 use crate::cell_faults::BalancingConfig;
 use crate::cli::common::numbers::{NamedValue, between, finite, one_of, share, within};
@@ -8,29 +8,29 @@ use packwatch_host::failure::Failure;
 /// Scenarios by name.
 pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
     ("paper", Scenario::Paper, "2.6 Ah, 0.05 Ah lost per cycle between SOC 30 and 90 %, until 0.25 Ah"),
-    ("reference", Scenario::Reference, "The 30 Ah example: random discharge pulses, 1 Ah lost per cycle"),
+    ("reference", Scenario::Reference, "30 Ah example: random discharge pulses, 1 Ah lost per cycle"),
     ("random-walk", Scenario::RandomWalk, "Random 5-minute loads with reference cycles in between"),
     ("ev-day", Scenario::EvDay, "A day of an electric car: drive, park asleep, fast charge"),
 ];
 
-/// Qualities of sensors by name.
+/// Sensor qualities by name.
 const QUALITIES: [NamedValue<SensorQuality>; 3] = [
     ("good", SensorQuality::Good, "Offset 1 mV in steps of 0.1 mV, current 0.1 % + 5 mA, 0.3 K"),
     ("usual", SensorQuality::Usual, "Offset 5 mV in steps of 1 mV, current 0.5 % + 50 mA, 1 K"),
     ("poor", SensorQuality::Poor, "Offset 15 mV in steps of 5 mV, current 2 % + 300 mA, 3 K"),
 ];
 
-/// All changes; without one the scenario's setting applies. Amounts of a scenario (currents, losses) are stated for its
-/// source's cell and scale with the capacity.
+/// All changes; an absent option keeps the scenario's value. Currents and losses of a scenario are stated for its original cell and
+/// scale with the capacity.
 #[derive(Debug, clap::Args)]
 pub(super) struct Changes {
-    /// Seed of all randomness
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// End after this many cycles (reference: 10; random-walk: blocks, 1; ev-day: days)
+    /// End after this many cycles; of random-walk: blocks, of ev-day: days [default: reference 10, random-walk 1, ev-day 1]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     cycles: Option<u32>,
-    /// End after this time, s (ev-day: 86400)
+    /// End after this time, s [default: ev-day 86400]
     #[arg(long, value_name = "S", value_parser = positive)]
     duration: Option<f64>,
     #[command(flatten)]
@@ -39,83 +39,83 @@ pub(super) struct Changes {
     sensors: SensorChanges,
     #[command(flatten)]
     pub(super) faults: FaultArgs,
-    /// Time between current samples, ms (ev-day: 10, others: 1000)
+    /// Time between current samples, ms [default: ev-day 10, others 1000]
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
     period: Option<u32>,
-    /// Time between samples of the cells, ms, a multiple of --period (ev-day: 100) [default: --period]
+    /// Time between samples of the cells, ms, a multiple of --period [default: ev-day 100, others --period]
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
     cell_period: Option<u32>,
-    /// Random walk: loads before each pair of reference cycles (1500)
+    /// Loads before each pair of reference cycles of random-walk [default: 1500]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     walk_steps: Option<u32>,
 }
 
-/// Changes of the pack.
+/// Options of the pack.
 #[derive(Debug, clap::Args)]
 pub(super) struct PackChanges {
-    /// Cells in series [default: as configured]
+    /// Cells in series [default: from the configuration]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=1024))]
     cells: Option<u16>,
-    /// Capacity of a new cell, Ah [default: the cell model's]
+    /// Capacity of a new cell, Ah [default: from the cell model]
     #[arg(long, value_name = "AH", value_parser = positive)]
     pub(super) capacity_ah: Option<f64>,
-    /// SOC at the start, fraction (paper: 0.9; reference: 1; random-walk: 0.9; ev-day: 0.85)
+    /// Initial SOC, fraction [default: paper 0.9, reference 1, random-walk 0.9, ev-day 0.85]
     #[arg(long, value_name = "SOC", value_parser = share)]
     initial_soc: Option<f64>,
-    /// Temperature of the surroundings, degrees C [default: as configured]
+    /// Ambient temperature, degrees C [default: from the configuration]
     #[arg(long, value_name = "C", allow_negative_numbers = true, value_parser = between(-60.0, 100.0, ""))]
     ambient: Option<f64>,
     /// Capacity lost per cycle, Ah
     #[arg(long, value_name = "AH", value_parser = non_negative)]
     loss_per_cycle: Option<f64>,
-    /// Resistance gained per cycle, fraction of new
+    /// Resistance gained per cycle, fraction of the new cell's
     #[arg(long, value_name = "X", value_parser = non_negative)]
     resistance_per_cycle: Option<f64>,
-    /// Spread of capacity over the cells, relative standard deviation (ev-day: 0.01, others 0)
+    /// Spread of capacity between cells, relative standard deviation [default: ev-day 0.01, others 0]
     #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_capacity: Option<f64>,
-    /// Spread of resistance over the cells, relative standard deviation (ev-day: 0.03, others 0)
+    /// Spread of resistance between cells, relative standard deviation [default: ev-day 0.03, others 0]
     #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_resistance: Option<f64>,
-    /// Spread of the first SOC over the cells, standard deviation (ev-day: 0.005, others 0)
+    /// Spread of the initial SOC between cells, standard deviation [default: ev-day 0.005, others 0]
     #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_soc: Option<f64>,
-    /// Open-circuit hysteresis that the estimator does not model, V each way
+    /// Open-circuit hysteresis that the estimator does not model, V in each direction
     #[arg(long, value_name = "V", value_parser = non_negative)]
     hysteresis: Option<f64>,
-    /// Self-discharge, A
+    /// Self-discharge current, A
     #[arg(long, value_name = "A", value_parser = non_negative)]
     leakage: Option<f64>,
 }
 
-/// Faults and the BMS that balances.
+/// Fault injection and balancing.
 #[derive(Debug, clap::Args)]
 pub(super) struct FaultArgs {
-    /// Inject a fault; may be repeated
+    /// Inject a fault; repeat for several
     ///
-    /// Cells and temperature sensors count from 1. @WHEN is the time from the start at which the fault begins: day3, 3d,
-    /// 12h or 900s; without it the fault is there from the start.
+    /// Cells and temperature sensors count from 1. @WHEN is the start of the fault after the start of the simulation: day3, 3d,
+    /// 12h or 900s; without it the fault exists from the start.
     ///
-    /// Cells: leak:CELL:20mA, leak:CELL:1kohm, weak:CELL:-10% (capacity), resistance:CELL:+20% (all of the cell's),
-    /// contact:CELL:0.4mohm, contact:CELL:+20% (of the cell's ohmic resistance), module:FIRST-LAST:+15% (replaced).
+    /// Cells: leak:CELL:20mA, leak:CELL:1kohm, weak:CELL:-10% (capacity), resistance:CELL:+20% (whole resistance of the cell),
+    /// contact:CELL:0.4mohm, contact:CELL:+20% (of the cell's ohmic resistance), module:FIRST-LAST:+15% (replaced module).
     ///
     /// Sensors: current-offset:50mA, current-gain:+1%, current-stuck, voltage-offset:CELL:10mV, voltage-stuck:CELL,
-    /// swap:CELL:CELL, double:CELL:CELL (the second shows the first), temperature-stuck:SENSOR, temperature-off:SENSOR.
+    /// swap:CELL:CELL, double:CELL:CELL (the second channel shows the first cell), temperature-stuck:SENSOR, temperature-off:SENSOR.
     #[arg(long = "fault", value_name = "KIND:...[@WHEN]", value_parser = str::parse::<Fault>)]
     faults: Vec<Fault>,
-    /// Balance the cells near the end of a charge and in the rest after it, by a thousandth of the capacity per hour or
-    /// `input.balancing.bleed_a`
+    /// Balance the cells near the end of a charge and in the rest after it, with `input.balancing.bleed_a` or, if not configured, a
+    /// thousandth of the capacity per hour
     #[arg(long)]
     balancing: bool,
 }
 
 impl FaultArgs {
-    /// Whether the truth has more columns.
+    /// Whether the truth needs additional columns.
     pub(super) fn changes_truth(&self) -> bool {
         self.balancing || !self.faults.is_empty()
     }
 
-    /// Adds them to `sim`. `balancing`: `[input.balancing]`, whose `bleed_a` replaces the usual one.
+    /// Adds faults and balancing to `sim`. `balancing`: `[input.balancing]`, whose `bleed_a` replaces the default.
     pub(super) fn apply(
         &self,
         sim: Simulation,
@@ -134,31 +134,31 @@ impl FaultArgs {
     }
 }
 
-/// Changes of the sensors.
+/// Options of the sensors.
 #[derive(Debug, clap::Args)]
 struct SensorChanges {
-    /// Quality of the sensors: errors that are constant per channel, and noise of one step; other options change them
+    /// Quality of the sensors: constant errors per channel and noise of one step; other options override parts of it
     #[arg(long, value_name = "QUALITY", value_parser = one_of(&QUALITIES))]
     sensors: Option<SensorQuality>,
-    /// White noise of cell voltages, V (paper: 0.005)
+    /// White noise of cell voltages, V [default: paper 0.005]
     #[arg(long, value_name = "V", value_parser = non_negative)]
     noise_voltage: Option<f64>,
-    /// White noise of the current, A (paper: 0.02)
+    /// White noise of the current, A [default: paper 0.02]
     #[arg(long, value_name = "A", value_parser = non_negative)]
     noise_current: Option<f64>,
-    /// White noise of temperatures, K (paper: 0.1; ev-day: 0.02)
+    /// White noise of temperatures, K [default: paper 0.1, ev-day 0.02]
     #[arg(long, value_name = "K", value_parser = non_negative)]
     noise_temperature: Option<f64>,
     /// Constant error of cell voltages, V
     #[arg(long, value_name = "V", allow_negative_numbers = true, value_parser = finite)]
     offset_voltage: Option<f64>,
-    /// Constant error of the current, A (paper: 0.01)
+    /// Constant error of the current, A [default: paper 0.01]
     #[arg(long, value_name = "A", allow_negative_numbers = true, value_parser = finite)]
     offset_current: Option<f64>,
-    /// Relative error of the current (paper: 0.005)
+    /// Relative error of the current [default: paper 0.005]
     #[arg(long, value_name = "X", allow_negative_numbers = true, value_parser = finite)]
     gain_current: Option<f64>,
-    /// Step of the voltage converter, V (the DBC's own resolution comes on top)
+    /// Step of the voltage converter, V, in addition to the DBC's resolution
     #[arg(long, value_name = "V", value_parser = non_negative)]
     resolution_voltage: Option<f64>,
     /// Probability that a reading is missing
@@ -171,7 +171,7 @@ impl Changes {
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);
-        // Only the day has a duration of its own, and its cycles are days.
+        // Only the day has its own duration; its cycles are days.
         let days = f64::from(self.cycles.unwrap_or(1));
         settings.duration_s = self.duration.or(settings.duration_s.map(|day_s| days * day_s));
         settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);
@@ -189,9 +189,7 @@ impl Changes {
         settings.cell_period_ns = self.cell_period.map_or(settings.cell_period_ns, ns);
         if settings.cell_period_ns % settings.current_period_ns != 0 {
             let (cell, current) = (settings.cell_period_ns / 1_000_000, settings.current_period_ns / 1_000_000);
-            return Err(Failure::new(format!(
-                "--cell-period {cell}, must be a multiple of the current's {current} ms"
-            )));
+            return Err(Failure::new(format!("--cell-period {cell}, must be a multiple of --period {current} ms")));
         }
         Ok(())
     }

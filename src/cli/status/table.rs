@@ -11,16 +11,16 @@ use crate::quantity::catalogue::{PackValues, Quantity};
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
-/// Most cells that are all listed: more do not fit a screen with the rest.
+/// Most cells that are listed without `--cells`, so that the table fits a screen.
 const MAX_LISTED: usize = 16;
-/// An outlier is this many times as far from the median as half of the cells are.
+/// A cell is an outlier if it is this many times the median distance from the median.
 const OUTLYING: f64 = 3.0;
-/// Most outliers listed of more cells.
+/// Most outliers listed.
 const MAX_OUTLIERS: usize = 8;
-/// Most findings that are listed.
+/// Most findings listed.
 const MOST_FOUND: usize = 8;
 
-/// Formats the document as a table; `all` = every cell.
+/// Formats the document as a table; `all` lists every cell.
 pub(super) fn table(document: &StatusDocument, all: bool) -> String {
     let mut text = String::new();
     head(&mut text, document);
@@ -50,20 +50,17 @@ fn pack(text: &mut String, document: &StatusDocument) {
     let pack = &document.pack;
     if let Some(since) = document.asleep_since {
         let asleep = duration(document.time.since(since));
-        let _ = writeln!(
-            text,
-            "asleep     for {asleep}: the buses are silent at rest, nothing is measured and nothing missing"
-        );
+        let _ = writeln!(text, "asleep     for {asleep}: the buses are silent at rest; inputs do not count as missing");
     }
     for Intruder { interface, id, kind } in &document.intruders {
         let what = match kind {
-            IntruderKind::SecondSender => "has a second sender: which of its values are the sensor's is not known",
-            IntruderKind::OwnIdentifier => "is sent by another node: it is an identifier of this program's frames",
+            IntruderKind::SecondSender => "has a second sender: its values cannot be trusted",
+            IntruderKind::OwnIdentifier => "is an identifier of packwatch, but another node sends it",
         };
         let _ = writeln!(text, "intruder   {interface} {id} {what}");
     }
     if document.current_frozen {
-        let _ = writeln!(text, "current    frozen: its reading does not change, and the voltages show another load");
+        let _ = writeln!(text, "current    frozen: its reading does not change, but the voltages show a changing load");
     }
     for found in document.findings.iter().take(MOST_FOUND) {
         let _ = writeln!(text, "found      {found}, for {}", duration(document.time.since(found.since)));
@@ -104,7 +101,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
     let _ = writeln!(text, "life       {}", remaining(pack));
 }
 
-/// What the weakest cell has lost.
+/// Losses of the weakest cell.
 fn losses(values: &PackValues) -> String {
     if values.get(Quantity::LithiumLoss).is_none() {
         return "not known".to_owned();
@@ -117,7 +114,7 @@ fn losses(values: &PackValues) -> String {
     )
 }
 
-/// The remaining life of the cell whose life ends first.
+/// Remaining life of the cell that ends first.
 fn remaining(pack: &PackView) -> String {
     let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
     let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {
@@ -182,7 +179,7 @@ fn alarms(text: &mut String, document: &StatusDocument) {
     }
 }
 
-/// An alarm, or one that many cells share, in a line.
+/// Formats an alarm, or an alarm that many cells share, in a line.
 pub(super) fn alarm_line(group: &AlarmGroup) -> String {
     let alarm = &group.alarm;
     let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value));
@@ -232,8 +229,8 @@ fn row(cell: &CellView) -> Vec<String> {
     ]
 }
 
-/// A quantity compared over the cells: name, decimals, and the distance from the median up to which no cell is an outlier, in the
-/// quantity's unit and as a part of the median: what sensors and equal cells differ by.
+/// A quantity compared between cells: name, decimals, and the distance from the median within which a cell is never an outlier, in
+/// the quantity's unit and relative to the median. The distance covers the differences of sensors and equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 
 const COMPARISONS: [Comparison; 5] = [
@@ -244,7 +241,7 @@ const COMPARISONS: [Comparison; 5] = [
     ("resistance", Quantity::ResistanceRatio, 2, 0.05, 0.0),
 ];
 
-/// Least and greatest of every quantity, with their cells.
+/// Prints the smallest and largest value of every quantity, with their cells.
 fn spread(text: &mut String, cells: &[CellView]) {
     for (name, quantity, decimals, ..) in COMPARISONS {
         let known = || cells.iter().filter_map(|cell| Some((cell, cell.values.mean(quantity)?)));
@@ -254,18 +251,18 @@ fn spread(text: &mut String, cells: &[CellView]) {
         let _ = match least.zip(greatest) {
             Some(((least, _), (greatest, _))) => writeln!(
                 text,
-                "{name:<10} {} to {}, known of {} of {}",
+                "{name:<10} {} to {}, known for {} of {}",
                 end(least),
                 end(greatest),
                 known().count(),
                 cells.len()
             ),
-            None => writeln!(text, "{name:<10} not known of any of {}", cells.len()),
+            None => writeln!(text, "{name:<10} unknown for all {}", cells.len()),
         };
     }
 }
 
-/// Outliers: cells that are not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
+/// Cells that are not trusted, unknown, or furthest from the median of a quantity, sorted by number.
 fn outliers(cells: &[CellView]) -> Vec<&CellView> {
     let mut ranked: Vec<(f64, &CellView)> = cells.iter().map(|cell| (0.0, cell)).collect();
     for (_, quantity, _, floor, relative_floor) in COMPARISONS {
@@ -275,7 +272,7 @@ fn outliers(cells: &[CellView]) -> Vec<&CellView> {
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
-        // Relative to the median distance; cells within the floor are no outliers.
+        // Relative to the median distance; cells within the floor do not count.
         let floor = floor.max(relative_floor * median.abs());
         let typical = distances[distances.len() / 2].max(floor / OUTLYING);
         for (rank, cell) in &mut ranked {

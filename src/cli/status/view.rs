@@ -1,6 +1,6 @@
 //! The full-screen live view of `packwatch status --watch`: the terminal, and the loop around [`App`].
 //!
-//! In: documents of the stream socket, keys, the clock. Out: a screen, redrawn on each input. Restores the terminal on
+//! Input: documents of the stream socket, keys, the clock. Output: a screen, redrawn on each input. Restores the terminal on
 //! quitting, on SIGTERM, SIGINT and SIGHUP, and on a panic. Waits for a daemon that has stopped.
 
 mod app;
@@ -23,29 +23,29 @@ use tokio::time::interval;
 
 use app::App;
 
-/// Longest time between two drawings: the screen shows the time without a document.
+/// Longest time between redraws, so that the screen shows the time since the last document.
 const DRAW_PERIOD: Duration = Duration::from_secs(1);
-/// Keys waiting: more than a user types between two drawings.
+/// Capacity of the key queue: more than a user types between two redraws.
 const KEYS: usize = 64;
 
-/// Runs the view until the user quits; `socket` is the status socket, next to which the stream socket lies.
+/// Runs the view until the user quits. `socket` is the status socket; the stream socket is next to it.
 ///
 /// # Errors
-/// When there is no terminal, or it fails.
+/// No terminal, or the terminal fails.
 pub(super) fn run(socket: &Path) -> Result<(), String> {
     if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
         return Err(
-            "--watch needs a terminal, and standard input or output is not one; run it without --watch for a table, \
-             or with --json for a document"
+            "--watch needs a terminal as standard input and output; run without --watch for a table, or with --json for a \
+            document"
                 .to_owned(),
         );
     }
-    // https://no-color.org: set and not empty.
+    // See https://no-color.org: disables colour if set and not empty.
     let has_colour = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let app = App::new(socket.to_owned(), has_colour);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
-    // From here on a panic restores the terminal, too.
+    // From here on a panic also restores the terminal.
     let terminal = ratatui::try_init().map_err(|error| format!("terminal: {error}"))?;
     let watched = runtime.block_on(watch(terminal, app));
     ratatui::restore();
@@ -72,7 +72,7 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
                     Some(key) => app.handle_key(key),
                     None => continue,
                 },
-                // A new size: redraws.
+                // Resized: redraw.
                 Some(_) => {}
                 // The terminal was closed.
                 None => return Ok(()),
@@ -85,7 +85,7 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
     }
 }
 
-/// Starts a thread that reads keys and changes of size.
+/// Starts a thread that reads keys and size changes.
 fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     let (sender, keys) = mpsc::channel(KEYS);
     std::thread::Builder::new().name("keys".to_owned()).spawn(move || {
@@ -98,7 +98,7 @@ fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     Ok(keys)
 }
 
-/// The key that the view acts on: Esc for every key that leaves it, `None` for one without a meaning.
+/// Maps a key to an action: Esc for every key that quits, `None` for unknown keys.
 fn meaning(key: KeyEvent) -> Option<KeyCode> {
     let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
     match key.code {

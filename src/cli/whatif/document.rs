@@ -1,4 +1,4 @@
-//! Output of `whatif` for programs: one JSON document, or CSV.
+//! Output of `whatif` as JSON or CSV.
 
 use std::io;
 use std::path::Path;
@@ -18,7 +18,7 @@ const VERSION: u32 = 1;
 /// A column of the CSV: name and value.
 type Column = (&'static str, fn(&LogResult, &ThresholdScore) -> String);
 
-/// Columns of the CSV in addition to the values set.
+/// Columns of the CSV after those of the values set.
 #[rustfmt::skip]
 const COLUMNS: [Column; 23] = [
     ("log", |log, _| log.log.display().to_string()),

@@ -1,4 +1,4 @@
-//! Tables of `whatif`: the summary over the logs, each log.
+//! Tables of `whatif`: the summary over the logs, and each log.
 
 use std::io::{self, Write};
 
@@ -10,7 +10,7 @@ use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
-/// Columns of a table in addition to the alarm and the values set.
+/// Columns of a table after those of the alarm and the values set.
 const OWN_COLUMNS: usize = 9;
 const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
@@ -22,7 +22,7 @@ pub(super) struct WhatifReport<'a> {
     pub(super) grid: &'a VariantGrid,
     pub(super) settings: &'a WhatifSettings<'a>,
     pub(super) rated_ah: f64,
-    /// Rules in the tables.
+    /// Rules to show.
     pub(super) rules: &'a [Rule],
     pub(super) logs: &'a [&'a LogResult],
     /// Logs that failed.
@@ -36,9 +36,9 @@ pub(super) struct Summary {
     rule: Rule,
     severity: Severity,
     threshold: f64,
-    /// Logs in which it was raised.
+    /// Number of logs in which it was raised.
     raised_logs: usize,
-    /// Median, 5 % and 95 % of the logs.
+    /// Median, 5 % and 95 % quantiles over the logs.
     lead_days: Option<[f64; 3]>,
     lead_cycles: Option<[f64; 3]>,
     missed: Option<usize>,
@@ -67,7 +67,8 @@ impl WhatifReport<'_> {
 
     fn write_head(&self, out: &mut impl Write) -> io::Result<()> {
         let (settings, replays) = (self.grid.variants.len(), self.grid.replays);
-        let more = if settings == 1 { "the configuration as it is".to_owned() } else { format!("{settings} settings") };
+        let more =
+            if settings == 1 { "the configuration without changes".to_owned() } else { format!("{settings} settings") };
         writeln!(out, "{}, {more}, {} per log", numbered(self.logs.len(), "log"), numbered(replays, "replay"))?;
         let (end_ah, part) = (self.settings.end_of_life_ah, 100.0 * self.settings.end_of_life_ah / self.rated_ah);
         let reached = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
@@ -77,9 +78,13 @@ impl WhatifReport<'_> {
         let by = by.collect::<Vec<_>>().join(", ");
         writeln!(out, "end of life {end_ah:.3} Ah ({part:.0} % of rated), reached in {reached}, judged by {by}")?;
         match self.settings.horizon {
-            None => writeln!(out, "a raise is false in a log that has no end of life")?,
-            Some(Horizon::Cycles(n)) => writeln!(out, "a raise is false when the end does not come within {n} cycles")?,
-            Some(Horizon::Days(n)) => writeln!(out, "a raise is false when the end does not come within {n} days")?,
+            None => writeln!(out, "a raise is false in a log without end of life")?,
+            Some(Horizon::Cycles(n)) => {
+                writeln!(out, "a raise is false if the end of life does not follow within {n} cycles")?
+            }
+            Some(Horizon::Days(n)) => {
+                writeln!(out, "a raise is false if the end of life does not follow within {n} days")?
+            }
         }
         self.grid.notes.iter().try_for_each(|note| writeln!(out, "note: {note}"))?;
         for log in self.logs {
@@ -151,18 +156,18 @@ impl WhatifReport<'_> {
         std::iter::once(alarm).chain(self.setting_cells(setting)).chain(own).collect()
     }
 
-    /// Returns the columns of the values set; "as it is" for the plain configuration.
+    /// Returns the columns of the values set; "unchanged" for the plain configuration.
     fn setting_cells(&self, setting: usize) -> impl Iterator<Item = String> {
         let values = self.grid.variants.get(setting).map(|variant| variant.values.clone()).unwrap_or_default();
         let plain = values.is_empty();
         (0..self.grid.keys.len()).map(move |key| match values.get(key) {
             Some(value) => value.clone(),
-            None if plain => "as it is".to_owned(),
+            None if plain => "unchanged".to_owned(),
             None => dash(),
         })
     }
 
-    /// The rows of a log that are shown.
+    /// Rows of a log to show.
     pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l ThresholdScore> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
@@ -202,7 +207,7 @@ fn summary(rows: &[&ThresholdScore]) -> Summary {
     }
 }
 
-/// Median, 5 % and 95 %, each the nearest value there is (the lower of two middle ones).
+/// Median, 5 % and 95 % quantiles, each the nearest existing value (the lower of two middle ones).
 fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     values.sort_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;
@@ -213,14 +218,14 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
 fn verdict(row: &ThresholdScore, end: Option<&EndOfLife>) -> String {
     let judged = &row.judged;
     let late_days = judged.first.zip(end).map(|(first, end)| first.days - end.days).filter(|days| *days >= 0.0);
-    let missed = || late_days.map_or_else(|| "missed".to_owned(), |days| format!("missed, came {days:.2} days late"));
+    let missed = || late_days.map_or_else(|| "missed".to_owned(), |days| format!("missed, {days:.2} days late"));
     let words = [
         judged.missed.filter(|missed| *missed).map(|_| missed()),
         judged.false_alarms.filter(|n| *n > 0).map(|n| format!("{n} false")),
         judged.open.filter(|n| *n > 0).map(|n| format!("{n} open")),
         judged.false_raises.filter(|n| *n > 0).map(|n| format!("{n} false raises")),
         Some(judged.flickers).filter(|n| *n > 0).map(|n| format!("{n} flickers")),
-        Some(judged.not_kept).filter(|n| *n > 0).map(|n| format!("{n} more not judged")),
+        Some(judged.not_kept).filter(|n| *n > 0).map(|n| format!("{n} more not evaluated")),
     ];
     let words: Vec<String> = words.into_iter().flatten().collect();
     match (words.is_empty(), judged.lead_days.is_some()) {
@@ -256,7 +261,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_are_values_that_there_are() {
+    fn quantiles_are_existing_values() {
         assert_eq!(quantiles(Vec::new()), None);
         assert_eq!(quantiles(vec![3.0]), Some([3.0; 3]));
         assert_eq!(quantiles((1..=100).map(f64::from).collect()), Some([50.0, 5.0, 95.0]));

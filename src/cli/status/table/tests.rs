@@ -1,10 +1,10 @@
-//! The table of sample documents.
+//! Tables of sample documents.
 
 use super::*;
 use crate::cli::status::sample::sample;
 
 #[test]
-fn a_short_pack_is_listed_whole_and_what_is_unknown_is_a_dash() {
+fn short_pack_lists_all_cells_with_dashes_for_unknown() {
     let text = table(&sample(3), false);
     let wanted = "\
 packwatch 1.2.3, process 4711, up 3 h 12 min, 2027-01-15T08:00:00Z, configuration pack.toml (01234567)
@@ -35,7 +35,7 @@ cell  voltage    temp.           SOC          capacity   resistance  trusted
 }
 
 #[test]
-fn many_findings_are_counted() {
+fn findings_beyond_limit_are_counted() {
     let mut document = sample(3);
     document.findings = vec![document.findings[0]; 11];
     let text = table(&document, false);
@@ -44,7 +44,7 @@ fn many_findings_are_counted() {
 }
 
 #[test]
-fn a_hostile_bus_is_shown() {
+fn intruders_and_frozen_current_are_shown() {
     let mut document = sample(1);
     let intruder = |id: &str, kind| Intruder { interface: "can0".to_owned(), id: id.to_owned(), kind };
     document.intruders =
@@ -52,9 +52,9 @@ fn a_hostile_bus_is_shown() {
     document.current_frozen = true;
     let text = table(&document, false);
     for line in [
-        "intruder   can0 100 has a second sender: which of its values are the sensor's is not known",
-        "intruder   can0 6B0 is sent by another node: it is an identifier of this program's frames",
-        "current    frozen: its reading does not change, and the voltages show another load",
+        "intruder   can0 100 has a second sender: its values cannot be trusted",
+        "intruder   can0 6B0 is an identifier of packwatch, but another node sends it",
+        "current    frozen: its reading does not change, but the voltages show a changing load",
     ] {
         assert!(text.lines().any(|found| found == line), "{line}\n{text}");
     }
@@ -62,7 +62,7 @@ fn a_hostile_bus_is_shown() {
 }
 
 #[test]
-fn a_stated_vehicle_is_the_second_line() {
+fn stated_vehicle_is_second_line() {
     let mut document = sample(1);
     document.vehicle.name = Some("Bus 12".to_owned());
     document.vehicle.pack = Some("rear".to_owned());
@@ -70,7 +70,7 @@ fn a_stated_vehicle_is_the_second_line() {
 }
 
 #[test]
-fn a_failing_store_and_late_estimates_are_shown() {
+fn failing_store_and_late_estimates_are_shown() {
     let mut document = sample(1);
     let store = document.store.as_mut().unwrap();
     (store.works, store.failures, store.late) = (Some(false), 3, 2);
@@ -90,7 +90,7 @@ fn a_failing_store_and_late_estimates_are_shown() {
 }
 
 #[test]
-fn cells_that_differ_by_less_than_their_sensors_are_no_outliers() {
+fn differences_within_sensor_error_give_no_outliers() {
     let mut document = sample(96);
     for cell in &mut document.cells {
         for (quantity, value) in [
@@ -116,18 +116,18 @@ fn cells_that_differ_by_less_than_their_sensors_are_no_outliers() {
 }
 
 #[test]
-fn of_many_cells_only_the_outliers_are_listed() {
+fn large_pack_lists_outliers_only() {
     let mut document = sample(96);
     document.cells[40].values.set(Quantity::Soc, Some(0.1));
     let text = table(&document, false);
-    assert!(text.contains("SOC        10.0 % (cell 41) to 79.2 % (cell 24), known of 95 of 96\n"), "{text}");
+    assert!(text.contains("SOC        10.0 % (cell 41) to 79.2 % (cell 24), known for 95 of 96\n"), "{text}");
     let listed: Vec<&str> = text
         .lines()
         .skip_while(|line| !line.starts_with("cell "))
         .skip(1)
         .filter_map(|line| line.split_whitespace().next())
         .collect();
-    // Empty, not trusted, silent.
+    // Cells without a value, not trusted and silent.
     assert_eq!(listed, ["41", "95", "96"]);
     assert_eq!(table(&document, true).lines().filter(|line| line.contains(" °C  ")).count(), 95);
 }

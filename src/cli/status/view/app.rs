@@ -13,12 +13,12 @@ use crate::status::document::StatusDocument;
 /// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
 
-/// An update of the stream.
+/// An update from the stream.
 #[derive(Debug)]
 pub(super) enum FeedUpdate {
     /// A document.
     StatusDocument(Box<StatusDocument>),
-    /// The connection failed: why.
+    /// The connection failed, for this reason.
     Lost(String),
 }
 
@@ -51,10 +51,10 @@ impl Page {
     }
 }
 
-/// The quantities of the map of the cells, in the order in which the key `v` changes them.
+/// Quantities of the cell map, in the order of the key `v`.
 pub(super) const MAPPED: [(Quantity, &str); 2] = [(Quantity::Soc, "SOC"), (Quantity::Voltage, "voltage")];
 
-/// A cell's values at one document, a quantity after the other.
+/// A cell's values in one document, one per quantity.
 pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 
 /// The view.
@@ -62,30 +62,30 @@ pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 pub(super) struct App {
     path: PathBuf,
     pub(super) has_colour: bool,
-    /// The latest document, while it is fresh.
+    /// The latest document, unless stale.
     pub(super) document: Option<StatusDocument>,
-    /// Time of the last document and the reason, while there is no fresh one.
+    /// Time of the last document and the reason of the loss, while no fresh document is available.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
     /// Time of the latest document.
     received_at: Option<Timestamp>,
-    /// Per cell, oldest first.
+    /// History of each cell, oldest first.
     pub(super) history: Vec<VecDeque<CellPoint>>,
     pub(super) page: Page,
     /// Index of the mapped quantity.
     pub(super) mapped: usize,
     /// The selected cell.
     pub(super) selected: usize,
-    /// First line shown of the other pages.
+    /// First visible line of the other pages.
     pub(super) scroll: usize,
-    /// Cells in a row of the map, as last drawn.
+    /// Cells in a row of the map when last drawn.
     pub(super) row_cells: usize,
-    /// Lines of a page, as last drawn.
+    /// Lines of a page when last drawn.
     pub(super) page_lines: usize,
     now: Timestamp,
 }
 
 impl App {
-    /// A view of the stream socket at `path`.
+    /// Creates a view of the stream socket at `path`.
     pub(super) fn new(path: PathBuf, has_colour: bool) -> Self {
         Self {
             path,
@@ -115,7 +115,7 @@ impl App {
         if self.document.is_some()
             && self.received_at.is_some_and(|received_at| now.since(received_at) > STALE.as_secs_f64())
         {
-            self.lose("it sends no document".to_owned());
+            self.lose("it has stopped sending documents".to_owned());
         }
     }
 
@@ -136,7 +136,7 @@ impl App {
     fn lose(&mut self, why: String) {
         let since = self.lost.take().map_or(self.received_at, |(since, _)| since);
         self.lost = Some((since, why));
-        // A stale document is not shown.
+        // Do not show a stale document.
         self.document = None;
     }
 
@@ -161,7 +161,7 @@ impl App {
                 let last = self.history.len().saturating_sub(1);
                 self.selected = moved(self.selected, key, self.row_cells, self.page_lines * self.row_cells, last);
             }
-            // Drawing limits it to the number of lines.
+            // Drawing caps it at the number of lines.
             _ => self.scroll = moved(self.scroll, key, 1, self.page_lines, usize::MAX / 2),
         }
     }

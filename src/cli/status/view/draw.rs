@@ -1,4 +1,4 @@
-//! Draws the view: head, pack, the selected page, keys.
+//! Draws the view: head, pack, selected page, keys.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -14,7 +14,7 @@ use crate::cli::status::{config, duration, mean, number, soc_band, store, with_s
 use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
 
-/// Smallest usable size.
+/// Smallest usable size, columns and lines.
 const LEAST: (u16, u16) = (40, 12);
 
 /// Draws everything.
@@ -25,7 +25,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
         return frame.render_widget(Paragraph::new(text), area);
     }
     let theme = Theme { has_colour: app.has_colour };
-    // Moved out, so that the pages can update the app while they draw.
+    // Taken out, so that the pages can update the app while they draw.
     let Some(document) = app.document.take() else { return lost(frame, app, area) };
     let [head_area, pack_area, alarm_area, tab_area, page_area, keys_area] = Layout::vertical([
         Constraint::Length(1),

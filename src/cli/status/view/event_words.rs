@@ -1,14 +1,14 @@
-//! An event of the status document in words: names without underscores, values with their unit and deviation, cells from 1,
-//! interfaces by name.
+//! Describes an event of the status document: names without underscores, values with unit and deviation, cells from 1, interfaces
+//! by name.
 
 use serde_json::{Map, Value};
 
 use crate::cell_faults::CellFault;
 use crate::status::document::StatusDocument;
 
-/// Units at the end of a key.
+/// Units by suffix of the key.
 const UNITS: [(&str, &str); 5] = [("_ah", " Ah"), ("_a", " A"), ("_v", " V"), ("_s", " s"), ("_c", " °C")];
-/// Keys that are abbreviations.
+/// Display names of abbreviated keys.
 const NAMES: [(&str, &str); 5] = [
     ("lli", "lithium lost"),
     ("lam_ne", "negative electrode lost"),
@@ -16,7 +16,7 @@ const NAMES: [(&str, &str); 5] = [
     ("mean_nis", "innovations over expected"),
     ("what", ""),
 ];
-/// Channels, whose number counts from 0 in the document.
+/// Keys whose number counts from 0 in the document.
 const NUMBERED: [&str; 4] = ["cell", "cell_voltage", "temperature", "sensor"];
 
 /// Formats the event without its time.
@@ -30,7 +30,7 @@ pub(super) fn words(event: &Map<String, Value>, document: &StatusDocument) -> St
     if parts.is_empty() { name } else { format!("{name}: {}", parts.join(", ")) }
 }
 
-/// The finding that an event reports.
+/// Returns the finding that an event reports.
 fn finding(event: &Map<String, Value>) -> Option<CellFault> {
     if event.get("event")? != "finding" {
         return None;
@@ -40,12 +40,12 @@ fn finding(event: &Map<String, Value>) -> Option<CellFault> {
     serde_json::from_value(Value::Object(keys)).ok()
 }
 
-/// A key with its value; `None` = another key shows it.
+/// Formats a key with its value; `None` if another key shows it.
 fn part(event: &Map<String, Value>, key: &str, value: &Value, document: &StatusDocument) -> Option<String> {
     let (stem, unit) = UNITS.iter().find_map(|(end, unit)| Some((key.strip_suffix(end)?, *unit))).unwrap_or((key, ""));
     let end = &key[stem.len()..];
     if let Some(mean) = stem.strip_suffix("_std") {
-        // Stands behind the mean.
+        // Shown after the mean.
         return (!event.contains_key(&format!("{mean}{end}")))
             .then(|| format!("{} {}", named(stem), shown(key, value, document) + unit));
     }
@@ -78,7 +78,7 @@ fn shown(key: &str, value: &Value, document: &StatusDocument) -> String {
             let interface = index.as_u64().and_then(|index| document.interfaces.get(usize::try_from(index).ok()?));
             interface.map_or_else(|| index.to_string(), |interface| interface.name.clone())
         }
-        // Counts from 1 on the screen.
+        // The screen counts from 1.
         Value::Number(index) if NUMBERED.contains(&key) => (index.as_u64().unwrap_or(0) + 1).to_string(),
         Value::Number(it) if it.is_f64() => number(it.as_f64().unwrap_or(f64::NAN)),
         Value::Object(keys) => {
@@ -90,7 +90,7 @@ fn shown(key: &str, value: &Value, document: &StatusDocument) -> String {
     }
 }
 
-/// Four digits at most behind the point, without trailing zeros and without "-0".
+/// Formats with at most four decimals, without trailing zeros and without "-0".
 fn number(value: f64) -> String {
     let digits = format!("{value:.4}");
     let digits = digits.trim_end_matches('0').trim_end_matches('.');
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn no_raw_key_reaches_the_screen() {
+    fn event_words_contain_no_raw_keys() {
         let capacity = serde_json::json!({ "time": 1, "event": "capacity", "cell": 2, "measured_ah": null,
             "capacity_ah": 2.41, "capacity_std_ah": 0.02, "resistance_ratio": -0.00001, "resistance_ratio_std": 0.1 });
         assert_eq!(

@@ -1,4 +1,4 @@
-//! Reads the stream socket, and reconnects after a failure. Out: updates for the view.
+//! Reads the stream socket and reconnects after a failure. Output: updates for the view.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,9 @@ use crate::quantity::Timestamp;
 use crate::status::client::{check_length, explain, parse};
 use crate::status::stream_path;
 
-/// Pause before a reconnection.
+/// Pause before reconnecting.
 const RETRY: Duration = Duration::from_secs(1);
-/// Longest wait for a line before the connection is closed: a suspended daemon keeps it open.
+/// Longest wait for a line before the connection is closed, because a suspended daemon keeps it open.
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// The computer's clock.
@@ -25,10 +25,10 @@ pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Starts reading the stream beside the status socket at `path`; faults name the status socket, which is what `--status` and `--socket`
-/// name.
+/// Starts reading the stream next to the status socket at `path`. Errors name the status socket, as the options `--status` and
+/// `--socket` do.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
-    // One is drawn while the next is read.
+    // One update is drawn while the next is read.
     let (updates, received) = mpsc::channel(1);
     tokio::spawn(async move {
         loop {
@@ -42,7 +42,7 @@ pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     received
 }
 
-/// Reads until the connection fails (`Err`) or the view has ended.
+/// Reads until the connection fails (`Err`) or the view ends.
 async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
     let failed = |error: io::Error| explain(path, &error);
     let mut stream = UnixStream::connect(stream_path(path)).await.map_err(failed)?;
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn without_a_daemon_the_hint_names_the_status_socket_and_not_the_stream() {
+    async fn hint_without_daemon_names_status_socket() {
         let (updates, _received) = mpsc::channel(1);
         let said = listen(Path::new("/nonexistent/status.sock"), &updates).await.unwrap_err();
         assert!(said.starts_with("/nonexistent/status.sock: no daemon listens there"), "{said}");

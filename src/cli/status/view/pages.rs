@@ -18,13 +18,13 @@ use crate::quantity::Timestamp;
 use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
 
-/// Width of a row's first cell number in the map.
+/// Width of the cell number at the start of a map row.
 const LABEL: usize = 5;
-/// Lines of the list of cells and of the plot below the map that are always there.
+/// Lines reserved below the map for the list of cells and the plot.
 const LIST_LINES: usize = 4;
-/// Least range of the bars of SOC: smaller differences are not of interest.
+/// Smallest range of the SOC bars; hides small differences.
 const LEAST_SOC_RANGE: f64 = 0.05;
-/// Height of the chosen cell's plot, its title included.
+/// Height of the selected cell's plot, including its title.
 const PLOT_LINES: usize = 5;
 
 /// Draws the selected page.
@@ -48,7 +48,7 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme:
     let grid = Grid::new(document.cells.len(), usize::from(area.width), lines);
     let map_lines = grid.rows.min(lines) + 1;
     let left = height.saturating_sub(map_lines);
-    // Lines that the list does not need go to the plot.
+    // The plot gets lines that the list does not need.
     let spare = left.saturating_sub(document.cells.len() + 1);
     let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES.max(spare) } else { 0 };
     let length = |lines: usize| Constraint::Length(u16::try_from(lines).unwrap_or(u16::MAX));
@@ -62,21 +62,21 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme:
     }
 }
 
-/// The layout of the map.
+/// Layout of the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Grid {
-    /// Characters of a cell, its space included.
+    /// Characters of a cell, including its space.
     cell_width: usize,
     per_row: usize,
     rows: usize,
 }
 
 impl Grid {
-    /// Chooses the widest bars with which the cells fit; with the narrowest the map scrolls.
+    /// Chooses the widest bars that fit all cells; if the narrowest do not fit, the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);
-            // Rows of whole dozens are easy to count.
+            // Rows in multiples of 12 are easy to count.
             let per_row = if fit >= 12 { fit / 12 * 12 } else { fit };
             Self { cell_width, per_row, rows: cells.div_ceil(per_row) }
         };
@@ -125,7 +125,7 @@ fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: u
     text
 }
 
-/// The cells around the selected one, each with a small plot of the quantity.
+/// Cells around the selected one, each with a small plot of the quantity.
 fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<Line<'static>> {
     let height = usize::from(area.height);
     let rows = height.saturating_sub(1);
@@ -152,7 +152,7 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
     text
 }
 
-/// The plot of the selected cell.
+/// Plot of the selected cell.
 fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let Some(points) = app.history.get(app.selected) else { return };
     let width = usize::from(area.width.saturating_sub(2));
@@ -166,7 +166,7 @@ fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let digits = if quantity == Quantity::Soc { 2 } else { 3 };
     let seconds = values.len();
     let title = format!(" {name} of cell {cell}, {least:.digits$} to {greatest:.digits$}{unit} in {seconds} s ");
-    // At least one dot for a known value; 1 to 1,001.
+    // At least one dot for a known value: 1 to 1,001.
     let dots = values.into_iter().map(|value| value.and_then(|value| Some((1000.0 * scale.share(value)?) as u64 + 1)));
     let dots: Vec<Option<u64>> = dots.collect();
     let sparkline = Sparkline::default().data(dots).max(1001).style(theme.colour(Color::Cyan));
@@ -240,7 +240,7 @@ fn count_line(name: &str, count: u64) -> Line<'static> {
 fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
     let counters = &document.counters;
     let mut text = Vec::new();
-    // Every count, with its name in the document.
+    // Every count, named as in the document.
     for part in [serde_json::to_value(counters.readings), serde_json::to_value(&counters.core)] {
         let Ok(Value::Object(keys)) = part else { continue };
         text.extend(keys.iter().filter_map(|(name, count)| Some(count_line(&name.replace('_', " "), count.as_u64()?))));

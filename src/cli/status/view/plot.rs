@@ -1,18 +1,18 @@
 //! Bars and small plots made of characters. Pure.
 
-/// Eighths of a character's height.
+/// Bars of one to eight eighths of a character's height.
 const EIGHTHS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
-/// An unknown value.
+/// Mark of an unknown value.
 const UNKNOWN: char = '·';
 
-/// A bar one character high; `share` 0 to 1 of its height.
+/// Returns a bar one character high; `share` is 0 to 1 of its height.
 pub(super) fn bar(share: Option<f64>) -> char {
     let Some(share) = share else { return UNKNOWN };
-    // 0 to 7, saturating.
+    // The cast saturates to 0 to 7.
     EIGHTHS[((share.clamp(0.0, 1.0) * 8.0) as usize).min(7)]
 }
 
-/// The last `width` values as a line of bars between their least and greatest; missing ones in front are spaces.
+/// Draws the last `width` values as bars between their smallest and largest value; pads on the left.
 pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, width: usize) -> String {
     let skipped = values.len().saturating_sub(width);
     let values: Vec<Option<f64>> = values.skip(skipped).collect();
@@ -21,7 +21,7 @@ pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, widt
     blank + &values.iter().map(|value| bar(value.and_then(|value| scale?.share(value)))).collect::<String>()
 }
 
-/// From the least to the greatest of some values.
+/// Range from the smallest to the largest value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ValueRange {
     pub(super) least: f64,
@@ -29,7 +29,7 @@ pub(super) struct ValueRange {
 }
 
 impl ValueRange {
-    /// `None` = there are no values.
+    /// Returns the range of the values; `None` if there are none.
     pub(super) fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
         values.fold(None, |so_far, value| match so_far {
             None => Some(Self { least: value, greatest: value }),
@@ -37,23 +37,23 @@ impl ValueRange {
         })
     }
 
-    /// A range of at least this width around the same middle.
+    /// Widens the range to at least this width around its centre.
     pub(super) fn at_least(self, width: f64) -> Self {
         let room = (0.5 * (width - (self.greatest - self.least))).max(0.0);
         Self { least: self.least - room, greatest: self.greatest + room }
     }
 
-    /// Where a value is between them, 0 to 1; all alike are in the middle.
+    /// Position of a value in the range, 0 to 1; 0.5 in an empty range.
     pub(super) fn share(&self, value: f64) -> Option<f64> {
         let range = self.greatest - self.least;
         Some(if range > 0.0 { (value - self.least) / range } else { 0.5 })
     }
 }
 
-/// A gauge: full up to the lower end of the interval, hatched within it, light beyond; a stroke at the value.
+/// Draws a gauge: full up to the lower end of the interval, hatched within it, light beyond; a stroke marks the value.
 pub(super) fn gauge(value: Option<f64>, low: Option<f64>, high: Option<f64>, width: usize) -> String {
     let (Some(value), Some(low), Some(high)) = (value, low, high) else { return UNKNOWN.to_string().repeat(width) };
-    // 0 to width, saturating.
+    // The cast saturates to 0 to width.
     let column = |share: f64| (share.clamp(0.0, 1.0) * width as f64).round() as usize;
     let (low, high, at) = (column(low), column(high), column(value).min(width.saturating_sub(1)));
     let dot = |index: usize| match index {
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sparkline_shows_the_latest_values_and_where_one_is_missing() {
+    fn sparkline_shows_latest_and_missing_values() {
         let values = [9.0, 0.0, 1.0, 2.0].map(Some);
         assert_eq!(sparkline(values.into_iter(), 3), "▁▅█");
         assert_eq!(sparkline([Some(1.0), None, Some(2.0)].into_iter(), 5), "  ▁·█");
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gauge_shows_its_interval_and_nothing_when_nothing_is_known() {
+    fn gauge_shows_interval_or_unknown() {
         assert_eq!(gauge(Some(0.5), Some(0.3), Some(0.8), 10), "███▒▒┃▒▒░░");
         assert_eq!(gauge(Some(1.0), Some(1.0), Some(1.0), 4), "███┃");
         assert_eq!(gauge(None, Some(0.3), Some(0.8), 3), "···");

@@ -1,5 +1,5 @@
-//! Drawn screens, compared with the files in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` rewrites the files:
-//! check them before a commit.
+//! Compares drawn screens with the files in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` rewrites the files; check
+//! them before a commit.
 
 use std::path::PathBuf;
 
@@ -18,7 +18,7 @@ fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status.sock"), true)
 }
 
-/// A pack that was watched for so many seconds.
+/// A pack watched for `seconds`.
 fn watched(cells: u16, seconds: usize) -> App {
     let mut app = app();
     for second in 0..seconds {
@@ -52,14 +52,14 @@ fn check(name: &str, app: &mut App, size: (u16, u16)) {
         std::fs::write(&file, &found).unwrap();
     }
     let wanted = std::fs::read_to_string(&file).unwrap_or_default();
-    assert!(wanted == found, "{name} is drawn otherwise:\n{found}");
+    assert!(wanted == found, "{name} differs from its file:\n{found}");
 }
 
 const SMALL: (u16, u16) = (80, 24);
 const LARGE: (u16, u16) = (120, 40);
 
 #[test]
-fn screens_of_the_cells() {
+fn cell_screens_match_files() {
     for (name, cells, size) in [
         ("cells_1_80x24", 1, SMALL),
         ("cells_1_120x40", 1, LARGE),
@@ -77,7 +77,7 @@ fn screens_of_the_cells() {
 }
 
 #[test]
-fn screens_of_the_other_pages() {
+fn page_screens_match_files() {
     let mut app = watched(96, 3);
     for page in [Page::Alarms, Page::Interfaces, Page::Counts, Page::Events] {
         app.handle_key(KeyCode::Tab);
@@ -89,20 +89,20 @@ fn screens_of_the_other_pages() {
 }
 
 #[test]
-fn screens_without_a_daemon() {
+fn lost_daemon_screens_match_files() {
     check("waiting_80x24", &mut app(), SMALL);
     let mut app = watched(96, 3);
     app.handle_update(FeedUpdate::Lost("/run/packwatch/status.sock: no daemon listens there".to_owned()));
     app.handle_update(FeedUpdate::Lost("/run/packwatch/status.sock: no daemon listens there".to_owned()));
     check("lost_80x24", &mut app, SMALL);
-    // No stale value is on the screen.
+    // No stale value remains on the screen.
     assert!(!drawn(&mut app, LARGE).to_string().contains("SOC"));
     app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(96))));
     assert!(drawn(&mut app, LARGE).to_string().contains("SOC"));
 }
 
 #[test]
-fn a_silent_daemon_is_reported_as_lost() {
+fn silent_daemon_is_reported_as_lost() {
     let mut app = watched(1, 1);
     let received_at = sample(1).wall_time;
     app.poll(received_at.plus_secs(2.9));
@@ -113,7 +113,7 @@ fn a_silent_daemon_is_reported_as_lost() {
 }
 
 #[test]
-fn unknown_is_drawn_as_unknown() {
+fn unknown_soc_is_drawn_as_unknown() {
     let mut document = StatusDocument { cells: Vec::new(), ..sample(2) };
     document.pack.values = PackValues::default();
     let mut app = app();
@@ -123,11 +123,11 @@ fn unknown_is_drawn_as_unknown() {
 }
 
 #[test]
-fn a_silent_cell_is_not_painted_as_trusted() {
+fn silent_cell_is_not_drawn_as_trusted() {
     let mut app = app();
     app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(3))));
     let screen = drawn(&mut app, SMALL);
-    // The first row of the map: trusted, not trusted, silent; the selected one is the first.
+    // First row of the map: trusted, not trusted, silent. The first cell is selected.
     let row =
         (0..SMALL.1).find(|row| (0..5).map(|x| screen.buffer()[(x, *row)].symbol()).eq([" ", " ", " ", "1", " "]));
     let colours: Vec<Color> = [5, 9, 13].map(|x| screen.buffer()[(x, row.unwrap())].fg).to_vec();
@@ -135,7 +135,7 @@ fn a_silent_cell_is_not_painted_as_trusted() {
 }
 
 #[test]
-fn every_size_and_every_key_is_handled_without_a_fault() {
+fn all_sizes_and_keys_draw_without_panic() {
     for cells in [1, 2, 96, 1024] {
         let mut app = watched(cells, 2);
         for size in [(1, 1), (40, 12), (41, 13), (57, 30), (200, 12), (80, 24), (300, 100)] {
@@ -161,13 +161,13 @@ fn every_size_and_every_key_is_handled_without_a_fault() {
 }
 
 #[test]
-fn history_is_bounded() {
+fn history_length_is_bounded() {
     let app = watched(2, HISTORY + 5);
     assert!(app.history.iter().all(|points| points.len() == HISTORY));
 }
 
 #[test]
-fn without_colour_there_is_none() {
+fn theme_without_colour_draws_no_colour() {
     let mut app = watched(96, 2);
     let colours =
         |backend: &TestBackend| backend.buffer().content().iter().filter(|cell| cell.fg != Color::Reset).count();
@@ -181,7 +181,7 @@ fn without_colour_there_is_none() {
 }
 
 #[test]
-fn keys_mean_what_the_help_says() {
+fn keys_match_help_line() {
     let key = |code| meaning(KeyEvent::new(code, KeyModifiers::NONE));
     assert_eq!(key(KeyCode::Char('q')), Some(KeyCode::Esc));
     assert_eq!(key(KeyCode::Tab), Some(KeyCode::Tab));

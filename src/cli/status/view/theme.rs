@@ -1,4 +1,4 @@
-//! Colours and words that the frame of the view and its pages share.
+//! Colours and words shared by the frame of the view and its pages.
 
 use ratatui::style::{Color, Modifier, Style};
 
@@ -7,7 +7,7 @@ use crate::io::stamp;
 use crate::monitor::Validity;
 use crate::quantity::Timestamp;
 
-/// The colours of the view; without colour only bold and reversed text.
+/// Colours of the view; without colour it uses bold and reversed text only.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Theme {
     pub(super) has_colour: bool,
@@ -35,7 +35,7 @@ impl Theme {
     }
 }
 
-/// The time of day, UTC.
+/// Formats the time of day, UTC.
 pub(super) fn clock(time: Timestamp) -> String {
     let stamp = stamp::format_utc(time);
     stamp.split_once('T').map_or(stamp.clone(), |(_, clock)| clock.to_owned())

@@ -44,7 +44,7 @@ pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read:
         let Label { chemistry, voltage_min_v, voltage_max_v, rated_ah, .. } = label;
         let usual = Label::usual(chemistry, rated_ah);
         let what = format!(
-            "no cell of {} is empty at {voltage_min_v} V and full at {voltage_max_v} V; usual are {} and {} V",
+            "{voltage_min_v} to {voltage_max_v} V is not a plausible range for {} (typical: {} to {} V)",
             chemistry.name(),
             usual.voltage_min_v,
             usual.voltage_max_v

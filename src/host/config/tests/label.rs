@@ -60,7 +60,7 @@ fn what_is_missing_or_does_not_fit_is_named() {
     assert_eq!(
         of("chemistry = \"lfp-graphite\"\nrated_capacity_ah = 100\nvoltage_min_v = 3.5\nvoltage_max_v = 4.3"),
         [
-            "pack.toml:3: pack.chemistry = \"lfp-graphite\", no cell of lfp-graphite is empty at 3.5 V and full at 4.3 V; usual are 2.5 and 3.65 V"
+            "pack.toml:3: pack.chemistry = \"lfp-graphite\", 3.5 to 4.3 V is not a plausible range for lfp-graphite (typical: 2.5 to 3.65 V)"
         ]
     );
     assert_eq!(
