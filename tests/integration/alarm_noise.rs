@@ -1,6 +1,6 @@
-//! A value that wanders round its threshold with noise for 24 hours, through the whole core from input frames to alarm
-//! frames: one raise and one clear, in the events and on the wire. The same day without hysteresis and debounce must
-//! flicker, or it would show nothing.
+//! A noisy value stays near its alarm threshold for 24 hours. The test runs the whole core, from input frames to alarm
+//! frames, and expects one raise and one clear, in the events and on the bus. As a control, the same day without
+//! hysteresis and debounce must flicker.
 
 use std::path::Path;
 
@@ -17,14 +17,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
 const DAY_S: u32 = 86_400;
-/// The value comes down to its threshold (or up to it) in the first hour and leaves it in the last.
+/// The value reaches its threshold within the first hour and leaves it in the last.
 const HOUR_S: f64 = 3600.0;
 const SLEEP_GAP_S: f64 = 30.0;
-/// States of an alarm on the wire, as `config/packwatch.dbc` has them.
+/// Alarm states on the wire, as `config/packwatch.dbc` defines them.
 const ACTIVE: u64 = 1;
 const CLEARED: u64 = 2;
 
-/// One cell as `config/paper.toml` has it, and the alarm under test.
+/// One cell as in `config/paper.toml`, with the alarm under test.
 fn configuration(alarm: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let paper = std::fs::read_to_string(folder.join("paper.toml")).unwrap();
@@ -38,20 +38,20 @@ fn configuration(alarm: &str) -> MonitorConfig {
         .monitor
 }
 
-/// What one second's frame says: current in A (positive = discharge), voltage in V, temperature in degrees C.
+/// Content of one second's frame: current in A (positive = discharge), voltage in V, temperature in degrees C.
 type Second = (f64, f64, f64);
 
-/// The life of an alarm in a day.
+/// Alarm changes and alarm frames of one day.
 #[derive(Debug, PartialEq)]
 struct Day {
     raised: usize,
     cleared: usize,
-    /// States of the rule's alarm frames, one of each run of equal ones.
+    /// States in the rule's alarm frames, without repetitions.
     states: Vec<u64>,
     frames: usize,
 }
 
-/// The rule's number and the state of an alarm frame, read with the shipped DBC.
+/// Reads the rule's number and the state from an alarm frame, using the shipped DBC.
 struct AlarmReader {
     id: CanId,
     rule: SignalPlan,
@@ -67,7 +67,7 @@ impl AlarmReader {
     }
 }
 
-/// A day at a frame a second, with the driver's ticks between them.
+/// Simulates a day with one frame per second and the driver's ticks between the frames.
 fn day(config: MonitorConfig, rule: Rule, mut second: impl FnMut(&MonitorConfig, f64) -> Second) -> Day {
     let reader = AlarmReader::new();
     let encoder = InputEncoder::new(&config.input);
@@ -116,21 +116,21 @@ impl Day {
         }
     }
 
-    /// Once, and in each period of 1 s in between a frame that says so.
+    /// Expects one raise, one clear, and an alarm frame in each 1 s period between them.
     fn assert_quiet(&self) {
         assert_eq!((self.raised, self.cleared), (1, 1));
         assert_eq!(self.states, [ACTIVE, CLEARED], "on the wire");
-        assert!(self.frames > 70_000, "{} frames in the 20 hours and more in which it was raised", self.frames);
+        assert!(self.frames > 70_000, "{} alarm frames in more than 20 raised hours", self.frames);
     }
 
     fn assert_flickers(&self) {
-        assert!(self.raised > 200, "raised {} times: the day is too quiet to show anything", self.raised);
+        assert!(self.raised > 200, "raised {} times: too little noise for this test", self.raised);
         assert!(self.raised - self.cleared <= 1);
-        assert!(self.states.len() >= self.raised + self.cleared, "each of them went out");
+        assert!(self.states.len() >= self.raised + self.cleared, "every change was sent");
     }
 }
 
-/// Standard normal noise, near enough: the sum of twelve uniform numbers.
+/// Approximate standard normal noise: the sum of twelve uniform numbers.
 struct Noise(ChaCha8Rng);
 
 impl Noise {
@@ -143,18 +143,18 @@ impl Noise {
     }
 }
 
-/// 0 in the middle of the day, 1 at its ends: how far the value is from its threshold.
+/// Distance of the value from its threshold: 0 in the middle of the day, 1 at its ends.
 fn away(t: f64) -> f64 {
     let to_end = (f64::from(DAY_S) - t).min(t);
     (1.0 - to_end / HOUR_S).max(0.0)
 }
 
-/// Slow wandering, -1 to 1, with periods of 17 and 140 minutes.
+/// Slow variation between -1 and 1, with periods of 17 and 140 minutes.
 fn wander(t: f64) -> f64 {
     (0.6 * (t / 160.0).sin() + 0.4 * (t / 1340.0).sin()).clamp(-1.0, 1.0)
 }
 
-/// A sensor of 0.7 degrees of noise whose cell is at 50 C, 1 C more or less, for all the day, and at 40 C at its ends.
+/// A sensor with 0.7 degrees of noise. Its cell stays within 1 C of 50 C during the day and is at 40 C at both ends.
 fn temperature_day(alarm: &str) -> Day {
     let mut noise = Noise::new(1);
     day(configuration(alarm), Rule::TemperatureHigh, |_, t| {
@@ -162,17 +162,17 @@ fn temperature_day(alarm: &str) -> Day {
     })
 }
 
-/// A cell that is discharged to 10 % in the first hour, kept there, 0.6 % more or less every four minutes, and charged in
-/// the last. Both sensors are noisy (50 mA, 10 mV); the estimate, which the filter makes smooth, is what the rule compares.
+/// A cell is discharged to 10 % in the first hour, kept within 0.6 % of that level (period four minutes), and charged
+/// in the last hour. Both sensors are noisy (50 mA, 10 mV). The rule compares the filter's estimate, which is smoother.
 fn soc_day(alarm: &str) -> Day {
     let (mut noise, mut soc) = (Noise::new(2), 0.3);
     day(configuration(alarm), Rule::SocLow, |config, t| {
         let model = &config.model;
         let target = 0.1 + 0.2 * away(t) + 0.006 * (t / 40.0).sin();
-        // The charge that leads there in this second.
+        // Current that reaches the target within this second.
         let current_a = (soc - target) * model.capacity_ah * 3600.0;
         soc = soc_after(soc, current_a, model.capacity_ah);
-        // Branch in balance with the current.
+        // Branch voltages in equilibrium with the current.
         let place = model.grid_position(soc, 25.0);
         let voltage_v = terminal_v(model, &place, 1.0, 0.025 * current_a, current_a);
         (current_a + 0.05 * noise.next(), voltage_v + 0.01 * noise.next(), 25.0)
@@ -180,22 +180,22 @@ fn soc_day(alarm: &str) -> Day {
 }
 
 #[test]
-fn a_noisy_temperature_round_its_threshold_raises_and_clears_once_in_a_day() {
+fn noisy_temperature_near_threshold_raises_once() {
     let alarm = "rule = \"temperature_high\"\nwarning = { set = 50.0, clear = 46.0 }\ndebounce_s = 10.0\n";
     temperature_day(alarm).assert_quiet();
 }
 
 #[test]
-fn the_same_temperature_flickers_without_hysteresis_and_debounce() {
+fn noisy_temperature_without_hysteresis_flickers() {
     temperature_day("rule = \"temperature_high\"\nwarning = 50.0\nhysteresis = 0.0\n").assert_flickers();
 }
 
 #[test]
-fn a_noisy_state_of_charge_round_its_threshold_raises_and_clears_once_in_a_day() {
+fn noisy_soc_near_threshold_raises_once() {
     soc_day("rule = \"soc_low\"\nwarning = \"10 %\"\nhysteresis = 0.03\ndebounce_s = 10.0\n").assert_quiet();
 }
 
 #[test]
-fn the_same_state_of_charge_flickers_without_hysteresis_and_debounce() {
+fn noisy_soc_without_hysteresis_flickers() {
     soc_day("rule = \"soc_low\"\nwarning = \"10 %\"\nhysteresis = 0.0\n").assert_flickers();
 }

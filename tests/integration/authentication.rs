@@ -1,5 +1,5 @@
-//! Authenticated commands: a million forged, replayed, held back and older frames are not executed, every genuine one is; a
-//! journal replays without the key; frames that are sent never use a freshness twice.
+//! Authenticated commands: of a million frames, forged, replayed, delayed and outdated ones are never executed, and
+//! genuine ones always are. A journal replays without the key. Sent frames never reuse a freshness value.
 
 mod ecu;
 
@@ -13,14 +13,14 @@ use rand_chacha::ChaCha8Rng;
 
 use ecu::{Daemon, Ecu, FRESHNESS, REPLY, config, frame_of, key};
 
-/// What an attacker has recorded: at most this many frames, the newest.
+/// An attacker keeps this many recorded frames, the newest.
 const RECORDED: usize = 512;
 
-/// An attacker who hears everything and has no key.
+/// An attacker who hears all traffic but has no key.
 struct Attacker {
     rng: ChaCha8Rng,
     recorded: Vec<Frame>,
-    /// Genuine frames that never arrived, and when they were made.
+    /// Genuine frames that the attacker withheld, with their creation times.
     withheld: Vec<(i64, Frame)>,
     frames: u64,
     of_kind: [u64; 6],
@@ -42,7 +42,7 @@ impl Attacker {
         let frame = match kind {
             0 => old(&mut self.rng, &self.recorded),
             1 => {
-                // Held back for more than two announcements.
+                // A frame withheld for longer than two announcement periods.
                 let due = self.withheld.iter().position(|(made, _)| now_ms - made > 2000)?;
                 self.withheld[due].1
             }
@@ -53,14 +53,14 @@ impl Attacker {
                 frame_of(&payload)
             }
             3 => {
-                // A guess: right command, fresh value, any authenticator.
+                // A guess: correct command, fresh value, random authenticator.
                 let mut payload = other.made(3, 2047, fresh).data().to_vec();
                 other.authentication.write_mac(&mut payload, self.rng.random::<u128>().to_be_bytes());
                 frame_of(&payload)
             }
             4 => other.made(3, 2047, fresh),
             _ => {
-                // The data of one recorded frame, the end of another.
+                // The data of one recorded frame with the authenticator of another.
                 let (a, b) = (old(&mut self.rng, &self.recorded), old(&mut self.rng, &self.recorded));
                 if a.data()[..4] == b.data()[..4] {
                     return None;
@@ -74,13 +74,13 @@ impl Attacker {
     }
 }
 
-/// Hears what the daemon sent; the last announcement, if there was one.
+/// Delivers the daemon's sent frames to the ECU. Returns the last announcement, if there was one.
 fn hear(daemon: &Daemon, ecu: &mut Ecu) -> Option<Frame> {
     daemon.sent.iter().for_each(|frame| ecu.hear(frame));
     daemon.sent.iter().rev().find(|frame| frame.id() == CanId::standard(FRESHNESS).unwrap()).copied()
 }
 
-/// The announced value: below 2^36, so all of it is sent.
+/// The announced freshness value. It is below 2^36, so the frame carries it completely.
 fn freshness_of(announced: &Frame) -> u64 {
     let bits = announced.data().iter().fold(0, |bits, byte| bits << 8 | u64::from(*byte));
     bits >> Profile::Announcement.mac_bits()
@@ -102,7 +102,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
         if attacker.rng.random_range(0..40) == 0
             && let Some(frame) = ecu.command(attacker.rng.random_range(1..=3), 2047)
         {
-            // A sender that repeats a refused command with the next freshness is served.
+            // A sender that repeats a rejected command with the next freshness value succeeds.
             let mut sent = frame;
             let mut is_executed = daemon.receive(&sent);
             if !is_executed {
@@ -111,7 +111,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
                 sent = ecu.command(codes, 2047).unwrap_or_else(|| panic!("round {round}: no freshness left"));
                 is_executed = daemon.receive(&sent);
             }
-            assert!(is_executed, "round {round}: genuine and not executed");
+            assert!(is_executed, "round {round}: genuine frame was not executed");
             genuine += 1;
             attacker.record(frame);
             attacker.record(sent);
@@ -128,12 +128,12 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
         for _ in 0..30 {
             let executed = daemon.executed;
             if let Some(frame) = attacker.frame(daemon.ms, &latest, &other) {
-                assert!(!daemon.receive(&frame), "round {round}: executed {frame:?}");
+                assert!(!daemon.receive(&frame), "round {round}: executed the attacker's {frame:?}");
                 assert_eq!(daemon.executed, executed);
             }
         }
         if round % 300 == 0 {
-            // Killed, with a state up to six seconds old; the clock is right, unknown, or behind.
+            // Kill the daemon and restart it from a state up to six seconds old. The clock is right, unknown or late.
             let downtime = [Downtime::AsStamped, Downtime::Unknown, Downtime::Seconds(3.0)][(round / 300 % 3) as usize];
             let away_ms = [50, 30_000, -4_000, 4_000_000][(round / 300 % 4) as usize];
             daemon.restart(stored.clone(), downtime, away_ms);
@@ -153,22 +153,22 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
     );
     assert!(genuine > frames / 2000 && attacker.of_kind.iter().all(|count| *count > frames / 20));
     assert_eq!(daemon.executed, genuine);
-    assert_eq!(daemon.monitor.dropped().count(), 0, "every frame was judged, none dropped by the flood limit");
+    assert_eq!(daemon.monitor.dropped().count(), 0, "the flood limit dropped frames");
 }
 
 #[test]
-fn of_a_million_frames_without_the_key_none_is_executed_and_every_genuine_one_is() {
+fn million_attack_frames_only_genuine_execute() {
     attack(Profile::P1, 1_000_000, 1);
 }
 
 #[test]
-fn the_other_profiles_hold_too() {
+fn other_profiles_withstand_attacks() {
     attack(Profile::P3, 50_000, 2);
     attack(Profile::Fd, 50_000, 3);
 }
 
 #[test]
-fn the_example_of_the_manual_is_what_the_key_gives() {
+fn manual_example_matches_computed_authenticator() {
     let key = CanKey::parse(b"2b7e151628aed2a6abf7158809cf4f3c").unwrap();
     let mut ecu = Ecu::new(Profile::P1, key);
     ecu.authentication = Authentication { profile: Profile::P1, data_id: 0x124 };
@@ -179,7 +179,7 @@ fn the_example_of_the_manual_is_what_the_key_gives() {
 }
 
 #[test]
-fn every_command_has_a_reply_with_its_reason() {
+fn every_command_reply_carries_reason() {
     let mut daemon = Daemon::new(config("1", ""));
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
     daemon.pass(1000);
@@ -191,10 +191,10 @@ fn every_command_has_a_reply_with_its_reason() {
     };
     let first = ecu.command(1, 2047).unwrap();
     assert!(daemon.receive(&first));
-    assert_eq!(reply(&daemon), [1, 7, 1, 511], "accepted, nothing to do");
+    assert_eq!(reply(&daemon), [1, 7, 1, 511], "accepted without effect");
     daemon.pass(200);
     assert!(!daemon.receive(&first));
-    assert_eq!(reply(&daemon), [2, 9, 15, 511], "old freshness; the content is not repeated");
+    assert_eq!(reply(&daemon), [2, 9, 15, 511], "old freshness: the reply does not repeat the content");
     daemon.pass(200);
     let mut forged = ecu.command(3, 2047).unwrap().data().to_vec();
     forged[7] ^= 1;
@@ -204,7 +204,7 @@ fn every_command_has_a_reply_with_its_reason() {
     daemon.pass(1000);
     daemon.sent.iter().for_each(|frame| ecu.hear(frame));
     assert!(!daemon.receive(&ecu.command(1, 2047).unwrap()));
-    assert_eq!(reply(&daemon), [2, 10, 1, 511], "during an attack it has to come again");
+    assert_eq!(reply(&daemon), [2, 10, 1, 511], "during an attack the sender must repeat the command");
     daemon.pass(200);
     assert!(daemon.receive(&ecu.command(1, 2047).unwrap()));
     daemon.pass(200);
@@ -214,13 +214,13 @@ fn every_command_has_a_reply_with_its_reason() {
     );
     daemon.pass(200_000);
     daemon.sent.iter().for_each(|frame| ecu.hear(frame));
-    assert!(daemon.receive(&ecu.command(2, 2047).unwrap()), "the attack is over");
+    assert!(daemon.receive(&ecu.command(2, 2047).unwrap()), "rejected after the end of the attack");
     let counts = daemon.counts();
     assert_eq!((counts.authentic, counts.unconfirmed), (3, 3));
 }
 
 #[test]
-fn a_journal_gives_the_live_run_byte_for_byte_without_the_key() {
+fn journal_replay_without_key_equals_live_run() {
     let more = "[output.alarm]\nfd = true\nsecoc = \"fd\"\ndata_id = 0x500\n[[alarm]]\nrule = \"input_missing\"\nwarning = 1\n";
     let config = config("1", &more.replace("[output.alarm]\n", "[output.digest]\n"));
     let mut daemon = Daemon::new(config.clone());
@@ -235,7 +235,7 @@ fn a_journal_gives_the_live_run_byte_for_byte_without_the_key() {
         assert!(!daemon.receive(&frame));
     }
     let live = serde_json::to_string(&daemon.monitor.snapshot()).unwrap();
-    // The same inputs, as a journal has them: no key anywhere.
+    // The same inputs as a journal stores them, without the key.
     let (mut replay, mut out) = (Monitor::new(config), Outputs::default());
     for (ms, frame) in daemon.journal.take().unwrap() {
         let time = Timestamp::from_nanos(ms * 1_000_000);
@@ -250,18 +250,18 @@ fn a_journal_gives_the_live_run_byte_for_byte_without_the_key() {
     assert_eq!(serde_json::to_string(&replay.snapshot()).unwrap(), live);
     let executed = out.events.iter().filter(|event| matches!(event.kind, EventKind::Command { .. })).count();
     assert_eq!(executed, 60);
-    assert!(!live.contains("a0010203") && !live.contains("0102030405"), "no key in the state");
+    assert!(!live.contains("a0010203") && !live.contains("0102030405"), "the state contains the key");
 }
 
 #[test]
-fn without_announcements_what_was_announced_is_old_after_two_seconds() {
+fn announcement_expires_after_two_seconds() {
     for (stalled_ms, is_executed) in [(1_900, true), (2_100, false)] {
         let mut daemon = Daemon::new(config("1", ""));
         let mut ecu = Ecu::new(Profile::P1, key(0xA0));
         daemon.pass(1000);
         daemon.sent.iter().for_each(|frame| ecu.hear(frame));
         daemon.pass(20);
-        // No tick: the loop hangs, or the computer sleeps. The announcement was made 20 ms after a whole second.
+        // Stop the ticks (a hung loop or a suspended computer). The announcement was made 20 ms after a whole second.
         let frame = ecu.command(1, 2047).unwrap();
         daemon.ms += stalled_ms - 20;
         assert_eq!(daemon.receive(&frame), is_executed, "{stalled_ms}");
@@ -269,7 +269,7 @@ fn without_announcements_what_was_announced_is_old_after_two_seconds() {
 }
 
 #[test]
-fn a_frame_whose_authenticator_nobody_checked_is_not_executed() {
+fn frame_with_unchecked_authenticator_is_ignored() {
     let mut daemon = Daemon::new(config("1", ""));
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
     daemon.pass(1000);
@@ -281,7 +281,7 @@ fn a_frame_whose_authenticator_nobody_checked_is_not_executed() {
 }
 
 #[test]
-fn sent_frames_are_authenticated_and_their_freshness_rises_over_kills() {
+fn sent_freshness_rises_across_restarts() {
     let frames = "[output.digest]\nfd = true\nsecoc = \"fd\"\ndata_id = 0x501\n[output.status]\nfd = true\nsecoc = \"fd\"\ndata_id = 0x502\ne2e = \"1C\"\n";
     let mut daemon = Daemon::new(config("1", frames));
     let of = |id: u32| Authentication { profile: Profile::Fd, data_id: if id == 0x6B0 { 0x502 } else { 0x501 } };
@@ -292,7 +292,8 @@ fn sent_frames_are_authenticated_and_their_freshness_rises_over_kills() {
             daemon.pass(1000);
             for frame in daemon.sent.iter().filter(|frame| matches!(frame.id().raw(), 0x6B0 | 0x6B4)) {
                 let (authentication, last) = (of(frame.id().raw()), &mut last[usize::from(frame.id().raw() == 0x6B0)]);
-                // As a receiver does: the lowest value above the last one with these low bits.
+                // Reconstruct the freshness as a receiver does: the lowest value above the last one with these low
+                // bits.
                 let sent = authentication.sent_freshness(frame.data()).unwrap();
                 let freshness = *last + 1 + (sent.wrapping_sub(*last + 1) & 0xFFFF_FFFF);
                 let freshness =

@@ -1,4 +1,5 @@
-//! A parked vehicle: its buses fall silent as a whole, which is no fault; silence under load, or of one input, is one.
+//! A parked vehicle: if all its buses fall silent at once, this is not a fault. Silence under load, or of one input, is
+//! a fault.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::{CanId, Frame};
@@ -12,7 +13,7 @@ const ALARMS: &str = "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nsevere =
                       [[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n";
 const HOUR: i64 = 3600;
 
-/// A pack that drove and has stood for a minute.
+/// A pack that has been driven and then parked for a minute.
 fn parked() -> Rig {
     park(Rig::new(ALARMS))
 }
@@ -45,13 +46,13 @@ fn sleeps(events: &[Event]) -> Vec<(bool, Option<f64>)> {
 }
 
 #[test]
-fn a_night_is_four_events_and_no_alarm() {
+fn parked_night_gives_four_events_without_alarm() {
     let mut rig = parked();
     fall_silent(&mut rig);
     rig.seconds(8 * HOUR);
     assert!(rig.monitor.asleep_since().is_some());
-    assert_eq!(rig.monitor.pack_view().validity, Validity::Unavailable, "unknown does not look like healthy");
-    assert_eq!(rig.monitor.lost_inputs().count(), 0, "nothing is missing");
+    assert_eq!(rig.monitor.pack_view().validity, Validity::Unavailable, "a sleeping pack must not look healthy");
+    assert_eq!(rig.monitor.lost_inputs().count(), 0, "an input is reported missing");
     come_back(&mut rig);
     rig.seconds(60);
     let kinds: Vec<_> = rig.events.iter().map(|event| event.kind).collect();
@@ -62,7 +63,7 @@ fn a_night_is_four_events_and_no_alarm() {
 }
 
 #[test]
-fn bits_of_a_bms_that_balances_at_night_wake_no_bus() {
+fn balancing_bits_at_night_wake_no_bus() {
     let keys = "[input.balancing]\nsignal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n";
     let bit = |n: u8| format!(" SG_ Bleed{n} : {}|1@1+ (1,0) [0|1] \"\" A\n", n - 1);
     let dbc = format!("{DBC}BO_ 288 Bleeding: 1 A\n{}{}", bit(1), bit(2));
@@ -80,7 +81,7 @@ fn bits_of_a_bms_that_balances_at_night_wake_no_bus() {
 }
 
 #[test]
-fn a_restart_in_the_night_finds_a_sleeping_bus() {
+fn restart_at_night_finds_sleeping_bus() {
     let mut rig = parked();
     fall_silent(&mut rig);
     rig.seconds(HOUR);
@@ -91,7 +92,7 @@ fn a_restart_in_the_night_finds_a_sleeping_bus() {
 }
 
 #[test]
-fn silence_under_load_is_a_fault() {
+fn silence_under_load_raises_fault() {
     let mut rig = parked();
     rig.current_a = Some(5.0);
     rig.seconds(20);
@@ -102,29 +103,29 @@ fn silence_under_load_is_a_fault() {
 }
 
 #[test]
-fn silent_cells_among_other_inputs_are_a_fault() {
+fn silent_cells_among_active_inputs_raise_fault() {
     let mut rig = parked();
     rig.voltages_v = [None; 2];
     rig.seconds(60);
-    // Two cells, two severities.
+    // Two cells with two severities each.
     assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised; 4]));
-    // The others fall asleep later: the missing ones stay missing.
+    // The other inputs fall asleep later; the missing ones stay missing.
     fall_silent(&mut rig);
     rig.seconds(60);
     assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 4));
 }
 
 #[test]
-fn a_bus_that_never_brought_an_input_does_not_sleep() {
+fn bus_without_any_input_never_sleeps() {
     let mut rig = Rig::new(ALARMS);
     fall_silent(&mut rig);
     rig.seconds(60);
     assert_eq!((sleeps(&rig.events), rig.monitor.asleep_since()), (vec![], None));
-    assert!(!rig.changes(Rule::InputMissing).is_empty(), "the wiring may be wrong");
+    assert!(!rig.changes(Rule::InputMissing).is_empty(), "a possible wiring fault must be reported");
 }
 
 #[test]
-fn without_a_time_out_a_silent_bus_is_missing() {
+fn silent_bus_without_timeout_is_missing() {
     let mut rig = parked();
     rig.reload(|config| config.asleep_after_s = None).unwrap();
     fall_silent(&mut rig);

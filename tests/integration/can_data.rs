@@ -1,5 +1,5 @@
-//! Configured signals against the log of a real car: the pack's voltage and current of a Hyundai Kona, whose two
-//! buses use one identifier for different messages.
+//! Configured signals against the log of a real car: pack voltage and current of a Hyundai Kona. Its two buses use the
+//! same identifier for different messages.
 
 use std::io::Read;
 use std::path::Path;
@@ -10,7 +10,7 @@ use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::{CanId, Frame};
 use packwatch::quantity::{BusIndex, Channel};
 
-/// Frames of the log with the interface's number. Its lines are `(time) canN ID#DATA`, nothing else.
+/// Frames of the log with their interface number. Every line has the form `(time) canN ID#DATA`.
 fn frames(folder: &Path) -> Vec<(BusIndex, Frame)> {
     let file = std::fs::File::open(folder.join("kona2019_power_cycle_pcan_can0_ccan_can1.log.gz")).unwrap();
     let mut text = String::new();
@@ -42,7 +42,7 @@ fn pack(folder: &Path, bus: u8) -> InputMap {
     ])
 }
 
-/// Currents and voltages of the whole log, through one map.
+/// Currents and voltages of the whole log, decoded with one map.
 fn read(map: &InputMap, frames: &[(BusIndex, Frame)]) -> (Vec<f64>, Vec<f64>) {
     let (mut currents, mut voltages) = (Vec::new(), Vec::new());
     for (bus, frame) in frames {
@@ -68,14 +68,14 @@ fn near(found: f64, wanted: f64) -> bool {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_kona_s_pack_voltage_and_current_are_read_from_its_powertrain_bus_alone() {
+fn kona_pack_signals_come_from_powertrain_bus_only() {
     let folder = measured::path("can_ev");
     let frames = frames(&folder);
     assert_eq!(frames.len(), 39_546);
     let of_id = |bus| frames.iter().filter(|(on, frame)| on.0 == bus && frame.id() == CanId::Standard(0x595)).count();
-    assert_eq!((of_id(0), of_id(1)), (70, 108), "both buses carry the identifier");
+    assert_eq!((of_id(0), of_id(1)), (70, 108), "frames with the identifier per bus");
     let (currents, voltages) = read(&pack(&folder, 0), &frames);
-    assert_eq!((currents.len(), voltages.len()), (70, 70), "only what came on the bound interface");
+    assert_eq!((currents.len(), voltages.len()), (70, 70), "readings must come from the bound interface only");
     let ((low_a, high_a), (low_v, high_v)) = (ends(&currents), ends(&voltages));
     let mean_a = currents.iter().sum::<f64>() / 70.0;
     eprintln!("70 frames: {low_v} to {high_v} V, {low_a} to {high_a} A, mean {mean_a:.4} A");
@@ -86,8 +86,8 @@ fn a_kona_s_pack_voltage_and_current_are_read_from_its_powertrain_bus_alone() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_same_identifier_on_the_other_bus_would_read_as_hundreds_of_amperes() {
-    // Why the interface belongs to a binding: this is what a decoder keyed by the identifier alone would add.
+fn same_identifier_on_other_bus_decodes_wrongly() {
+    // Shows why a binding includes the interface: a decoder that looks at the identifier alone would add these values.
     let folder = measured::path("can_ev");
     let (currents, _) = read(&pack(&folder, 1), &frames(&folder));
     assert_eq!(currents.len(), 108);

@@ -1,4 +1,5 @@
-//! The rules that compare each cell with its pack: simulated packs with one fault, whole core, the alarms of every cell.
+//! Rules that compare each cell with its pack: simulated packs with one fault run through the whole core; the test
+//! checks the alarms of every cell.
 
 use std::fmt::Write as _;
 
@@ -16,7 +17,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// A hole in the record longer than this is sleep, s.
+/// A longer gap in the record means that the vehicle slept, s.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"
@@ -71,7 +72,7 @@ rule = "cell_imbalance"
 warning = "8 %"
 "#;
 
-/// Rules about what a cell's voltages show.
+/// Rules about a cell's voltages.
 const OF_CELL: [Rule; 6] = [
     Rule::CapacityLow,
     Rule::UsableCapacityLow,
@@ -85,7 +86,7 @@ fn config() -> MonitorConfig {
     load(PACK, "Temperature")
 }
 
-/// Three temperature sensors, each of four cells.
+/// Three temperature sensors with four cells each.
 fn config_with_three_sensors() -> MonitorConfig {
     let one = "[[input.temperature]]\nsignal = \"Pack.Temperature\"\n";
     let three = ["1-4", "5-8", "9-12"]
@@ -153,7 +154,7 @@ impl FaultyPack {
         }
     }
 
-    /// A healthy pack that a BMS balances.
+    /// A healthy pack with a balancing BMS.
     fn balanced(seed: u64, quality: SensorQuality) -> Self {
         let mut settings = settings();
         (settings.seed, settings.pack.spread.soc) = (seed, 0.005);
@@ -163,7 +164,8 @@ impl FaultyPack {
         pack
     }
 
-    /// Runs up to a day, and a quarter of an hour further: a row ends, and no input is missing any more after a night.
+    /// Runs to the given day plus a quarter of an hour, so that the day's row ends and all inputs are back after the
+    /// night.
     fn run_to(&mut self, day: f64) {
         let (mut out, mut frames) = (Outputs::default(), Vec::new());
         let mut moments_after = 0;
@@ -184,14 +186,14 @@ impl FaultyPack {
         }
     }
 
-    /// Stops and starts with the stored state, away for a second.
+    /// Stops the monitor for a second and restarts it with the stored state.
     fn restart(&mut self) {
         let stored = self.monitor.snapshot();
         self.monitor = Monitor::new(self.config.clone());
         self.monitor.restore(stored, Downtime::Seconds(1.0)).unwrap();
     }
 
-    /// Cells for which an alarm of the rule was raised, each as often as it was.
+    /// Cells for which an alarm of the rule was raised, once per raise.
     fn raised(&self, rule: Rule) -> Vec<Option<u16>> {
         let raised = self.events.iter().filter_map(|event| match event.kind {
             EventKind::Alarm { rule: of, cell, change: Change::Raised, .. } if of == rule => {
@@ -214,7 +216,7 @@ impl FaultyPack {
 }
 
 #[test]
-fn a_leak_raises_cell_leak_for_its_cell_alone_and_is_still_raised_after_a_restart() {
+fn leak_alarm_names_its_cell_and_survives_restart() {
     let mut pack = FaultyPack::new("leak:7:2mA@day1");
     pack.run_to(6.0);
     assert_eq!(pack.raised(Rule::CellLeak), [Some(6)]);
@@ -231,12 +233,12 @@ fn a_leak_raises_cell_leak_for_its_cell_alone_and_is_still_raised_after_a_restar
 }
 
 #[test]
-fn a_loose_contact_raises_connection_resistance_for_its_cell_alone() {
+fn loose_contact_raises_alarm_for_its_cell() {
     let mut pack = FaultyPack::new("contact:3:+50%@day1");
     pack.run_to(4.0);
     assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(2)]);
     assert_eq!(pack.raised(Rule::ChannelFaulty), []);
-    // At first a contact may look like a loss of charge.
+    // At first a loose contact may look like a loss of charge.
     assert!(pack.raised(Rule::CellLeak).iter().all(|cell| *cell == Some(2)));
     assert_ne!(pack.state(Rule::CellLeak, 2), AlarmState::Active);
     let contact = pack.value(Rule::ConnectionResistance, 2).unwrap();
@@ -244,7 +246,7 @@ fn a_loose_contact_raises_connection_resistance_for_its_cell_alone() {
 }
 
 #[test]
-fn healthy_cells_raise_nothing_and_are_all_judged() {
+fn healthy_cells_are_judged_without_alarm() {
     let mut pack = FaultyPack::new("");
     pack.run_to(6.0);
     for rule in [Rule::CellLeak, Rule::ConnectionResistance, Rule::ChannelFaulty] {
@@ -255,7 +257,7 @@ fn healthy_cells_raise_nothing_and_are_all_judged() {
 }
 
 #[test]
-fn a_stuck_channel_raises_channel_faulty_and_no_alarm_of_its_cell() {
+fn stuck_channel_raises_only_channel_faulty() {
     let mut pack = FaultyPack::new("voltage-stuck:5@30h");
     pack.run_to(4.0);
     assert_eq!(pack.raised(Rule::ChannelFaulty), [Some(4)]);
@@ -263,12 +265,12 @@ fn a_stuck_channel_raises_channel_faulty_and_no_alarm_of_its_cell() {
         assert_eq!(pack.raised(rule), [], "{rule:?}");
         assert_eq!(pack.state(rule, 4), AlarmState::Unknown, "{rule:?}");
     }
-    assert_ne!(pack.state(Rule::CapacityLow, 3), AlarmState::Unknown, "the others are judged");
+    assert_ne!(pack.state(Rule::CapacityLow, 3), AlarmState::Unknown, "the other cells must still be judged");
     assert_eq!(pack.raised(Rule::SocLow), []);
 }
 
 #[test]
-fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_next_pack_starts_anew() {
+fn faulty_channel_suppresses_alarm_until_new_pack() {
     let mut pack = FaultyPack::new("contact:5:+50%@6h voltage-offset:5:60mV@day3");
     pack.run_to(6.0);
     assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(4)]);
@@ -281,17 +283,21 @@ fn a_raised_alarm_of_a_cell_is_suppressed_while_its_channel_is_faulty_and_the_ne
     let mut out = Outputs::default();
     pack.monitor.handle(&Record::command(pack.monitor.now(), Command::PackReplaced), &mut out);
     assert_eq!(pack.state(Rule::ConnectionResistance, 4), AlarmState::Unknown);
-    assert_eq!(pack.state(Rule::ChannelFaulty, 4), AlarmState::Suppressed, "until the first row of the new pack");
+    assert_eq!(
+        pack.state(Rule::ChannelFaulty, 4),
+        AlarmState::Suppressed,
+        "suppressed until the first row of the new pack"
+    );
 }
 
-/// Kinds that were found, with their first and last cells.
+/// Fault kinds found, with their first and last cells.
 fn found(pack: &FaultyPack) -> Vec<(CellFaultKind, Option<(CellIndex, CellIndex)>)> {
     pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
 }
 
-/// A BMS bleeds a cell whose channel reads high below the others; it is healthy.
+/// A healthy cell's channel reads too high, so the BMS bleeds it below the others.
 #[test]
-fn cells_that_a_bms_bleeds_do_not_leak() {
+fn bled_cells_raise_no_leak() {
     use SensorQuality::{Good, Poor};
     for (seed, quality) in [(1, Good), (3, Good), (7, Poor), (8, Poor)] {
         let mut pack = FaultyPack::balanced(seed, quality);
@@ -303,7 +309,7 @@ fn cells_that_a_bms_bleeds_do_not_leak() {
 }
 
 #[test]
-fn a_leak_is_found_although_a_bms_bleeds_the_others() {
+fn leak_is_found_despite_balancing() {
     let mut settings = settings();
     settings.pack.spread.soc = 0.005;
     let mut pack = FaultyPack::simulated(config(), settings, Wiring::single(), "leak:7:20mA@day3");
@@ -312,7 +318,8 @@ fn a_leak_is_found_although_a_bms_bleeds_the_others() {
     assert!(found(&pack).contains(&(CellFaultKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
 }
 
-/// Findings of 14 days in a pack of 12 cells whose BMS balances with `Balancing::usual`; `configure` changes what the monitor knows of it.
+/// Findings of 14 days in a pack of 12 cells whose BMS balances with `Balancing::usual`. `configure` changes what the
+/// monitor knows about the balancing.
 fn found_in_balanced(
     fault: &str,
     bleed: f64,
@@ -335,14 +342,14 @@ fn found_in_balanced(
     found
 }
 
-/// Changes what the bits mean.
+/// Changes the meaning of the balancing bits.
 fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(MonitorConfig) -> MonitorConfig {
     move |config| MonitorConfig { balancing: config.balancing.map(change), ..config }
 }
 
-/// Without the bits only the lowest cell is one that may leak: what cell 3 loses may have been bled.
+/// Without the bits, only the lowest cell counts as leaking: cell 3 may have been bled.
 #[test]
-fn leaks_beside_that_of_the_lowest_cell_are_found_by_the_bits_of_what_is_bled() {
+fn balancing_bits_reveal_leaks_of_other_cells() {
     let leak_of = |cell| (CellFaultKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
     let faults = "leak:7:0.4mA@day3 leak:3:0.2mA@day3";
     assert_eq!(found_in_balanced(faults, 1.0, |config| config), [leak_of(2), leak_of(6)]);
@@ -350,12 +357,12 @@ fn leaks_beside_that_of_the_lowest_cell_are_found_by_the_bits_of_what_is_bled() 
     assert_eq!(found_in_balanced(faults, 1.0, without_bits), [leak_of(6)]);
 }
 
-/// What a cell loses while its bit does not come, or is not known, may have been bled.
+/// While a cell's balancing bit is missing or unknown, its loss may be due to bleeding.
 #[test]
-fn what_may_have_been_bled_is_no_leak() {
+fn loss_explained_by_bleeding_raises_no_leak() {
     let unseen = with_balancing(|it| BalancingConfig { is_only_while_sent: false, max_age_s: 10.0, ..it });
     assert_eq!(found_in_balanced("", 1.0, unseen), []);
-    assert_eq!(found_in_balanced("", 1.2, |config| config), [], "more than the bits are taken for");
+    assert_eq!(found_in_balanced("", 1.2, |config| config), [], "the loss exceeds what the bits explain");
     let without_a_bit = |mut config: MonitorConfig| {
         let is_kept = |binding: &Binding| binding.channel != Channel::Balancing(CellIndex(4));
         config.input = InputMap::new(config.input.bindings().iter().filter(|it| is_kept(it)).cloned().collect());
@@ -364,9 +371,9 @@ fn what_may_have_been_bled_is_no_leak() {
     assert_eq!(found_in_balanced("", 1.0, without_a_bit), []);
 }
 
-/// The bits of that time were not received, also where the BMS bleeds only while it sends them.
+/// The bits of the downtime were not received, even if the BMS bleeds only while it sends them.
 #[test]
-fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
+fn downtime_reduces_knowledge_of_leak() {
     let leak_std = |bleed_a: f64| {
         let keys =
             "[input.balancing]\nsignal = \"Balancing.Bleed{n}\"\nbleed_a = 0.0026\nonly_while_sent = true\n[output]\n";
@@ -376,7 +383,7 @@ fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
         let mut pack = FaultyPack::simulated(config, settings(), Wiring::single(), "");
         pack.sim = pack.sim.with_balancing_bits();
         pack.run_to(0.01);
-        // The daemon stops in the drive and starts after the vehicle was parked for nine hours.
+        // The daemon stops during the drive and starts after the vehicle was parked for nine hours.
         let stored = pack.monitor.snapshot();
         while pack.sim.advance().unwrap().time < Timestamp::from_secs(9.0 * 3600.0) {}
         pack.monitor = Monitor::new(pack.config.clone());
@@ -390,7 +397,7 @@ fn less_is_known_of_a_leak_where_the_daemon_did_not_run() {
 }
 
 #[test]
-fn a_frozen_current_is_found_once() {
+fn frozen_current_is_found_once() {
     let mut pack = FaultyPack::new("current-stuck@24h");
     pack.run_to(1.03);
     assert_eq!(found(&pack), [(CellFaultKind::CurrentFrozen, None)]);
@@ -401,9 +408,9 @@ fn a_frozen_current_is_found_once() {
     assert_eq!(pack.events.iter().filter(is_it).count(), 1);
 }
 
-/// With offsets of some kelvins the median of three readings may be the detached sensor itself.
+/// With offsets of several kelvins, the median of three readings may be the detached sensor itself.
 #[test]
-fn a_detached_temperature_sensor_is_found_whatever_the_offsets() {
+fn detached_temperature_sensor_is_found_despite_offsets() {
     let mut settings = settings();
     settings.sensors = Sensors::of_quality(SensorQuality::Poor);
     let temperature_at = [0, 4, 8].map(|cell| Some(CellIndex(cell))).to_vec();
@@ -419,8 +426,8 @@ fn a_detached_temperature_sensor_is_found_whatever_the_offsets() {
 }
 
 #[test]
-fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() {
-    // Far from each other, and side by side.
+fn swapped_channels_are_found_and_keep_their_cells() {
+    // Cells far apart, and adjacent cells.
     for (fault, other) in [("weak:3:-12% swap:3:8@day3", 7), ("weak:3:-12% swap:3:4@day3", 3)] {
         let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, fault);
         pack.run_to(1.9);
@@ -432,14 +439,14 @@ fn exchanged_channels_of_unlike_cells_are_found_and_not_taken_for_other_cells() 
 }
 
 #[test]
-fn cells_of_a_replaced_module_are_one_finding() {
+fn replaced_module_gives_one_finding() {
     let mut pack = FaultyPack::new("module:5-8:+15%@day2");
     pack.run_to(6.0);
     assert_eq!(found(&pack), [(CellFaultKind::Module, Some((CellIndex(4), CellIndex(7))))]);
 }
 
 #[test]
-fn a_contact_is_no_aged_cell_and_an_aged_cell_no_contact() {
+fn contact_and_aged_cell_are_distinguished() {
     for (fault, kind) in
         [("contact:3:+40%", CellFaultKind::Contact), ("resistance:3:+30%", CellFaultKind::HighResistance)]
     {

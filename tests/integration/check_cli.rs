@@ -1,4 +1,4 @@
-//! `packwatch check` as its user runs it.
+//! Runs `packwatch check` as a user does.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ fn packwatch() -> Command {
     command
 }
 
-/// Standard output of a run that must succeed without a word on standard error.
+/// Standard output of a run that must succeed with nothing on standard error.
 fn good(args: &[&str]) -> String {
     let output = packwatch().args(args).output().unwrap();
     let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
@@ -18,7 +18,7 @@ fn good(args: &[&str]) -> String {
     text(&output.stdout)
 }
 
-/// Exit code and lines on standard error of a run that must fail without a word on standard output.
+/// Exit code and lines on standard error of a run that must fail with nothing on standard output.
 fn bad(file: &Path) -> (i32, Vec<String>) {
     let output = packwatch().arg("check").arg(file).output().unwrap();
     assert!(output.stdout.is_empty());
@@ -26,7 +26,7 @@ fn bad(file: &Path) -> (i32, Vec<String>) {
     (output.status.code().unwrap(), lines)
 }
 
-/// The shipped files of `config/`, or of a folder below, that end in `.toml`.
+/// The shipped `.toml` files of `config/` or one of its folders.
 fn shipped(folder: &str) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap();
     let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
@@ -37,17 +37,17 @@ fn shipped(folder: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn every_shipped_configuration_is_good() {
-    // The uplink's settings are checked by its own tests.
+fn every_shipped_configuration_is_valid() {
+    // The uplink's own tests check its settings.
     for file in shipped("config").into_iter().filter(|file| !file.ends_with("uplink.toml")) {
         let said = good(&["check", file.to_str().unwrap()]);
         assert!(said.starts_with(&format!("{}: good\n", file.display())), "{said}");
     }
 }
 
-/// As the comment says it: packwatch once had 30 % there and 80 % in the key.
+/// The comment, the key and the alarm must state the same percentage; they once differed (30 % and 80 %).
 #[test]
-fn the_measured_cell_s_end_of_life_is_one_in_comment_key_and_alarm() {
+fn measured_cell_end_of_life_is_consistent() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");
     let text = std::fs::read_to_string(&file).unwrap();
     let said = text.split_once("End of life as the publishers of the data state it: ").unwrap().1;
@@ -62,14 +62,14 @@ fn the_measured_cell_s_end_of_life_is_one_in_comment_key_and_alarm() {
 }
 
 #[test]
-fn every_shipped_cell_model_is_good() {
+fn every_shipped_cell_model_is_valid() {
     for file in shipped("config/cells") {
         packwatch::config::cell_model::load(&file).unwrap();
     }
 }
 
 #[test]
-fn a_good_file_is_explained() {
+fn valid_file_is_explained() {
     let said = good(&["check", "config/example.toml"]);
     for part in [
         "96 cells in series, each with its own voltage",
@@ -86,7 +86,7 @@ fn a_good_file_is_explained() {
 }
 
 #[test]
-fn json_says_the_same_for_scripts() {
+fn json_output_matches_text() {
     let json: serde_json::Value = serde_json::from_str(&good(&["check", "--json", "config/example.toml"])).unwrap();
     assert_eq!(json["signals"].as_array().unwrap().len(), 1 + 12 + 96);
     assert_eq!(json["signals"][0]["channel"], "pack current");
@@ -96,7 +96,7 @@ fn json_says_the_same_for_scripts() {
 }
 
 #[test]
-fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
+fn all_faults_are_reported_with_exit_code_78() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
     write("cell.toml", "format = 1\nname = \"x\"\nrated_capacity_ah = 0\n");
@@ -119,7 +119,7 @@ fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
     }
 }
 
-/// A copy of `config/paper.toml` with the files it names, and these drop-ins.
+/// A copy of `config/paper.toml` with the files it names, and the given drop-ins.
 fn with_drop_ins(drop_ins: &[(&str, &str)]) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -140,7 +140,7 @@ fn with_drop_ins(drop_ins: &[(&str, &str)]) -> (tempfile::TempDir, PathBuf) {
 }
 
 #[test]
-fn drop_ins_are_merged_and_shown_with_the_place_of_each_part() {
+fn drop_ins_are_merged_with_their_places() {
     let drop_ins = [("20-late.toml", "[pack]\nambient_c = 12.5\n"), ("10-early.toml", "[pack]\nambient_c = 3\n")];
     let (_folder, file) = with_drop_ins(&drop_ins);
     let name = file.to_str().unwrap();
@@ -155,7 +155,7 @@ fn drop_ins_are_merged_and_shown_with_the_place_of_each_part() {
 }
 
 #[test]
-fn commands_without_a_key_are_called_unauthenticated() {
+fn commands_without_key_are_called_unauthenticated() {
     let commands = "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 0x321\n";
     let (_folder, file) = with_drop_ins(&[("commands.toml", commands)]);
     let said = good(&["check", file.to_str().unwrap()]);
@@ -163,7 +163,7 @@ fn commands_without_a_key_are_called_unauthenticated() {
 }
 
 #[test]
-fn a_faulty_drop_in_is_refused_and_merged_shows_it_all_the_same() {
+fn faulty_drop_in_is_rejected_but_shown_merged() {
     let (_folder, file) = with_drop_ins(&[("a.toml", "[pack]\ncells = 0\n")]);
     let fault = format!("{}.d/a.toml:2: pack.cells = 0, must be 1 to 1024", file.display());
     assert_eq!(bad(&file), (78, vec![fault.clone()]));
@@ -174,7 +174,7 @@ fn a_faulty_drop_in_is_refused_and_merged_shows_it_all_the_same() {
 }
 
 #[test]
-fn the_fingerprint_is_that_of_the_files_one_after_the_other() {
+fn fingerprint_covers_all_files_in_order() {
     use packwatch::status::document::ConfigFile;
     let (folder, file) = with_drop_ins(&[]);
     let plain = ConfigFile::of(&file).unwrap();
@@ -189,20 +189,20 @@ fn the_fingerprint_is_that_of_the_files_one_after_the_other() {
 }
 
 #[test]
-fn a_file_that_is_not_there_is_a_bad_configuration() {
+fn missing_file_is_invalid_configuration() {
     let (code, lines) = bad(Path::new("no/such/file.toml"));
     assert_eq!((code, lines.len()), (78, 1));
     assert!(lines[0].starts_with("no/such/file.toml: cannot be read: "), "{lines:?}");
 }
 
 #[test]
-fn the_reference_page_is_printed() {
+fn reference_page_is_printed() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/src/reference/keys.md")).unwrap();
     assert_eq!(good(&["check", "--reference"]), page);
 }
 
 #[test]
-fn a_file_with_a_warning_is_usable_and_not_called_good() {
+fn file_with_warning_is_usable_but_flagged() {
     let folder = tempfile::tempdir().unwrap();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     std::fs::create_dir(folder.path().join("cells")).unwrap();

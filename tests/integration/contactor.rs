@@ -1,4 +1,5 @@
-//! Contactors that say they are open: no current flows, whatever its sensor reports, and a state without news is unknown.
+//! If the contactors report open, no current flows, whatever the sensor reports. A contactor state that is no longer
+//! received counts as unknown.
 
 use packwatch::monitor::Downtime;
 use packwatch::quantity::catalogue::Quantity;
@@ -25,7 +26,7 @@ fn soc(rig: &Rig) -> f64 {
 }
 
 #[test]
-fn open_contactors_mean_no_current_and_closed_ones_the_measured_one() {
+fn contactor_state_selects_zero_or_measured_current() {
     let mut rig = rig();
     assert_eq!((current_a(&rig), rig.monitor.mode()), (Some(1.0), Mode::Discharge));
     for open in [0.0, 3.0] {
@@ -40,20 +41,20 @@ fn open_contactors_mean_no_current_and_closed_ones_the_measured_one() {
 }
 
 #[test]
-fn open_contactors_stand_in_for_a_current_that_is_missing() {
+fn open_contactors_replace_missing_current() {
     let mut rig = rig();
     (rig.current_a, rig.contactor) = (None, Some(0.0));
     rig.seconds(30);
     assert_eq!((current_a(&rig), rig.monitor.mode()), (Some(0.0), Mode::Rest));
-    assert!(rig.monitor.lost_inputs().eq([Channel::Current]), "the input is missing all the same");
-    // Closed, or not known: nothing is known of the current.
+    assert!(rig.monitor.lost_inputs().eq([Channel::Current]), "the input must still be reported missing");
+    // If the contactors are closed or unknown, the current is unknown.
     rig.contactor = Some(1.0);
     rig.seconds(1);
     assert_eq!(current_a(&rig), None);
 }
 
 #[test]
-fn a_state_without_news_is_unknown_and_the_current_as_measured() {
+fn stale_contactor_state_uses_measured_current() {
     let mut rig = rig();
     rig.contactor = Some(0.0);
     rig.seconds(5);
@@ -63,7 +64,7 @@ fn a_state_without_news_is_unknown_and_the_current_as_measured() {
     rig.seconds(3);
     assert_eq!(current_a(&rig), Some(1.0));
     assert!(rig.monitor.lost_inputs().eq([Channel::Contactor]));
-    // Bad readings are none: before the first good one the current is as measured.
+    // Invalid readings do not count: before the first valid one, the measured current applies.
     let mut silent = Rig::new(CONTACTOR);
     silent.current_a = Some(1.0);
     silent.seconds(10);
@@ -71,7 +72,7 @@ fn a_state_without_news_is_unknown_and_the_current_as_measured() {
 }
 
 #[test]
-fn the_same_frames_give_the_same_outputs_also_over_a_restart_with_open_contactors() {
+fn restart_with_open_contactors_is_deterministic() {
     let run = |restarts: bool| {
         let mut rig = rig();
         rig.contactor = Some(0.0);
@@ -87,6 +88,6 @@ fn the_same_frames_give_the_same_outputs_also_over_a_restart_with_open_contactor
     };
     let (first, restarted) = (run(false), run(true));
     assert_eq!(first, run(false));
-    // A restart of 0 s is a downtime all the same: the estimate is within what that may move it.
+    // Even a restart of 0 s is a downtime: the estimate may move within its tolerance.
     assert!((first.2 - restarted.2).abs() < 1e-3 && first.3 == restarted.3, "{} {}", first.2, restarted.2);
 }

@@ -1,7 +1,8 @@
-//! The contract with other ECUs: a listener that loses frames, starts late and sees the daemon killed has the daemon's table of
-//! alarms after two cycles. The listener knows the written DBC and the manual's page `ecu/contract.md`, nothing else.
+//! The contract with other ECUs: a listener that loses frames, starts late and sees the daemon killed has the daemon's
+//! alarm table after two cycles. The listener is built only from the written DBC and the manual's page
+//! `ecu/contract.md`.
 //!
-//! `PACKWATCH_CONTRACT_RUNS` says how many runs (200); the whole are 10,000.
+//! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
 
 mod listener;
 mod replies;
@@ -21,7 +22,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::support::config_texts;
 
-/// Cells, and how many of them are on a page of their message.
+/// Number of cells, and cells per page of their message.
 const CELLS: u16 = 96;
 const PAGE_CELLS: u16 = 3;
 const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
@@ -29,9 +30,9 @@ const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
 const LOSS: f64 = 0.1;
 /// Restarts in a run.
 const RESTARTS: u32 = 10;
-/// Step in which the daemon's table is looked at, ms.
+/// Interval at which the daemon's table is compared, ms.
 const STEP_MS: i64 = 100;
-/// Longest time until no alarm has changed for two cycles, ms: the share of bad readings moves for a minute.
+/// Maximum wait until no alarm has changed for two cycles, ms: the share of bad readings changes for up to a minute.
 const MAX_WAIT_MS: i64 = 600_000;
 const BUS: BusIndex = BusIndex(0);
 
@@ -84,10 +85,10 @@ fn load() -> Config {
     config_texts::load(PACK, &dbc)
 }
 
-/// Periods of the digest after which a table is no longer confirmed.
+/// After this many digest periods without a digest, the table is no longer confirmed.
 const DIGEST_TIMEOUT_PERIODS: i64 = 3;
 
-/// A listener with the time-out of the digest: rule 5 of the contract.
+/// A listener with the digest timeout: rule 5 of the contract.
 struct TimedListener {
     listener: Listener,
     digest: CanId,
@@ -119,18 +120,18 @@ impl TimedListener {
     }
 }
 
-/// The daemon with its bus, its disk, and what its inputs show now.
+/// The daemon with its bus, its disk, and its simulated inputs.
 struct Daemon<'a> {
     config: &'a Config,
     random: ChaCha8Rng,
     monitor: Monitor,
-    /// What the disk has: stored with every change of an alarm, as the service does.
+    /// State on disk, stored at every alarm change as the service does.
     stored: Snapshot,
     encoder: InputEncoder,
     out: Outputs,
     now_ms: i64,
     listener: Option<TimedListener>,
-    /// Whether no digest reaches the listener.
+    /// Whether all digests to the listener are lost.
     is_digest_lost: bool,
     /// Per page of cells: 0 good, 1 missing, 2 out of range.
     pages: [u8; PAGES],
@@ -138,7 +139,7 @@ struct Daemon<'a> {
 }
 
 impl<'a> Daemon<'a> {
-    /// With a listener from the beginning.
+    /// Creates a daemon with a listener attached from the start.
     fn with_listener(config: &'a Config, seed: u64) -> Self {
         let listener = TimedListener::new(config.output_layout.as_ref().unwrap());
         Self { listener: Some(listener), ..Self::new(config, seed) }
@@ -182,7 +183,7 @@ impl<'a> Daemon<'a> {
         self.out.clear();
     }
 
-    /// Time passes: frames of the inputs twice a second, ticks when they do something.
+    /// Advances the time: input frames twice a second, and ticks when they have an effect.
     fn run_for(&mut self, duration_ms: i64) {
         let end_ms = self.now_ms + duration_ms;
         while self.now_ms < end_ms {
@@ -212,7 +213,7 @@ impl<'a> Daemon<'a> {
         }
     }
 
-    /// Something happens to the vehicle, or a command comes.
+    /// Applies a random change of the vehicle, or a command.
     fn act(&mut self) {
         let time = self.now();
         match self.random.random_range(0..10) {
@@ -240,7 +241,7 @@ impl<'a> Daemon<'a> {
         }
     }
 
-    /// The process is killed, and starts from the disk.
+    /// Kills the process and restarts it from the stored state.
     fn restart(&mut self) {
         let away_ms = self.random.random_range(5..300) * 10;
         let age_ms = away_ms + self.now_ms - self.stored.time.nanos() / 1_000_000;
@@ -249,7 +250,7 @@ impl<'a> Daemon<'a> {
         self.monitor.restore(self.stored.clone(), Downtime::Seconds(age_ms as f64 / 1000.0)).unwrap();
     }
 
-    /// The raised alarms as their frames carry them.
+    /// The raised alarms, encoded as in their frames.
     fn table(&self) -> AlarmTable {
         let raised = self.monitor.alarms().raised();
         raised
@@ -271,7 +272,7 @@ impl<'a> Daemon<'a> {
     }
 }
 
-/// One run. Returns the largest number of raised alarms, and two cycles, ms.
+/// Performs one run. Returns the largest number of raised alarms and the length of two cycles, ms.
 fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
     let mut daemon = Daemon::new(config, seed);
     let joins = daemon.random.random_range(0..=RESTARTS);
@@ -298,21 +299,21 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
         if now != state {
             (state, since_ms) = (now, daemon.now_ms);
         }
-        // The listener's own idea of a cycle may be as late as its last digest.
+        // The listener's cycle time may be as old as its last digest.
         two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().listener.cycle_ms();
-        assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms change for ever");
+        assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms never settle");
     }
     let (truth, rules) = (daemon.table(), daemon.rules());
     let now_ms = daemon.now_ms;
     let listener = daemon.listener.as_mut().unwrap();
     assert_eq!(listener.table(now_ms), truth, "seed {seed}");
-    assert!(listener.is_confirmed(now_ms), "seed {seed}: the table is right, and the listener must know it");
+    assert!(listener.is_confirmed(now_ms), "seed {seed}: the listener does not confirm a correct table");
     assert_eq!(listener.listener.rules(), &rules, "seed {seed}");
     (most.max(truth.len()), two_cycles_ms)
 }
 
 #[test]
-fn a_listener_that_loses_a_tenth_of_the_frames_has_the_table_after_two_cycles() {
+fn lossy_listener_has_table_after_two_cycles() {
     let runs: u64 = std::env::var("PACKWATCH_CONTRACT_RUNS").map_or(200, |runs| runs.parse().unwrap());
     let config = load();
     let database = config.output_layout.clone().unwrap();
@@ -325,18 +326,18 @@ fn a_listener_that_loses_a_tenth_of_the_frames_has_the_table_after_two_cycles() 
     eprintln!(
         "{runs} runs, {mean:.1} alarms at once ({most} at most), two cycles of up to {longest_ms} ms: 0 differences"
     );
-    assert!(most > 97 && sum > 3 * usize::try_from(runs).unwrap(), "the runs raise alarms");
+    assert!(most > 97 && sum > 3 * usize::try_from(runs).unwrap(), "too few alarms for this test");
 }
 
 #[test]
-fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
+fn listener_needs_digest_to_remove_alarms() {
     let config = load();
     let mut daemon = Daemon::with_listener(&config, 1);
     daemon.temperature_c = Some(55.0);
     daemon.run_for(3_000);
     let raised = daemon.listener.as_mut().unwrap().table(daemon.now_ms);
     assert!(raised.contains_key(&(9, 2, 2047)), "{raised:?}");
-    // The daemon is killed and forgets: nothing announces the end, and the digest shows it.
+    // Kill the daemon and discard its alarms. No frame announces their end; only the digest shows it.
     daemon.monitor = Monitor::new(config.monitor.clone());
     daemon.temperature_c = Some(25.0);
     daemon.run_for(3_000);
@@ -347,20 +348,20 @@ fn a_listener_without_the_digest_s_removal_would_keep_alarms_that_are_over() {
 }
 
 #[test]
-fn a_right_table_is_not_confirmed_once_the_digest_has_stopped_for_its_time_out() {
+fn digest_timeout_withdraws_table_confirmation() {
     let config = load();
     let mut daemon = Daemon::with_listener(&config, 2);
     let timeout_ms = daemon.listener.as_ref().unwrap().timeout_ms;
     let manual = include_str!("../../docs/src/ecu/contract.md");
     let row = manual.lines().find(|line| line.starts_with("| `PACKWATCH_Digest` |")).unwrap();
-    assert!(row.ends_with(&format!("| {timeout_ms} ms |")), "the manual has another time-out: {row}");
+    assert!(row.ends_with(&format!("| {timeout_ms} ms |")), "the manual's timeout differs: {row}");
     daemon.temperature_c = Some(55.0);
     daemon.run_for(8_000);
     let confirmed = |daemon: &mut Daemon<'_>| {
         let (now_ms, truth) = (daemon.now_ms, daemon.table());
         let listener = daemon.listener.as_mut().unwrap();
         assert!(truth.contains_key(&(9, 2, 2047)), "{truth:?}");
-        assert_eq!(listener.table(now_ms), truth, "alarm frames keep the table right");
+        assert_eq!(listener.table(now_ms), truth, "alarm frames keep the table correct");
         listener.is_confirmed(now_ms)
     };
     assert!(confirmed(&mut daemon));
@@ -380,7 +381,7 @@ fn a_right_table_is_not_confirmed_once_the_digest_has_stopped_for_its_time_out()
 }
 
 #[test]
-fn a_listener_that_never_received_a_digest_confirms_no_table() {
+fn listener_without_digest_confirms_nothing() {
     let config = load();
     let mut daemon = Daemon::with_listener(&config, 3);
     daemon.is_digest_lost = true;

@@ -1,4 +1,5 @@
-//! Our decoding against `cantools`, an independent decoder, run live with the interpreter `PACKWATCH_PYTHON` names.
+//! Compares packwatch's decoding with `cantools`, an independent decoder, run by the interpreter that
+//! `PACKWATCH_PYTHON` names.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ffi::OsString;
@@ -13,7 +14,7 @@ use packwatch::quantity::Fault;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Payloads per page of a message (a message without pages is one page).
+/// Payloads per page of a message. A message without pages counts as one page.
 const PAYLOADS: usize = 1000;
 
 fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
@@ -23,8 +24,8 @@ fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
     })
 }
 
-/// Random payloads: for each page of the message `PAYLOADS` of them with its selectors written. The other selectors
-/// get codes that some signal is there for: cantools refuses a payload with any other code.
+/// Random payloads: `PAYLOADS` for each page of the message, with the page's selectors written. The other selectors get
+/// codes that some signal uses, because cantools rejects a payload with any other code.
 fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.conditions).collect();
     let mut pages: Vec<&[MuxCondition]> = Vec::new();
@@ -60,18 +61,18 @@ fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     made
 }
 
-/// What a comparison of a whole DBC came to.
+/// Result of the comparison of a whole DBC.
 #[derive(Debug, Default)]
 struct Tally {
     payloads: usize,
     values: usize,
-    /// Values compared of each signal, by full name.
+    /// Number of compared values per signal, by full name.
     per_signal: BTreeMap<String, usize>,
-    /// Short frames of each signal that reaches past its message.
+    /// Number of short frames per signal that extends past its message.
     short: BTreeMap<String, usize>,
 }
 
-/// Compares every signal of every message in every payload, presence included.
+/// Compares every signal of every message in every payload, including its presence.
 fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
     let db = Database::parse_bytes(&std::fs::read(path).unwrap()).unwrap();
     let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -91,10 +92,10 @@ fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
     let signals: usize = db.messages.iter().map(|message| message.signals.len()).sum();
     let counted = ask(python, path, &["count"], &[]);
     assert_eq!(counted, [format!("{} {signals}", db.messages.len())], "messages and signals");
-    // A message that cannot exist (no bytes) has no signal; every other signal is in one list or in the other.
-    assert_eq!(tally.per_signal.len() + tally.short.len(), signals, "a signal was never there");
+    // A message that cannot exist (no bytes) has no signal. Every other signal is in one of the two lists.
+    assert_eq!(tally.per_signal.len() + tally.short.len(), signals, "a signal was never present");
     for (name, count) in tally.per_signal.iter().chain(&tally.short) {
-        assert!(*count >= PAYLOADS, "{name} was there {count} times");
+        assert!(*count >= PAYLOADS, "{name} was present only {count} times");
     }
     eprintln!(
         "{}: {} messages, {signals} signals ({} past their message), {} payloads, {} values compared",
@@ -112,7 +113,7 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
         let name = format!("{}.{}", message.name, signal.name);
         let found = signal.layout.plan().unwrap().physical(payload);
         let Some(wanted) = expected.remove(&signal.name) else {
-            assert_eq!(found, Err(Fault::ShortFrame), "cantools has no {name} in {}", hex(payload));
+            assert_eq!(found, Err(Fault::ShortFrame), "cantools finds no {name} in {}", hex(payload));
             *tally.short.entry(name).or_default() += 1;
             continue;
         };
@@ -121,7 +122,7 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
             let close = (found - wanted).abs() <= 1e-9 * wanted.abs().max(1e-9);
             assert!(close, "{name} in {}: {found} for {wanted}", hex(payload));
         } else {
-            // On the wire, or only after the factor: neither may come out as a value.
+            // The raw value is invalid, or the scaled value is; neither may be returned.
             let plan = signal.layout.plan().unwrap();
             let fault = plan.decode(payload).unwrap_err();
             assert!(matches!(fault, Fault::NotFinite | Fault::OutOfRange), "{name} in {}: {fault:?}", hex(payload));
@@ -134,18 +135,18 @@ fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<Str
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn every_signal_of_the_tesla_dbc_decodes_as_cantools_does() {
+fn tesla_dbc_signals_decode_as_cantools() {
     let path = measured::path("can_ev/tesla_model3.dbc");
     let Some(python) = python() else { return };
     let tally = compare(&python, &path, false);
     let past: BTreeSet<String> = ask(&python, &path, &["short"], &[]).into_iter().collect();
     assert_eq!(tally.short.keys().cloned().collect::<BTreeSet<_>>(), past, "signals that reach past their message");
     assert!(!past.is_empty() && tally.per_signal.len() > 3000);
-    eprintln!("past their message, always a short frame: {past:?}");
+    eprintln!("extend past their message, always a short frame: {past:?}");
 }
 
 #[test]
-fn every_signal_of_the_shipped_dbcs_decodes_as_cantools_does() {
+fn shipped_dbc_signals_decode_as_cantools() {
     let Some(python) = python() else { return };
     for name in ["packwatch.dbc", "pack96.dbc", "measured.dbc"] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name);
@@ -153,8 +154,8 @@ fn every_signal_of_the_shipped_dbcs_decodes_as_cantools_does() {
     }
 }
 
-/// Pages below pages, ranges of codes, two multiplexors side by side, an extended identifier, both byte orders,
-/// floats, 64 bits across nine bytes, a payload of 64 bytes.
+/// Nested pages, code ranges, two parallel multiplexors, an extended identifier, both byte orders, floats, 64 bits
+/// across nine bytes, a payload of 64 bytes.
 const EXTENDED: &str = r#"VERSION ""
 
 NS_ :
@@ -200,7 +201,7 @@ SIG_VALTYPE_ 513 SingleBig : 1;
 "#;
 
 #[test]
-fn extended_multiplexing_floats_and_long_payloads_decode_as_cantools_does() {
+fn extended_multiplexing_decodes_as_cantools() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("extended.dbc");
@@ -211,12 +212,12 @@ fn extended_multiplexing_floats_and_long_payloads_decode_as_cantools_does() {
 }
 
 #[test]
-fn the_alarm_rules_are_those_of_the_shipped_value_table() {
+fn alarm_rules_match_shipped_value_table() {
     let db = default_database().unwrap();
     let table = &db.signal("PACKWATCH_Alarm.Rule").unwrap().1.values;
     for rule in Rule::ALL {
         let named = (i64::from(rule as u8), format!("{rule:?}"));
         assert!(table.contains(&named), "{named:?}");
     }
-    assert_eq!(table.len(), Rule::ALL.len() + 1, "and not available");
+    assert_eq!(table.len(), Rule::ALL.len() + 1, "all rules, and `not available`");
 }

@@ -1,4 +1,4 @@
-//! `packwatch diagnose` as its user meets it: the pack's lines against the simulator's truth.
+//! Runs `packwatch diagnose` as a user does and compares the pack's lines with the simulator's truth.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::Command;
 use assert_cmd::cargo::cargo_bin;
 use serde_json::Value;
 
-/// The leaking cell and the one with a stuck channel, counted from 1, of 96.
+/// The leaking cell and the cell with a stuck channel, counted from 1, of 96 cells.
 const LEAKING: u64 = 7;
 const STUCK: u64 = 20;
 
@@ -17,8 +17,8 @@ fn packwatch(args: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Usable charge and what balancing would give back, fractions of the mean cell's capacity, and the cell that ends a discharge, by
-/// the last true state of every cell.
+/// From the last true state of every cell: usable charge and the charge that balancing would recover, as fractions of
+/// the mean cell's capacity, and the cell that ends a discharge.
 fn truth(path: &Path) -> (f64, f64, u64) {
     let mut cells: BTreeMap<u64, (f64, f64)> = BTreeMap::new();
     for row in csv::Reader::from_path(path).expect("the truth").deserialize() {
@@ -38,7 +38,7 @@ fn truth(path: &Path) -> (f64, f64, u64) {
 }
 
 #[test]
-fn the_charge_that_a_leak_costs_is_that_of_the_simulator_and_the_cell_is_named() {
+fn leak_cost_matches_simulator_and_names_cell() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = |name: &str| -> PathBuf { folder.path().join(name) };
     let text = |path: PathBuf| path.display().to_string();
@@ -66,7 +66,7 @@ fn the_charge_that_a_leak_costs_is_that_of_the_simulator_and_the_cell_is_named()
     assert_eq!((pack["discharge_limit"]["cell"].as_u64(), first_empty), (Some(LEAKING), LEAKING));
     assert_eq!((&pack["discharge_limit"]["reason"], &pack["unknown"]), (&Value::from("leak"), &Value::Null));
     assert_eq!(pack["left_out"], serde_json::json!([{ "cell": STUCK, "reason": "faulty_channel" }]));
-    // A state has no cell model of a file: no energy.
+    // The state has no cell model from a file, hence no energy.
     assert_eq!(pack["usable"]["kwh"], Value::Null);
 
     let lines = packwatch(&["diagnose", "--state", &state]);
@@ -78,7 +78,7 @@ fn the_charge_that_a_leak_costs_is_that_of_the_simulator_and_the_cell_is_named()
 }
 
 #[test]
-fn a_pack_that_was_not_compared_is_unknown() {
+fn uncompared_pack_is_unknown() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = |name: &str| folder.path().join(name).display().to_string();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml").display().to_string();

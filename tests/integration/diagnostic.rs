@@ -1,4 +1,4 @@
-//! Cells behind diagnostic answers, end to end: simulated, replayed, estimated; and the log of a car that was polled.
+//! Cells read by diagnostic requests, end to end: simulated, replayed, estimated; and the log of a polled car.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{Monitor, Outputs, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
-/// A Leaf: 96 cells of 16 bits in group 2 of service 0x21, current and pack values in group 1.
+/// A Nissan Leaf: 96 cells of 16 bits in group 2 of service 0x21; current and pack values in group 1.
 const LEAF: &str = r#"[pack]
 cells = 96
 cell_model = "CELL"
@@ -61,7 +61,7 @@ fn packwatch(args: &[&str]) -> Vec<u8> {
 }
 
 #[test]
-fn every_cell_of_a_leaf_is_estimated_from_its_answers() {
+fn leaf_cells_are_estimated_from_answers() {
     assert!(LEAF.lines().count() <= 60);
     let folder = tempfile::tempdir().unwrap();
     let config = written(folder.path(), LEAF);
@@ -79,10 +79,10 @@ fn every_cell_of_a_leaf_is_estimated_from_its_answers() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_leafs_log_gives_what_its_answers_say() {
+fn leaf_log_gives_values_of_its_answers() {
     let log = measured::path("can_ev/leaf2019_uds_poll.log.gz");
     let folder = tempfile::tempdir().unwrap();
-    // The logger asked for groups 1 and 4 only: no cell is in this log.
+    // The logger requested groups 1 and 4 only, so this log contains no cells.
     let pack = LEAF.replace(
         "[input.cell_voltage]\nsignal = \"Leaf.Cell{n}\"",
         "[input.pack_voltage]\nsignal = \"Leaf.PackVoltage\"",
@@ -96,9 +96,10 @@ fn the_leafs_log_gives_what_its_answers_say() {
     assert!(controller["lost"].as_array().unwrap().iter().all(|lost| lost == 0), "{controller}");
 }
 
-/// The current rises while the answer with the cells is under way: their voltages belong to the current at its first frame.
+/// The current rises while the answer with the cells is transmitted: their voltages belong to the current at its first
+/// frame.
 #[test]
-fn the_values_of_an_answer_are_of_its_first_frame() {
+fn answer_values_are_dated_to_first_frame() {
     let folder = tempfile::tempdir().unwrap();
     let pack = LEAF.replace("cells = 96", "cells = 8").replacen("0x79B", "0x797", 1).replacen("0x7BB", "0x79A", 1);
     let config = packwatch::config::load(&written(folder.path(), &pack)).unwrap().monitor;
@@ -127,9 +128,10 @@ fn the_values_of_an_answer_are_of_its_first_frame() {
     assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 8]);
 }
 
-/// As in a public definition of a car: the pack's voltage lacks a division by ten, and is limited to what the author expected.
+/// Reproduces a fault of a public car definition: the pack voltage lacks a division by ten and is limited to the range
+/// its author expected.
 #[test]
-fn the_doctor_compares_the_cells_of_answers_with_a_pack_voltage_that_is_off_by_ten() {
+fn doctor_finds_pack_voltage_off_by_ten() {
     let folder = tempfile::tempdir().unwrap();
     let pack = LEAF.replace(
         r#"{ name = "PackVoltage", bit = 144, length = 16, factor = 0.01, unit = "V", minimum = 200, maximum = 450 }"#,

@@ -1,5 +1,6 @@
-//! `packwatch discover` on logs of real cars, and on simulated traffic among messages of random content: pack voltage,
-//! current, cells and temperature are among the first three candidates, and what `--write` writes is a configuration.
+//! `packwatch discover` on logs of real cars, and on simulated traffic among messages of random content. Pack voltage,
+//! current, cells and temperature must be among the first three candidates, and `--write` must write a valid
+//! configuration.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use serde_json::Value;
 use crate::import_obdb::{self, Case};
 use crate::support::measured;
 
-/// Share of the expected signals that must be among the first three.
+/// Fraction of the expected signals that must be among the first three candidates.
 const BAR: f64 = 0.8;
 
 fn config(name: &str) -> PathBuf {
@@ -29,7 +30,7 @@ fn found(document: &Value, quantity: &str) -> Vec<String> {
     of_quantity.map(|candidate| candidate["signal"].as_str().unwrap().to_owned()).collect()
 }
 
-/// A log, its options, and the signal that is each quantity.
+/// A log, its options, and the expected signal of each quantity.
 struct Trial<'a> {
     name: &'a str,
     log: PathBuf,
@@ -38,7 +39,7 @@ struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// Hits among the first three, of how many; misses are printed.
+    /// Returns the hits among the first three candidates and the number of quantities. Prints misses.
     fn run(&self) -> (usize, usize) {
         let mut args = vec!["discover", self.log.to_str().unwrap(), "--json"];
         args.extend(self.options.iter().map(String::as_str));
@@ -53,7 +54,7 @@ impl Trial<'_> {
     }
 }
 
-/// A pack that publishes these signals, simulated.
+/// Simulates a pack that publishes these signals.
 fn simulate(folder: &Path, name: &str, dbc: &Path, inputs: &str, cells: u32) -> PathBuf {
     let text = format!(
         "[pack]\ncells = {cells}\nstrings = 25\ncell_model = {:?}\n[[interface]]\nname = \"can0\"\n[input]\ndbc = [{:?}]\n{inputs}",
@@ -67,7 +68,7 @@ fn simulate(folder: &Path, name: &str, dbc: &Path, inputs: &str, cells: u32) -> 
     log
 }
 
-/// Adds every other message of the DBC, twice a second, with bytes that change at random.
+/// Adds every other message of the DBC twice a second, with random bytes.
 fn add_other_messages(log: &Path, dbc: &Path) {
     let text = std::fs::read_to_string(log).unwrap();
     let stamp = |line: &str| line[1..line.find(')').unwrap()].parse::<f64>().unwrap();
@@ -96,7 +97,7 @@ fn add_other_messages(log: &Path, dbc: &Path) {
     std::fs::write(log, all).unwrap();
 }
 
-/// The raw frames of a car's cases as a log: each answer behind its request, a second apart.
+/// Writes the raw frames of a car's test cases as a log: each request followed by its answer, one per second.
 fn log_of_cases(folder: &Path, car: &str, year: &str, identifiers: &[&str], log: &Path) {
     let mut streams: Vec<Vec<Case>> = Vec::new();
     for identifier in identifiers {
@@ -147,7 +148,7 @@ const TESLA_OF_CELLS: &[(&str, &str)] = &[
     ("cell_voltage", "ID401CellVoltages.Cell{n}"),
     ("temperature", "ID332BattCellMinMax.BattCellTempMax332"),
 ];
-/// Without a DBC: messages are named by their number.
+/// Without a DBC, messages are named by their number.
 const KONA_FIELDS: &[(&str, &str)] = &[
     ("current", "Message1429.Current_16bits_at_32_little"),
     ("pack_voltage", "Message1429.Voltage_16bits_at_48_little"),
@@ -165,7 +166,7 @@ const KONA_ANSWERS: &[(&str, &str)] = &[
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn signals_of_three_cars_are_among_the_first_three_candidates() {
+fn car_signals_are_among_first_three_candidates() {
     let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let (kona, tesla) = (data.join("kona_pcan.dbc"), data.join("tesla_model3.dbc"));
@@ -204,7 +205,7 @@ fn signals_of_three_cars_are_among_the_first_three_candidates() {
     ];
     for (index, expected) in [(2, KONA_FIELDS), (4, TESLA_FIELDS)] {
         let log = trials[index].log.clone();
-        trials.push(Trial { name: "the same without a DBC", log, options: Vec::new(), expected });
+        trials.push(Trial { name: "the same log without a DBC", log, options: Vec::new(), expected });
     }
     {
         let obd = import_obdb::folder();
@@ -215,13 +216,13 @@ fn signals_of_three_cars_are_among_the_first_three_candidates() {
     }
     let scores: Vec<(usize, usize)> = trials.iter().map(Trial::run).collect();
     let (hits, all) = scores.iter().fold((0, 0), |(hits, all), score| (hits + score.0, all + score.1));
-    eprintln!("{hits} of {all} among the first three");
+    eprintln!("{hits} of {all} signals among the first three candidates");
     assert!(hits as f64 >= BAR * all as f64, "{hits} of {all}");
 }
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_written_configuration_is_accepted_and_estimates_the_log() {
+fn written_configuration_is_valid_and_estimates_log() {
     let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let tesla = data.join("tesla_model3.dbc");
@@ -232,7 +233,7 @@ fn a_written_configuration_is_accepted_and_estimates_the_log() {
     packwatch(&["discover", log, "--dbc", dbc, "--write", pack, "--model", model]).success();
     packwatch(&["check", pack]).success();
     let text = std::fs::read_to_string(pack).unwrap();
-    assert!(text.contains("positive = \"charge\""), "the simulated bus counts charge positive: {text}");
+    assert!(text.contains("positive = \"charge\""), "the simulated bus reports charge as positive: {text}");
     let output = packwatch(&["replay", "-c", pack, log, "--json"]).success();
     let summary: Value = serde_json::from_slice(&output.get_output().stdout).unwrap();
     assert!(summary.to_string().contains("96"), "{summary}");
@@ -240,7 +241,7 @@ fn a_written_configuration_is_accepted_and_estimates_the_log() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn fields_without_a_dbc_are_written_with_one() {
+fn discovered_fields_are_written_with_dbc() {
     let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let tesla = data.join("tesla_model3.dbc");
@@ -257,7 +258,7 @@ fn fields_without_a_dbc_are_written_with_one() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn what_the_log_does_not_show_is_a_question_and_nothing_is_written() {
+fn ambiguous_log_asks_and_writes_nothing() {
     let data = measured::path("can_ev");
     let folder = tempfile::tempdir().unwrap();
     let (pack, model) = (folder.path().join("pack.toml"), config("cells/example_nmc_2600.toml"));
@@ -273,7 +274,7 @@ fn what_the_log_does_not_show_is_a_question_and_nothing_is_written() {
 }
 
 #[test]
-fn bad_input_is_an_error_that_names_the_file() {
+fn bad_input_error_names_file() {
     let folder = tempfile::tempdir().unwrap();
     let (log, other) = (folder.path().join("a.log"), folder.path().join("b.json"));
     std::fs::write(&log, "(1.000000) can0 100#00\n").unwrap();

@@ -1,6 +1,6 @@
-//! Our end-to-end protection against two independent ones, PyPI `autosar-e2e` (profiles 1A, 1C and 5) and `cantools`
-//! (profile 5), run live with the interpreter `PACKWATCH_PYTHON` names. Both ways: what we protect they accept, what they
-//! protect we accept, byte for byte equal, and a payload with one wrong bit is refused by all alike.
+//! Compares our end-to-end protection with two independent implementations, PyPI `autosar-e2e` (profiles 1A, 1C and 5)
+//! and `cantools` (profile 5), run by the interpreter that `PACKWATCH_PYTHON` names. Each side must accept the other's
+//! payloads, both must produce equal bytes, and both must reject a payload with one wrong bit.
 
 use std::ffi::OsString;
 use std::io::Write;
@@ -11,19 +11,19 @@ use packwatch::can::e2e::{Profile, Protection};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Payloads of each profile.
+/// Payloads per profile.
 const PAYLOADS: usize = 100_000;
 
-/// The interpreter; `None`, and said so, when none is named.
+/// The interpreter. Prints a note and returns `None` if none is set.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
-        eprintln!("SKIPPED: PACKWATCH_PYTHON names no Python with autosar-e2e and cantools, nothing was compared");
+        eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with autosar-e2e and cantools");
     }
     python
 }
 
-/// What the oracle answers, line by line.
+/// Lines that the oracle answers.
 fn ask(python: &OsString, lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/e2e_oracle.py");
     let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
@@ -43,19 +43,19 @@ fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len() / 2).map(|n| u8::from_str_radix(&hex[2 * n..2 * n + 2], 16).unwrap()).collect()
 }
 
-/// One payload on both sides.
+/// One payload, protected by both sides.
 struct Case {
     protection: Protection,
     /// Our next counter.
     counter: u8,
-    /// Before protection, with the previous counter in its place.
+    /// Payload before protection, with the previous counter value.
     raw: Vec<u8>,
     ours: Vec<u8>,
     flipped: Vec<u8>,
 }
 
 impl Case {
-    /// Random identifier, length, payload, counter and wrong bit.
+    /// Draws a random identifier, length, payload, counter and wrong bit.
     fn random(profile: Profile, random: &mut ChaCha8Rng) -> Self {
         let mut below = |limit: usize| usize::try_from(random.next_u32()).unwrap() % limit;
         let data_id = u16::try_from(below(usize::from(profile.max_data_id()) + 1)).unwrap();
@@ -82,13 +82,13 @@ impl Case {
         format!("{} {data_id} {} {} {}", profile.name(), hex(&self.raw), hex(&self.ours), hex(&self.flipped))
     }
 
-    /// Compares one peer's answer: its payload, and whether it accepts ours and the one with a wrong bit.
+    /// Checks one peer's answer: its payload, and whether it accepts ours and rejects the one with a wrong bit.
     fn compare(&self, peer: &str, answer: &[&str]) {
         let what = self.question();
         let [theirs, accepts, accepts_flipped] = answer else { panic!("{peer} answers {answer:?} to {what}") };
         let theirs = bytes(theirs);
         assert_eq!(theirs, self.ours, "{peer} protects otherwise: {what}");
-        assert_eq!(self.protection.verified_counter(&theirs), Some(self.counter), "we refuse {peer}'s: {what}");
+        assert_eq!(self.protection.verified_counter(&theirs), Some(self.counter), "we reject {peer}'s payload: {what}");
         assert_eq!(*accepts, "1", "{peer} refuses ours: {what}");
         assert_eq!(*accepts_flipped, "0", "{peer} accepts a wrong bit: {what}");
         assert_eq!(self.protection.verified_counter(&self.flipped), None, "we accept a wrong bit: {what}");
@@ -111,31 +111,31 @@ fn compare(profile: Profile) {
             by_cantools += 1;
         }
     }
-    // cantools has profile 5 only, and that from 4 bytes on.
+    // cantools supports profile 5 only, for payloads of at least 4 bytes.
     let wanted = cases.iter().filter(|case| profile == Profile::P05 && case.raw.len() >= 4).count();
     assert_eq!(by_cantools, wanted);
     let counters: std::collections::BTreeSet<_> = cases.iter().map(|case| case.counter).collect();
-    assert_eq!(counters.len(), usize::from(profile.max_counter()) + 1, "every counter occurred");
+    assert_eq!(counters.len(), usize::from(profile.max_counter()) + 1, "every counter value must occur");
     eprintln!("profile {}: {} payloads both ways, {by_cantools} of them by cantools too", profile.name(), cases.len());
 }
 
 #[test]
-fn profile_1a_is_that_of_the_peer() {
+fn profile_1a_matches_peer() {
     compare(Profile::P01A);
 }
 
 #[test]
-fn profile_1c_is_that_of_the_peer() {
+fn profile_1c_matches_peer() {
     compare(Profile::P01C);
 }
 
 #[test]
-fn profile_5_is_that_of_the_peers() {
+fn profile_5_matches_peers() {
     compare(Profile::P05);
 }
 
 #[test]
-fn the_invalid_counter_15_is_refused_by_the_peer_too_whatever_the_crc() {
+fn peer_rejects_invalid_counter_15_too() {
     let Some(python) = python() else { return };
     let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
     let payload = |crc: u8| vec![crc, 0x0F, 1, 2];

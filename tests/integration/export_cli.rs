@@ -1,4 +1,5 @@
-//! `packwatch export` as its user runs it: the tables hold what a replay reports, and are whole or absent.
+//! Runs `packwatch export` as a user does. The tables hold what a replay reports; a failed export leaves no partial
+//! table.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,7 +15,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// A simulated life of three cycles.
+    /// Simulates a life of three cycles.
     fn new() -> Self {
         Self::of_cycles("3")
     }
@@ -35,7 +36,7 @@ impl Bench {
         command.current_dir(self.folder.path()).args(args).arg("--config").arg(config).assert()
     }
 
-    /// Rows, each by its columns' names.
+    /// Rows as maps from column name to value.
     fn csv(&self, name: &str) -> Vec<BTreeMap<String, String>> {
         let mut reader = csv::Reader::from_path(self.path(name)).unwrap();
         reader.deserialize().map(Result::unwrap).collect()
@@ -47,7 +48,7 @@ impl Bench {
 }
 
 #[test]
-fn estimates_are_those_of_a_replay() {
+fn exported_estimates_match_replay() {
     let bench = Bench::new();
     bench.run(&["replay", "--estimates", "e.csv", "life.log"]).success();
     bench.run(&["export", "--period", "0", "--out", "out", "life.log"]).success();
@@ -68,7 +69,7 @@ fn estimates_are_those_of_a_replay() {
 }
 
 #[test]
-fn half_cycles_and_alarms_are_those_of_a_replay_and_say_what_remains() {
+fn exported_half_cycles_and_alarms_match_replay() {
     let bench = Bench::of_cycles("12");
     bench.run(&["replay", "--events", "e.jsonl", "life.log"]).success();
     bench.run(&["export", "--format", "csv", "--out", "out", "life.log"]).success();
@@ -94,7 +95,7 @@ fn half_cycles_and_alarms_are_those_of_a_replay_and_say_what_remains() {
 }
 
 #[test]
-fn tables_of_another_log_are_replaced_and_that_is_reported() {
+fn replacing_tables_of_other_log_is_reported() {
     let bench = Bench::new();
     bench.run(&["export", "--out", "out", "life.log"]).success();
     fs::create_dir(bench.path("b")).unwrap();
@@ -103,11 +104,14 @@ fn tables_of_another_log_are_replaced_and_that_is_reported() {
     let stdout = String::from_utf8_lossy(&printed.get_output().stdout).into_owned();
     assert!(stdout.contains("replaced the tables of life.log"), "{stdout}");
     let printed = bench.run(&["export", "--out", "out", "b/life.log"]).success();
-    assert!(!String::from_utf8_lossy(&printed.get_output().stdout).contains("replaced"), "the same log is no other");
+    assert!(
+        !String::from_utf8_lossy(&printed.get_output().stdout).contains("replaced"),
+        "the tables of the same log are not reported as replaced"
+    );
 }
 
 #[test]
-fn a_csv_is_dated_by_the_table_beside_it() {
+fn csv_is_dated_by_cycles_table() {
     let bench = Bench::new();
     fs::write(bench.path("b5.csv"), "cycle,time_s,current_a,voltage_v,temperature_c\n7,0,1,3.9,24\n7,10,1,3.9,24\n")
         .unwrap();
@@ -119,7 +123,7 @@ fn a_csv_is_dated_by_the_table_beside_it() {
 }
 
 #[test]
-fn the_period_thins_estimates_and_nothing_else() {
+fn period_thins_only_estimates() {
     let bench = Bench::new();
     for (out, period) in [("all", "0"), ("thin", "60")] {
         bench.run(&["export", "--period", period, "--out", out, "life.log"]).success();
@@ -132,7 +136,7 @@ fn the_period_thins_estimates_and_nothing_else() {
 }
 
 #[test]
-fn csv_and_parquet_hold_the_same() {
+fn csv_and_parquet_hold_same_rows() {
     let bench = Bench::new();
     bench.run(&["export", "--out", "p", "life.log"]).success();
     bench.run(&["export", "--format", "csv", "--out", "c", "life.log"]).success();
@@ -152,7 +156,7 @@ fn csv_and_parquet_hold_the_same() {
 }
 
 #[test]
-fn files_say_where_they_come_from() {
+fn exported_files_name_their_source() {
     let bench = Bench::new();
     bench.run(&["export", "--out", "out", "life.log"]).success();
     let reader = bench.parquet("out/life/alarms.parquet");
@@ -166,7 +170,7 @@ fn files_say_where_they_come_from() {
 }
 
 #[test]
-fn a_log_that_fails_leaves_no_table_and_the_others_go_on() {
+fn failed_log_leaves_no_table_others_continue() {
     let bench = Bench::new();
     fs::write(bench.path("bad.log"), "(1.0) nonsense\n").unwrap();
     let printed = bench.run(&["export", "--strict", "--out", "out", "bad.log", "life.log", "none.log"]).code(1);
@@ -179,7 +183,7 @@ fn a_log_that_fails_leaves_no_table_and_the_others_go_on() {
 }
 
 #[test]
-fn the_page_about_the_columns_is_the_one_in_the_repository() {
+fn columns_page_matches_repository() {
     let output = Command::cargo_bin("packwatch").unwrap().args(["export", "--columns-page"]).assert().success();
     let page = String::from_utf8(output.get_output().stdout.clone()).unwrap();
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/src/reference/export.md");
@@ -190,9 +194,9 @@ fn the_page_about_the_columns_is_the_one_in_the_repository() {
     );
 }
 
-/// Python's readers as peers, where one is installed.
+/// Compares with Python's readers, if installed.
 #[test]
-fn other_readers_agree() {
+fn python_readers_agree() {
     let bench = Bench::new();
     for (format, out) in [("parquet", "p"), ("csv", "c")] {
         bench.run(&["export", "--format", format, "--out", out, "life.log"]).success();

@@ -1,4 +1,4 @@
-//! `packwatch fit` as its user runs it.
+//! Runs `packwatch fit` as a user does.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ fn packwatch() -> Command {
     Command::cargo_bin("packwatch").unwrap()
 }
 
-/// Pulses of 2 A for 60 s every 120 s from a full 1 Ah cell of 50 mohm, one row a second.
+/// Pulses of 2 A for 60 s every 120 s, from a full 1 Ah cell of 50 mohm, one row per second.
 fn pulses(folder: &Path, rows: u32, first_v: f64) -> PathBuf {
     let mut text = "time_s,current_a,voltage_v\n".to_owned();
     let mut out_ah = 0.0;
@@ -27,7 +27,7 @@ fn pulses(folder: &Path, rows: u32, first_v: f64) -> PathBuf {
     path
 }
 
-/// Standard error of a run that must fail with code 1 and leave no model.
+/// Standard error of a run that must fail with code 1 and write no model.
 fn refused(folder: &Path, args: &[&str]) -> String {
     let model = folder.join("model.toml");
     let output = packwatch().arg("fit").args(["--name", "cell", "-o"]).arg(&model).args(args).output().unwrap();
@@ -37,7 +37,7 @@ fn refused(folder: &Path, args: &[&str]) -> String {
 }
 
 #[test]
-fn a_simple_cell_is_found_and_the_model_loads() {
+fn simple_cell_is_fitted_and_model_loads() {
     let folder = tempfile::tempdir().unwrap();
     let file = pulses(folder.path(), 3500, 4.2);
     let model = folder.path().join("model.toml");
@@ -52,7 +52,7 @@ fn a_simple_cell_is_found_and_the_model_loads() {
     assert!(json["rmse_v"].as_f64().unwrap() < 0.002, "{json}");
     assert_eq!(json["files"][0]["rows"], 3500);
     assert!(json["seconds"].as_f64().unwrap() > 0.0);
-    assert!(first == second, "two runs, two models");
+    assert!(first == second, "two runs gave different models");
     let loaded = packwatch::config::cell_model::load(&model).unwrap();
     assert_eq!(loaded.name, "a \"cell\"");
     let place = loaded.grid_position(0.5, 25.0);
@@ -61,7 +61,7 @@ fn a_simple_cell_is_found_and_the_model_loads() {
 }
 
 #[test]
-fn unusable_data_are_refused_with_the_reason() {
+fn unusable_data_is_rejected_with_reason() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     pulses(folder.path(), 3500, 3.6);
@@ -88,7 +88,7 @@ fn unusable_data_are_refused_with_the_reason() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_papers_pulse_test_is_met_within_ten_millivolts() {
+fn paper_pulse_test_fits_within_10_mv() {
     let file = measured::path("nasa_randomized/RW9_pulsed_discharge_1hz.csv.gz");
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("rw9.toml");
@@ -102,7 +102,7 @@ fn the_papers_pulse_test_is_met_within_ten_millivolts() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn an_ageing_cells_first_cycles_give_a_model_of_discharge_and_charge() {
+fn first_cycles_give_discharge_and_charge_model() {
     let file = measured::path("nasa_pcoe_aging/B0005.csv.gz");
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("b0005.toml");

@@ -1,4 +1,4 @@
-//! Models from labels and from ordinary drives: `score --chemistry`, `fit --log`, on a simulated cell and on measured ones.
+//! Models from labels and from ordinary drives (`score --chemistry`, `fit --log`), on simulated and measured cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -10,9 +10,9 @@ use serde_json::Value;
 
 use crate::support::measured;
 
-/// Capacity of the simulated cell, Ah; its label says 3.
+/// True capacity of the simulated cell, Ah; its label says 3.
 const TRUE_AH: f64 = 2.7;
-/// Its resistances relative to the prior's.
+/// Its resistances relative to the chemistry prior.
 const RESISTANCE: f64 = 1.4;
 
 fn run(args: &[&str]) -> (Option<i32>, String, String) {
@@ -27,7 +27,8 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// Voltages of a cell of the chemistry, but with a curve 15 mV higher in the middle, another capacity and other resistances.
+/// A cell of the chemistry with an open-circuit curve 15 mV higher in the middle, another capacity and other
+/// resistances.
 fn true_model() -> CellModel {
     let mut model = Label::usual(Chemistry::NcaGraphite, TRUE_AH).model().unwrap();
     let soc = model.soc.clone();
@@ -37,7 +38,7 @@ fn true_model() -> CellModel {
     model
 }
 
-/// A drive from `soc` to 15 %: 20 s at 2C, 20 s at C/2, 20 s of rest, again and again; with rests of 10 min.
+/// A drive from `soc` to 15 %: repeats 20 s at 2C, 20 s at C/2 and 20 s of rest, with longer rests of 10 min.
 fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     let model = true_model();
     let mut text = "time_s,current_a,voltage_v,temperature_c,discharged_ah\n".to_owned();
@@ -70,7 +71,7 @@ fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     path
 }
 
-/// Root mean square, points, and share inside of the only score.
+/// Root mean square error, points, and fraction within the interval, of the only score.
 fn soc_score(args: &[&str]) -> (f64, f64) {
     let found = json(args);
     let soc = &found["scores"][0]["soc"];
@@ -80,7 +81,7 @@ fn soc_score(args: &[&str]) -> (f64, f64) {
 const LABEL: [&str; 4] = ["--chemistry", "nca-graphite", "--rated", "3"];
 
 #[test]
-fn drives_that_begin_anywhere_give_capacity_and_curve() {
+fn partial_drives_give_capacity_and_curve() {
     let folder = tempfile::tempdir().unwrap();
     let paths = [
         drive(folder.path(), "a.csv", 0.97, 1),
@@ -106,7 +107,7 @@ fn drives_that_begin_anywhere_give_capacity_and_curve() {
 }
 
 #[test]
-fn what_a_fit_to_logs_needs_is_named() {
+fn log_fit_names_missing_data() {
     let folder = tempfile::tempdir().unwrap();
     let short = folder.path().join("short.csv");
     std::fs::write(&short, "time_s,current_a,voltage_v\n0,1,3.7\n1,1,3.7\n").unwrap();
@@ -129,7 +130,7 @@ fn what_a_fit_to_logs_needs_is_named() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_measured_cell_is_known_after_two_drives() {
+fn two_drives_identify_measured_cell() {
     let file =
         |name: &str| measured::path(&format!("panasonic_18650pf/25C/{name}.csv.gz")).to_str().unwrap().to_owned();
     let (a, b, c) = (file("Cycle_1"), file("Cycle_2"), file("NN"));
@@ -138,7 +139,7 @@ fn a_measured_cell_is_known_after_two_drives() {
     let model = model.to_str().unwrap();
     let label = ["--chemistry", "nca-graphite", "--rated", "2.9"];
     let truth = ["score", "--json", "--truth-capacity", "2.99", &c];
-    // tests/label.md has all cells: 2 to 4 points from the label, below 1 after two drives.
+    // tests/label.md lists all cells: 2 to 4 points from the label, below 1 after two drives.
     let (label_rmse, label_inside) = soc_score(&[&truth[..], &label].concat());
     assert!(label_rmse < 4.0 && label_inside > 0.85, "{label_rmse} {label_inside}");
     json(&[&["fit", "--json", "--log", &a, &b, "-o", model][..], &label].concat());

@@ -1,4 +1,5 @@
-//! Bad logs for `fit --log`: a model that is fitted to them is no worse than that of the label, and the output says what is missing.
+//! Bad logs for `fit --log`: the fitted model must be at least as good as the label's, and the output must name what is
+//! missing.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -8,26 +9,26 @@ use packwatch::cell::circuit::{self, BranchAt};
 use packwatch::cell::{CellModel, Chemistry, Discretisation, Label};
 use serde_json::Value;
 
-/// Capacity of the simulated cell, Ah, and its resistances relative to the prior's.
+/// Capacity of the simulated cell, Ah, and its resistances relative to the chemistry prior.
 const TRUE_AH: f64 = 50.0;
 const RESISTANCE: f64 = 1.3;
 
-/// How a log is made.
+/// Properties of a generated log.
 #[derive(Clone, Copy)]
 struct Drive {
     chemistry: Chemistry,
     capacity_ah: f64,
-    /// SOC at its beginning and at its end.
+    /// SOC at the beginning and at the end.
     soc: (f64, f64),
     has_rests: bool,
     has_temperature: bool,
-    /// Interval of the rows, s.
+    /// Interval between rows, s.
     every_s: u32,
-    /// Step of the voltages, V.
+    /// Voltage resolution, V.
     step_v: f64,
     /// Error of the current sensor, A.
     offset_a: f64,
-    /// Seconds without rows: from, to.
+    /// Interval without rows, s: from, to.
     gap: (u32, u32),
 }
 
@@ -44,7 +45,7 @@ const DRIVE: Drive = Drive {
 };
 
 impl Drive {
-    /// The true cell: that of the label with a curve 15 mV higher in the middle.
+    /// The true cell: the label's, with an open-circuit curve 15 mV higher in the middle.
     fn model(&self) -> CellModel {
         let mut model = Label::usual(self.chemistry, self.capacity_ah).model().unwrap();
         let soc = model.soc.clone();
@@ -54,7 +55,8 @@ impl Drive {
         model
     }
 
-    /// Current at a second, A: 20 s at 1C, 20 s at C/3, 20 s of rest, rests of 10 min; a charge has half of it.
+    /// Current at a second, A: 20 s at 1C, 20 s at C/3, 20 s of rest, longer rests of 10 min; half of that for a
+    /// charge.
     fn current_a(&self, second: u32) -> f64 {
         let discharge_a = match second % 60 {
             _ if self.has_rests && second % 3000 > 2400 => 0.0,
@@ -66,7 +68,7 @@ impl Drive {
         if self.soc.1 > self.soc.0 { -0.5 * discharge_a } else { discharge_a }
     }
 
-    /// Adds its rows, from a second on; returns the second after it.
+    /// Appends the rows, starting at second `from`. Returns the second after the last row.
     fn write(&self, text: &mut String, from: u32) -> u32 {
         let model = self.model();
         let (mut soc, mut branch_v, mut second) = (self.soc.0, [0.0; 3], from);
@@ -94,7 +96,7 @@ impl Drive {
     }
 }
 
-/// A file of several drives, one after the other.
+/// Writes a file of several consecutive drives.
 fn log(folder: &Path, name: &str, drives: &[Drive]) -> PathBuf {
     let mut text = "time_s,current_a,voltage_v,temperature_c,discharged_ah\n".to_owned();
     let mut second = 0;
@@ -112,14 +114,14 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// Root mean square, points, and share inside of the interval, of a drive that the fit has not seen.
+/// Root mean square error, points, and fraction within the interval, for a drive that the fit has not used.
 fn score(args: &[&str]) -> (f64, f64) {
     let found = json(&[&["score", "--json", "--truth-capacity", "50"][..], args].concat());
     let soc = &found["scores"][0]["soc"];
     (soc["rmse_points"].as_f64().unwrap(), soc["coverage"].as_f64().unwrap())
 }
 
-/// The notes of a fit to `logs`, checked to be no worse than the label on another drive.
+/// Notes of a fit to `logs`. Checks that the model is at least as good as the label on another drive.
 fn notes_of_fit(folder: &Path, logs: &[PathBuf], label: &[&str]) -> Vec<String> {
     let model = folder.join("model.toml");
     let (model, judge) = (model.to_str().unwrap(), log(folder, "judge.csv", &[DRIVE]));
@@ -136,7 +138,7 @@ fn notes_of_fit(folder: &Path, logs: &[PathBuf], label: &[&str]) -> Vec<String> 
 const LABEL: [&str; 4] = ["--chemistry", "nca-graphite", "--rated", "50"];
 
 #[test]
-fn a_bad_log_makes_no_model_worse_than_the_label() {
+fn bad_log_model_is_no_worse_than_label() {
     let other_pack = Drive { capacity_ah: 0.8 * TRUE_AH, soc: (0.9, 0.4), ..DRIVE };
     let cases: [(&str, &[Drive], &str); 9] = [
         ("begins in the middle", &[Drive { soc: (0.6, 0.15), ..DRIVE }], ""),
@@ -158,7 +160,7 @@ fn a_bad_log_makes_no_model_worse_than_the_label() {
 }
 
 #[test]
-fn a_wrong_capacity_on_the_label_is_found() {
+fn wrong_label_capacity_is_found() {
     let folder = tempfile::tempdir().unwrap();
     let logs = [log(folder.path(), "a.csv", &[Drive { soc: (0.99, 0.1), ..DRIVE }])];
     let notes = notes_of_fit(folder.path(), &logs, &["--chemistry", "nca-graphite", "--rated", "60"]);
@@ -167,7 +169,7 @@ fn a_wrong_capacity_on_the_label_is_found() {
 }
 
 #[test]
-fn a_wrong_chemistry_on_the_label_is_named() {
+fn wrong_label_chemistry_is_named() {
     let cases = [
         (Chemistry::Nmc811Graphite, "lfp-graphite", true),
         (Chemistry::LfpGraphite, "nmc811-graphite", true),
@@ -198,9 +200,9 @@ fn a_wrong_chemistry_on_the_label_is_named() {
 }
 
 #[test]
-fn an_offset_of_the_current_over_days_is_found_and_makes_no_other_chemistry_of_the_cell() {
+fn current_offset_over_days_keeps_chemistry() {
     let folder = tempfile::tempdir().unwrap();
-    // C/50 over more than two days: the charge that is counted is off by more than the capacity.
+    // C/50 for more than two days: the counted charge is wrong by more than the capacity.
     let drive = Drive { offset_a: TRUE_AH / 50.0, every_s: 10, ..DRIVE };
     let (out, back) = (Drive { soc: (0.9, 0.2), ..drive }, Drive { soc: (0.2, 0.9), ..drive });
     let logs = [log(folder.path(), "a.csv", &[out, back].repeat(10))];

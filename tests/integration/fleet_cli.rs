@@ -1,4 +1,5 @@
-//! `packwatch fleet` as its user runs it: the same bytes in whatever parts, nothing lost by a kill or a damaged log.
+//! Runs `packwatch fleet` as a user does. The output is byte-identical for any division into parts, and neither a kill
+//! nor a damaged log loses data.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ struct Fleet {
 }
 
 impl Fleet {
-    /// Six lives, one of them in three files of a folder, and a log without a record.
+    /// Six lives, one of them in three files of a folder, and a log without records.
     fn new() -> Self {
         let fleet = Self { folder: tempfile::tempdir().unwrap() };
         fs::create_dir_all(fleet.path("logs/six")).unwrap();
@@ -50,7 +51,7 @@ impl Fleet {
         command
     }
 
-    /// Replays a part; returns what is printed.
+    /// Replays a part and returns its output.
     fn run(&self, out: &str, more: &[&str]) -> String {
         let mut command = self.command(&["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", out, "-c"]);
         let ran = command.arg(config()).args(more).assert().success();
@@ -75,7 +76,7 @@ fn config() -> PathBuf {
 }
 
 #[test]
-fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
+fn merged_tables_are_independent_of_parts() {
     let fleet = Fleet::new();
     let printed = fleet.run("whole", &[]);
     assert!(printed.contains("failed: broken: ") && printed.contains("logs/broken.log: holds no record"), "{printed}");
@@ -84,7 +85,7 @@ fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
     for shard in ["3/4", "1/4", "4/4", "2/4"] {
         fleet.run(&format!("part{}", &shard[..1]), &["--shard", shard, "--jobs", "1"]);
     }
-    assert!(whole == fleet.merged(&["part2", "part4", "part1", "part3"], "of_four"), "of four parts");
+    assert!(whole == fleet.merged(&["part2", "part4", "part1", "part3"], "of_four"), "merged from four parts");
 
     let table = |name: &str| {
         SerializedFileReader::new(fs::File::open(fleet.path(&format!("merged/{name}.parquet"))).unwrap()).unwrap()
@@ -92,13 +93,13 @@ fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
     let rows = table("vehicles").get_row_iter(None).unwrap().map(Result::unwrap).collect::<Vec<_>>();
     let names: Vec<&String> = rows.iter().map(|row| row.get_string(0).unwrap()).collect();
     assert_eq!(names, ["broken", "five", "four", "one", "six", "three", "two"]);
-    assert!(rows[0].get_string(10).unwrap().contains("holds no record"), "one row says why: {}", rows[0]);
+    assert!(rows[0].get_string(10).unwrap().contains("holds no record"), "one row must give the reason: {}", rows[0]);
     let half_cycles = table("half_cycles");
-    assert_eq!(half_cycles.metadata().num_row_groups(), 6, "one of each vehicle with tables");
+    assert_eq!(half_cycles.metadata().num_row_groups(), 6, "one row group for each vehicle with tables");
     let stated: i64 = rows.iter().map(|row| i64::from(row.get_int(5).unwrap())).sum();
     assert_eq!(half_cycles.metadata().file_metadata().num_rows(), stated);
 
-    // The three files of a folder are one life.
+    // The three files of the folder make up one life.
     let mut command = fleet.command(&["export", "--period", "60", "--out", "alone", "logs/six/whole", "-c"]);
     command.arg(config()).assert().success();
     let rows_of = |path: &str| {
@@ -110,7 +111,7 @@ fn the_merged_tables_are_the_same_bytes_in_whatever_parts_and_order() {
 }
 
 #[test]
-fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
+fn killed_run_continues_and_keeps_complete_vehicles() {
     let fleet = Fleet::new();
     let wanted = {
         fleet.run("whole", &[]);
@@ -134,7 +135,7 @@ fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
     child.kill().unwrap();
     child.wait().unwrap();
     let before = complete();
-    assert!((2..7).contains(&before), "killed in the middle: {before} complete");
+    assert!((2..7).contains(&before), "not killed in the middle: {before} complete");
     let missing = fleet.refused(&["fleet", "merge", "killed", "--manifest", "fleet.jsonl", "-o", "early"]);
     assert!(missing.contains("of 7 vehicles are not replayed: ") || missing.contains(": not complete"), "{missing}");
 
@@ -144,12 +145,12 @@ fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
     let count = |word: &str| outcomes.iter().filter(|vehicle| vehicle["outcome"] == word).count();
     let kept: usize =
         printed.split(" already complete").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
-    // The broken log may be one of those that have a record.
+    // One of the recorded vehicles may be the broken log.
     assert!((before - 1..=before).contains(&kept) && kept > 0, "{before} were complete: {printed}");
-    assert_eq!((count("complete"), count("failed")), (6, 1), "a vehicle that failed is tried again");
+    assert_eq!((count("complete"), count("failed")), (6, 1), "a failed vehicle is replayed again");
     assert!(wanted == fleet.merged(&["killed"], "continued"));
 
-    // Another way of reading, other logs: replayed again.
+    // Replay again after a change of a reading option or of the logs.
     assert!(fleet.run("killed", &["--sleep-gap", "1000"]).contains("6 vehicles replayed, 0 already complete"));
     fs::write(
         fleet.path("fleet.jsonl"),
@@ -160,7 +161,7 @@ fn a_run_that_was_killed_continues_and_what_is_complete_is_kept() {
 }
 
 #[test]
-fn two_processes_at_the_same_vehicles_do_not_harm_each_other() {
+fn concurrent_runs_on_same_vehicles_are_safe() {
     let fleet = Fleet::new();
     fleet.run("whole", &[]);
     let wanted = fleet.merged(&["whole"], "merged");
@@ -176,12 +177,12 @@ fn two_processes_at_the_same_vehicles_do_not_harm_each_other() {
         .into_iter()
         .map(|child| String::from_utf8(child.wait_with_output().unwrap().stdout).unwrap())
         .collect();
-    assert_eq!(printed.matches(" 1 failed").count(), 2, "the broken log alone: {printed}");
+    assert_eq!(printed.matches(" 1 failed").count(), 2, "only the broken log may fail: {printed}");
     assert!(wanted == fleet.merged(&["twice"], "of_two"));
 }
 
 #[test]
-fn a_table_that_was_damaged_later_is_named() {
+fn damaged_table_is_named() {
     let fleet = Fleet::new();
     fleet.run("out", &[]);
     fs::write(fleet.path("out/one/alarms.parquet"), "PAR1 is not enough PAR1").unwrap();
@@ -194,7 +195,7 @@ fn a_table_that_was_damaged_later_is_named() {
 }
 
 #[test]
-fn what_does_not_fit_together_is_not_merged() {
+fn inconsistent_parts_are_not_merged() {
     let fleet = Fleet::new();
     fleet.run("first", &["--shard", "1/2"]);
     let merge = |folders: &[&str]| fleet.refused(&[&["fleet", "merge", "-o", "merged"], folders].concat());
@@ -219,7 +220,7 @@ fn what_does_not_fit_together_is_not_merged() {
 }
 
 #[test]
-fn a_vehicle_may_have_a_configuration_of_its_own() {
+fn vehicle_specific_configuration_is_used() {
     let fleet = Fleet::new();
     let text = fs::read_to_string(fleet.path("fleet.jsonl")).unwrap();
     let own = text.replace("{\"vehicle\":\"one\",", "{\"vehicle\":\"one\",\"config\":\"missing.toml\",");

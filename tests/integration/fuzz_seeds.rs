@@ -1,5 +1,6 @@
-//! Every seed and every input that once broke an invariant (`fuzz/seeds`), and changed copies of them, through the doors that the
-//! fuzzers drive (`fuzz/src/doors`): on the stable compiler, without a fuzzer. `PACKWATCH_FUZZ_CHANGES` sets how many copies each door gets.
+//! Runs every seed, every input that once broke an invariant (`fuzz/seeds`), and mutated copies of them through the
+//! fuzz entry points (`fuzz/src/doors`), with the stable compiler and without a fuzzer. `PACKWATCH_FUZZ_CHANGES` sets
+//! the number of copies per entry point.
 
 use std::path::Path;
 
@@ -9,10 +10,10 @@ use self::doors::DOORS;
 #[expect(unreachable_pub, dead_code, reason = "the fuzz targets need a door by its name")]
 mod doors;
 
-/// Copies of each door's seeds in the tests; tests/fuzz runs the fuzzers.
+/// Number of mutated copies per entry point; tests/fuzz runs the fuzzers.
 const CHANGES: usize = 200;
 
-/// A stream of numbers (xorshift64*).
+/// A pseudo-random stream (xorshift64*).
 struct Stream(u64);
 
 impl Stream {
@@ -24,7 +25,7 @@ impl Stream {
     }
 }
 
-/// The bytes with some of them changed, moved, repeated or left out.
+/// A copy with some bytes changed, moved, repeated or removed.
 fn changed(seed: &[u8], stream: &mut Stream) -> Vec<u8> {
     let mut bytes = seed.to_vec();
     for _ in 0..=stream.below(6) {
@@ -54,11 +55,11 @@ fn seeds(door: &str) -> Vec<Vec<u8>> {
     paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
 }
 
-/// Broken inputs of a door that are shown.
+/// Maximum number of failing inputs printed per entry point.
 const SHOWN: usize = 3;
 
 #[test]
-fn seeds_and_changed_copies_of_them_break_no_invariant() {
+fn seeds_and_mutations_break_no_invariant() {
     let wanted: usize = std::env::var("PACKWATCH_FUZZ_CHANGES").map_or(CHANGES, |count| count.parse().unwrap());
     let mut broken = Vec::new();
     for (name, door) in DOORS {

@@ -1,5 +1,5 @@
-//! The paper's regression on the paper's rows: voltage of RW9 from time, temperature and current, exponential kernel,
-//! constant basis, standardised inputs; one fold of five held out. (The paper: RMSE 0.1058 V over five folds.)
+//! The paper's regression on the paper's data: voltage of RW9 from time, temperature and current; exponential kernel,
+//! constant basis, standardised inputs; one of five folds held out. (The paper: RMSE 0.1058 V over five folds.)
 
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::support::measured;
 use packwatch::regress::{Form, GprSettings, Model, TrainingRows, assign, fit, score};
 
-/// Inputs (time, temperature, current), row after row, and voltages.
+/// Inputs (time, temperature, current) row by row, and voltages.
 fn rows(file: &Path) -> (Vec<f64>, Vec<f64>) {
     let mut table = csv::Reader::from_reader(flate2::read::GzDecoder::new(std::fs::File::open(file).unwrap()));
     let header = table.headers().unwrap().clone();
@@ -25,7 +25,7 @@ fn rows(file: &Path) -> (Vec<f64>, Vec<f64>) {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_exponential_kernel_beats_the_papers_error_and_its_intervals_hold_what_they_say() {
+fn exponential_kernel_beats_paper_with_valid_intervals() {
     let file = measured::path("nasa_randomized/RW9_random_walk_sampled_0p4pct.csv.gz");
     let (inputs, targets) = rows(&file);
     assert_eq!(targets.len(), 30_723);

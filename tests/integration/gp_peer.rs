@@ -1,6 +1,6 @@
-//! Our exact Gaussian process and scikit-learn's, live, with the interpreter that `PACKWATCH_PYTHON` names: the same rows
-//! and hyperparameters, means and standard deviations to 1e-8. `tests/peers/run --only gp` also compares the time of the fit,
-//! in turns in one run with the same number of threads.
+//! Compares our exact Gaussian process with scikit-learn's, run by the interpreter that `PACKWATCH_PYTHON` names. With
+//! the same rows and hyperparameters, means and standard deviations agree to 1e-8. `tests/peers/run --only gp` also
+//! compares the fit times, alternating in one run with the same number of threads.
 
 use std::io::{BufRead, BufReader, Write};
 use std::ops::ControlFlow;
@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use packwatch::regress::{Basis, Form, GprSettings, Model, TrainingRows, fit};
 
-/// Rows and what our fit may take of scikit-learn's time.
+/// Number of rows, maximum fit time relative to scikit-learn's, and repetitions.
 const BARS: [(usize, f64, usize); 2] = [(2000, 0.8, 7), (5000, 0.6, 3)];
 
 struct Oracle {
@@ -20,10 +20,10 @@ struct Oracle {
 }
 
 impl Oracle {
-    /// `None`, and said so, when there is no Python, or none with scikit-learn.
+    /// Starts the oracle. Prints a note and returns `None` without Python or without scikit-learn.
     fn start(threads: usize) -> Option<Self> {
         let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
-            eprintln!("SKIPPED: PACKWATCH_PYTHON names no Python with scikit-learn, nothing was compared");
+            eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with scikit-learn");
             return None;
         };
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/gp_oracle.py");
@@ -38,7 +38,7 @@ impl Oracle {
         let folder = std::env::temp_dir();
         if oracle.ask(&format!("make 2 {}", folder.display())).is_empty() {
             assert_eq!(oracle.child.wait().unwrap().code(), Some(77), "the oracle failed");
-            eprintln!("SKIPPED: that Python has no scikit-learn, nothing was compared");
+            eprintln!("SKIPPED: scikit-learn is missing from the Python in PACKWATCH_PYTHON");
             return None;
         }
         Some(oracle)
@@ -46,13 +46,13 @@ impl Oracle {
 
     fn ask(&mut self, line: &str) -> String {
         let mut answer = String::new();
-        // A write to an oracle that has gone fails; its missing answer says so.
+        // Ignore write errors: if the oracle has exited, its missing answer shows that.
         let _ = writeln!(self.stdin, "{line}");
         self.stdout.read_line(&mut answer).unwrap();
         answer.trim().to_owned()
     }
 
-    /// Seconds of wall clock.
+    /// Wall-clock time, s.
     fn seconds(&mut self, line: &str) -> f64 {
         self.ask(line).split(' ').next().unwrap().parse().unwrap()
     }
@@ -86,7 +86,7 @@ fn case(oracle: &mut Oracle, rows: usize, folder: &Path) -> Case {
     }
 }
 
-/// The oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
+/// Uses the oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
 fn ours(case: &Case, threads: usize) -> Model {
     let mut settings = GprSettings::new("exponential".parse().unwrap(), case.targets.len());
     (settings.basis, settings.form, settings.threads) = (Basis::Zero, Form::Exact, threads);
@@ -96,7 +96,7 @@ fn ours(case: &Case, threads: usize) -> Model {
     fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
-/// Largest differences of means and standard deviations.
+/// Largest differences of means and of standard deviations.
 fn differences(oracle: &mut Oracle, case: &Case, model: &Model, folder: &Path) -> (f64, f64) {
     oracle.ask("fit");
     oracle.ask("predict");
@@ -110,7 +110,7 @@ fn differences(oracle: &mut Oracle, case: &Case, model: &Model, folder: &Path) -
 }
 
 #[test]
-fn means_and_deviations_are_those_of_scikit_learn() {
+fn means_and_deviations_match_scikit_learn() {
     let Some(mut oracle) = Oracle::start(1) else { return };
     let folder = tempfile::tempdir().unwrap();
     let case = case(&mut oracle, 400, folder.path());
@@ -119,9 +119,9 @@ fn means_and_deviations_are_those_of_scikit_learn() {
 }
 
 #[test]
-fn the_fit_takes_less_time_than_scikit_learns() {
+fn fit_is_faster_than_scikit_learn() {
     if cfg!(debug_assertions) || std::env::var_os("PACKWATCH_TIME_PEERS").is_none() {
-        eprintln!("SKIPPED: times are compared by tests/peers/run --only gp");
+        eprintln!("SKIPPED: tests/peers/run --only gp compares the times");
         return;
     }
     for threads in [1, 2] {

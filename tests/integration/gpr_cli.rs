@@ -1,4 +1,4 @@
-//! `packwatch gpr` as its user runs it, on small made data.
+//! Runs `packwatch gpr` as a user does, on small generated data.
 
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
@@ -23,7 +23,7 @@ fn json(folder: &Path, args: &[&str]) -> Value {
     serde_json::from_str(&printed(folder, &[args, &["--json"]].concat())).unwrap()
 }
 
-/// Standard error of a run that must fail with this code and print nothing else.
+/// Standard error of a run that must fail with this exit code and without standard output.
 fn refused(folder: &Path, code: i32, args: &[&str]) -> String {
     let output = gpr(folder, args);
     assert_eq!(output.status.code(), Some(code), "{args:?}");
@@ -31,10 +31,10 @@ fn refused(folder: &Path, code: i32, args: &[&str]) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
-/// Normal numbers, the same every time.
+/// Reproducible normal numbers.
 fn noise(mut state: u64) -> impl FnMut() -> f64 {
     move || {
-        // Twelve uniform numbers make one that is near enough to normal.
+        // The sum of twelve uniform numbers is approximately normal.
         let mut sum = -6.0;
         for _ in 0..12 {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -44,7 +44,7 @@ fn noise(mut state: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Voltage of time, temperature and current, with noise of 20 mV.
+/// Voltage as a function of time, temperature and current, with 20 mV of noise.
 fn rows(folder: &Path, name: &str, count: u32, seed: u64) -> PathBuf {
     let mut draw = noise(seed);
     let mut text = "time_s,current_a,voltage_v,temperature_c,voltage_mv\n".to_owned();
@@ -62,7 +62,7 @@ fn rows(folder: &Path, name: &str, count: u32, seed: u64) -> PathBuf {
 const COLUMNS: [&str; 4] = ["--output", "voltage_v", "--inputs", "time,temperature,current"];
 
 #[test]
-fn cross_validation_reports_errors_coverage_time_and_memory_of_every_kernel() {
+fn cross_validation_reports_every_kernel() {
     let folder = tempfile::tempdir().unwrap();
     let (place, csv) = (folder.path(), rows(folder.path(), "cell.csv", 240, 3));
     let file = csv.file_name().unwrap().to_str().unwrap();
@@ -76,13 +76,13 @@ fn cross_validation_reports_errors_coverage_time_and_memory_of_every_kernel() {
     assert_eq!(names, ["exponential", "squared_exponential", "exponential + matern52"]);
     for kernel in kernels {
         let number = |name: &str| kernel[name].as_f64().unwrap();
-        // 20 mV of noise cannot be predicted; 280 mV is what the mean alone would leave.
+        // 20 mV of noise cannot be predicted; the mean alone would leave 280 mV.
         assert!((0.019..0.06).contains(&number("rmse")), "{kernel}");
         assert!(number("mean_absolute_error") < number("rmse") && number("training_s") > 0.0, "{kernel}");
         assert!((0.89..=0.995).contains(&number("coverage_95")), "{kernel}");
         assert!(number("peak_memory_kib") > 1000.0 && kernel["folds"].as_array().unwrap().len() == 3, "{kernel}");
     }
-    // The rows written are those the score is of.
+    // The score is computed from the written rows.
     let text = std::fs::read_to_string(place.join("all.csv")).unwrap();
     assert_eq!(
         text.lines().next().unwrap(),
@@ -101,7 +101,7 @@ fn cross_validation_reports_errors_coverage_time_and_memory_of_every_kernel() {
     assert_eq!(text.lines().count(), 1 + 3 * 240);
     let rmse = (squares.iter().sum::<f64>() / 240.0).sqrt();
     assert!((rmse - kernels[0]["rmse"].as_f64().unwrap()).abs() < 1e-12);
-    // For people: a line per kernel, the form said; pictures.
+    // Text output: a line per kernel, the chosen form, and pictures.
     let shown = printed(
         place,
         &[&["cv", file, "--kernel", "matern32", "--folds", "2", "--plots", "plots"], &COLUMNS[..]].concat(),
@@ -112,13 +112,13 @@ fn cross_validation_reports_errors_coverage_time_and_memory_of_every_kernel() {
     assert!(picture.contains("predicted against measured") && picture.contains("95 % interval"));
 }
 
-/// Bits of the means in a file of predictions.
+/// Bit patterns of the means in a file of predictions.
 fn means(text: &str) -> Vec<u64> {
     let mean = |line: &str| line.split(',').nth(6).unwrap().parse::<f64>().unwrap().to_bits();
     text.lines().skip(1).map(mean).collect()
 }
 
-/// The same of a model that predicts as it was fitted, without a file between.
+/// Bit patterns of the means predicted directly after the fit, without saving the model.
 fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
     let table = |name: &str| {
         let columns = ["time", "temperature", "current", "voltage_v"].map(str::to_owned);
@@ -135,7 +135,7 @@ fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
 }
 
 #[test]
-fn a_saved_model_predicts_the_same_bit_for_bit_and_judges_where_it_can() {
+fn saved_model_predicts_bit_identically() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path();
     rows(place, "cell.csv", 200, 3);
@@ -146,25 +146,28 @@ fn a_saved_model_predicts_the_same_bit_for_bit_and_judges_where_it_can() {
         assert_eq!((&first["rows"], &first["kernel"]), (&200.into(), &"matern32".into()));
         let model = std::fs::read(place.join("model.json")).unwrap();
         printed(place, &[&train[..], &COLUMNS].concat());
-        assert!(std::fs::read(place.join("model.json")).unwrap() == model, "{form}: two trainings, two models");
+        assert!(
+            std::fs::read(place.join("model.json")).unwrap() == model,
+            "{form}: two trainings gave different models"
+        );
         let found = json(place, &["predict", "model.json", "later.csv", "-o", "out.csv"]);
         assert_eq!((&found["rows"], &found["known"]), (&60.into(), &60.into()));
         assert!(found["score"]["rmse"].as_f64().unwrap() < 0.08, "{form}: {found}");
         assert!(found["score"]["coverage_95"].as_f64().unwrap() > 0.85, "{form}: {found}");
         let written = std::fs::read_to_string(place.join("out.csv")).unwrap();
-        // The same from the loaded text, and on one thread; standard output carries the same rows.
+        // Predict again from the saved model with one thread; standard output must carry the same rows.
         let again = printed(place, &["predict", "model.json", "later.csv", "--threads", "1"]);
         assert!(again == written, "{form}: other predictions");
         assert_eq!(means_of_a_model_never_saved(place, form), means(&written), "{form}");
     }
-    // Without the output column there is nothing to judge, and rows are predicted all the same.
+    // Without the output column there is no score, but the rows are still predicted.
     std::fs::write(place.join("new.csv"), "current_a,temperature_c,time_s\n1,25,10\n0,30,20\n").unwrap();
     let found = json(place, &["predict", "model.json", "new.csv", "-o", "out.csv"]);
     assert_eq!((&found["rows"], &found["known"], &found["score"]), (&2.into(), &0.into(), &Value::Null));
 }
 
 #[test]
-fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
+fn bad_input_error_names_place_and_range() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path();
     rows(place, "cell.csv", 40, 3);
@@ -177,7 +180,7 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
     assert!(cv("voltage", "time").contains("\"voltage\" is ambiguous, found voltage_v, voltage_mv"));
     assert!(cv("voltage_v", "time,voltage_v").contains("column voltage_v is named twice"));
     assert!(refused(place, 1, &[&["cv", "nowhere.csv"], &COLUMNS[..]].concat()).starts_with("nowhere.csv: "));
-    // A hole is refused with its line, or skipped and counted.
+    // A row with a missing value is rejected with its line number, or skipped and counted.
     let text = std::fs::read_to_string(place.join("cell.csv")).unwrap();
     let holes: String = text
         .lines()
@@ -196,7 +199,7 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
     let found = json(place, &some);
     assert_eq!((&found["rows"], &found["skipped"]), (&38.into(), &2.into()));
     assert!(printed(place, &some).contains("2 rows left out: a value is missing"));
-    // Too few rows; no such kernel; no model; a damaged one.
+    // Too few rows, an unknown kernel, not a model, a damaged model.
     std::fs::write(place.join("few.csv"), text.lines().take(4).collect::<Vec<_>>().join("\n")).unwrap();
     let few = refused(place, 1, &[&["cv", "few.csv"], &COLUMNS[..]].concat());
     assert!(few.contains("folds = 5, must be"), "{few}");
@@ -213,7 +216,8 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
     assert!(steps.contains("windows of 5 lags and"), "{steps}");
 }
 
-/// x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, twice, the second driven by the first as well; in parts of 400 rows.
+/// Two autoregressive series, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e. The first also drives the second. In parts of 400
+/// rows.
 fn process(folder: &Path) {
     let mut draw = noise(11);
     let mut text = "cycle,time_s,voltage_v,temperature_c\n".to_owned();
@@ -222,7 +226,7 @@ fn process(folder: &Path) {
         for k in 0..450 {
             x = [1.6 * x[0] - 0.64 * x[1] + 0.01 * draw(), x[0]];
             y += 0.1 * (25.0 + 20.0 * x[0] - y) + 0.05 * draw();
-            // The beginning of a part knows its start: left out.
+            // Skip the beginning of each part, which still depends on its start.
             if k >= 50 {
                 writeln!(text, "{cycle},{},{:.5},{:.4}", 10 * (k - 50), 3.7 + x[0], y).unwrap();
             }
@@ -232,7 +236,7 @@ fn process(folder: &Path) {
 }
 
 #[test]
-fn a_forecast_holds_what_its_interval_says_and_its_error_grows_as_the_processes_does() {
+fn forecast_interval_holds_and_error_grows() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path();
     process(place);
@@ -249,13 +253,13 @@ fn a_forecast_holds_what_its_interval_says_and_its_error_grows_as_the_processes_
         for (k, coverage) in inside.iter().enumerate() {
             assert!((0.90..=0.985).contains(coverage), "{}, {k}: {inside:?}", output["name"]);
         }
-        // Up to what a finite sample may do.
+        // Allow for the finite sample.
         assert!(rmse.windows(2).all(|pair| pair[1] > 0.98 * pair[0]), "{}: {rmse:?}", output["name"]);
         assert!(rmse[rmse.len() - 1] > 2.0 * rmse[0] && width[width.len() - 1] > 2.0 * width[0]);
         let persistence = of("persistence_rmse");
         assert!(rmse.iter().zip(&persistence).all(|(ours, naive)| ours < naive), "{rmse:?} against {persistence:?}");
     }
-    // One step ahead the process itself leaves 10 mV.
+    // One step ahead, the process noise of 10 mV remains.
     let first = found["outputs"][0]["horizons"][0]["score"]["rmse"].as_f64().unwrap();
     assert!((0.0092..0.0115).contains(&first), "{first}");
     let text = std::fs::read_to_string(place.join("all.csv")).unwrap();
@@ -271,7 +275,7 @@ fn a_forecast_holds_what_its_interval_says_and_its_error_grows_as_the_processes_
 }
 
 #[test]
-fn a_forecast_looks_at_nothing_after_its_origin() {
+fn forecast_ignores_rows_after_origin() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path();
     process(place);

@@ -1,7 +1,8 @@
-//! A hostile or broken bus: what is noticed, and how fast; and that no number beyond physics is ever shown as valid.
+//! A hostile or broken bus: what packwatch detects, how fast, and that it never shows an unphysical number as valid.
 //!
-//! Runs of random absurd readings, random configurations (every number of the reference page between and at the ends of its range),
-//! a second sender, frames with our own identifiers, a frozen current. `PACKWATCH_CONFIGS` sets the number of configurations.
+//! The runs use random absurd readings, random configurations (every number of the reference page, within and at the
+//! ends of its range), a second sender, frames with our own identifiers, and a frozen current. `PACKWATCH_CONFIGS` sets
+//! the number of configurations.
 
 use std::path::Path;
 
@@ -23,7 +24,7 @@ const BUS: BusIndex = BusIndex(0);
 const ALARMS: &str = "[[alarm]]\nrule = \"input_implausible\"\nwarning = 0.5\n[[alarm]]\nrule = \"bus_fault\"\nwarning = 1\n\
                       [[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n";
 
-/// What a channel does in a run.
+/// Behaviour of a channel during a run.
 #[derive(Debug, Clone, Copy)]
 enum Behaviour {
     Normal,
@@ -70,7 +71,7 @@ impl Behaviour {
     }
 }
 
-/// What is shown as valid is what a cell can have.
+/// Checks that values shown as valid are physically possible.
 fn check_shown(monitor: &Monitor, run: u64, second: u32) {
     let (pack, model_ah) = (monitor.pack_view(), 2.6);
     if pack.validity != Validity::Valid {
@@ -95,7 +96,7 @@ fn is_capacity_of_rated(soh: f64) -> bool {
 }
 
 #[test]
-fn no_estimate_beyond_physics_is_shown_as_valid_in_120_hostile_runs() {
+fn hostile_readings_give_no_unphysical_estimate() {
     let mut valid = 0_u32;
     for run in 0..120 {
         let mut dice = Dice::new(run + 1);
@@ -124,10 +125,11 @@ fn no_estimate_beyond_physics_is_shown_as_valid_in_120_hostile_runs() {
         after.restore(snapshot, Downtime::Seconds(10.0)).unwrap_or_else(|error| panic!("run {run}: {error}"));
     }
     eprintln!("valid after {valid} of 360000 rounds of readings");
-    assert!(valid > 10_000, "the check has something to check: {valid}");
+    assert!(valid > 10_000, "too few valid estimates to check: {valid}");
 }
 
-/// Ten frames a second of a pack at rest for `seconds`, and `more` frames a second of another sender of the current.
+/// Sends ten frames a second of a resting pack for `seconds`, and `more` frames a second from a second sender of the
+/// current.
 fn with_second_sender(rig: &mut Rig, seconds: u32, more: u32, current_a: f64) {
     let encoder = InputEncoder::new(&rig.config.input);
     let mut made = Vec::new();
@@ -146,7 +148,7 @@ fn with_second_sender(rig: &mut Rig, seconds: u32, more: u32, current_a: f64) {
 }
 
 #[test]
-fn a_second_sender_of_the_current_is_reported_within_five_seconds_and_its_estimates_are_not_trusted() {
+fn second_current_sender_is_reported_and_distrusted() {
     for more in [1000, 100, 20] {
         let mut rig = Rig::new(ALARMS);
         rig.current_a = Some(0.5);
@@ -161,15 +163,15 @@ fn a_second_sender_of_the_current_is_reported_within_five_seconds_and_its_estima
         assert_eq!(rig.changes(Rule::InputImplausible), [Change::Raised], "{more}");
         assert_eq!(rig.monitor.second_senders().collect::<Vec<_>>(), [(BUS, CanId::Standard(0x100))]);
         rig.seconds(20);
-        assert_eq!(rig.monitor.second_senders().count(), 0, "it is gone");
+        assert_eq!(rig.monitor.second_senders().count(), 0, "the second sender has stopped");
         assert_eq!(rig.changes(Rule::InputImplausible).last(), Some(&Change::Cleared), "{more}");
     }
 }
 
 #[test]
-fn frames_with_our_own_identifiers_are_reported_within_five_seconds_and_an_echo_is_not() {
+fn own_identifiers_are_reported_but_echo_is_not() {
     let mut rig = Rig::new(ALARMS);
-    // An adapter that returns what is sent.
+    // Simulate an adapter that returns sent frames.
     for _ in 0..300 {
         rig.tick_with_frames();
         let time = rig.now();
@@ -191,17 +193,20 @@ fn frames_with_our_own_identifiers_are_reported_within_five_seconds_and_an_echo_
     assert_eq!(rig.changes(Rule::BusFault), [Change::Raised]);
     rig.seconds(12);
     assert_eq!(rig.changes(Rule::BusFault).last(), Some(&Change::Cleared));
-    assert!(rig.config.wanted_ids(BUS).contains(&CanId::Standard(0x6B0)), "the socket receives them");
+    assert!(
+        rig.config.wanted_ids(BUS).contains(&CanId::Standard(0x6B0)),
+        "the socket must receive our own identifiers"
+    );
 }
 
-/// What came of a drive, and when the frozen current was first wrong by 1 % of the largest, s.
+/// Events of a drive, and the time from which the frozen current is wrong by 1 % of the largest, s.
 struct Drive {
     events: Vec<(f64, EventKind)>,
     validity: Validity,
     differs_s: Option<f64>,
 }
 
-/// A drive of the shipped pack; the current's frames of every moment after `frozen_s` carry the same bits.
+/// A drive of the shipped pack. If `frozen_s` is given, the current frames repeat the same bits from then on.
 fn drive(frozen_s: Option<f64>, seconds: f64) -> Drive {
     use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml");
@@ -249,11 +254,11 @@ fn frozen_at(events: &[(f64, EventKind)]) -> Option<f64> {
 }
 
 #[test]
-fn a_frozen_current_is_found_within_a_minute_and_an_hour_s_drive_has_none() {
+fn frozen_current_is_found_without_false_finding() {
     let Drive { events, .. } = drive(None, 3600.0);
     assert_eq!(frozen_at(&events), None);
     assert!(!events.iter().any(|(_, kind)| matches!(kind, EventKind::SecondSender(_) | EventKind::OwnIdentifier(_))));
-    // The second one is followed by a cruise of 100 s, in which the voltages say nothing more.
+    // After the second time follows a cruise of 100 s, in which the voltages carry no information.
     for frozen_s in [120.0, 333.3] {
         let Drive { events, validity, differs_s } = drive(Some(frozen_s), frozen_s + 240.0);
         let after_s = frozen_at(&events).zip(differs_s).map(|(at_s, differs_s)| at_s - differs_s);
@@ -264,7 +269,7 @@ fn a_frozen_current_is_found_within_a_minute_and_an_hour_s_drive_has_none() {
 }
 
 #[test]
-fn a_stored_charge_that_no_current_moved_is_refused() {
+fn implausible_stored_charge_is_rejected() {
     let mut rig = Rig::new("");
     rig.current_a = Some(5.0);
     rig.seconds(60);

@@ -1,8 +1,9 @@
-//! `packwatch import obdb` on the signal sets of three cars: every expected value of their test cases, read from raw frames
-//! by the core through the written file: ISO-TP, configuration, decoder.
+//! `packwatch import obdb` on the signal sets of three cars. The core reads every expected value of their test cases
+//! from raw frames through the imported file: ISO-TP, configuration, decoder.
 //!
-//! The reference decoder moves a value onto the limit of its range; here such a value is out of range. That is the only
-//! difference allowed. Some cases were recorded with characters lost, their lines are no CAN frames: they have no answer here.
+//! The reference decoder clamps a value to its range; packwatch reports such a value as out of range. No other
+//! difference is allowed. Some cases were recorded with missing characters, so their lines are not CAN frames;
+//! packwatch reads no answer from them.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,7 +16,7 @@ use packwatch::can::uds::Answer;
 use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 
-/// The signal sets, in the folder of data or in the one next to it.
+/// The signal sets, in the data folder or the one next to it.
 pub(crate) fn folder() -> PathBuf {
     let inside = measured::path("obd");
     if inside.is_dir() { inside } else { measured::path("../more-data/obd") }
@@ -26,24 +27,25 @@ fn import(args: &[&str]) -> String {
     String::from_utf8(output.success().get_output().stdout.clone()).unwrap()
 }
 
-/// Result of one signal.
+/// Reading of one signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Reading {
     Value(f64),
-    /// With the range of the file.
+    /// The limits of the range in the file.
     OutOfRange(f64, f64),
     Other(Fault),
 }
 
-/// A signal set of one model year as the core reads it: every signal is bound to an input.
+/// A signal set of one model year as the core reads it; every signal is bound to an input.
 struct ImportedCar {
     text: String,
     answers: Vec<Answer>,
-    /// Name and range of the signal that is temperature sensor n.
+    /// Name and range of the signal bound to temperature sensor n.
     signals: Vec<(String, (f64, f64))>,
 }
 
-/// Inputs that have to be there, in an answer of their own; the imported signals are temperatures, of which there may be most.
+/// Required inputs in a separate answer. The imported signals are bound as temperatures, the most numerous kind of
+/// input.
 const OTHER_INPUTS: &str = "[[input.diagnostic]]\nname = \"Other\"\nrequest = 1\nresponse = 2\nservice = 0x22\nidentifier = 1\n\
     signals = [{ name = \"Cell{n}\", numbers = \"1-1024\", bit = 0, length = 8 }, { name = \"Current\", bit = 9000, length = 8 }]\n";
 
@@ -57,7 +59,7 @@ impl ImportedCar {
              signal = \"Other.Current\"\npositive = \"charge\"\n[input.cell_voltage]\nsignal = \"Other.Cell{{n}}\"\n"
         );
         for (number, (name, _)) in (1..).zip(&signals) {
-            // The scale says that the unit is on purpose.
+            // An explicit scale accepts the unit.
             writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\nscale = 1.0\ncells = \"{number}\"").unwrap();
         }
         let folder = tempfile::tempdir().unwrap();
@@ -67,7 +69,7 @@ impl ImportedCar {
         Self { text, answers, signals }
     }
 
-    /// Readings of a whole answer by signal.
+    /// Readings of a complete answer, by signal.
     fn decode(&self, response: CanId, answer: &[u8]) -> BTreeMap<&str, Reading> {
         let question = |found: &&Answer| {
             found.question.controller.response == response && answer.starts_with(&found.question.answer_head())
@@ -89,7 +91,7 @@ impl ImportedCar {
     }
 }
 
-/// Every signal of a file, series written out, with its range.
+/// Every signal of a file with its range; series are expanded.
 fn signals_of(tables: &toml::Table) -> Vec<(String, (f64, f64))> {
     let mut signals = Vec::new();
     for table in tables["input"]["diagnostic"].as_array().unwrap() {
@@ -111,15 +113,15 @@ fn signals_of(tables: &toml::Table) -> Vec<(String, (f64, f64))> {
     signals
 }
 
-/// One test case of a file: expected values by id, and the text with the frames.
+/// One test case of a file: expected values by id, and the text that contains the frames.
 #[derive(Debug, Default)]
 pub(crate) struct Case {
     expected: Vec<(String, String)>,
     response: String,
 }
 
-/// Reads a file of cases: below `expected_values` lines `ID: VALUE`, below `response` frames, as lines of a block (`|-`) or in
-/// one text in quotes, in which `\n` ends a frame and the end of a line is a blank.
+/// Reads a file of cases. Lines below `expected_values` have the form `ID: VALUE`. Below `response` follow the frames,
+/// either as the lines of a block (`|-`) or in a quoted text, where `\n` ends a frame and a line end is a space.
 pub(crate) fn cases(text: &str) -> Vec<Case> {
     let mut cases: Vec<Case> = Vec::new();
     for line in text.lines().map(str::trim_end) {
@@ -147,7 +149,7 @@ impl Case {
     }
 }
 
-/// Identifier and payload of every complete answer, put together by the core; lines that are no classic frames are left out.
+/// Identifier and payload of every complete answer, reassembled by the core. Skips lines that are not classic frames.
 fn reassemble(frames: &[String]) -> Vec<(CanId, Vec<u8>)> {
     let mut receiver = Receiver::new(None);
     let mut answers = Vec::new();
@@ -159,7 +161,7 @@ fn reassemble(frames: &[String]) -> Vec<(CanId, Vec<u8>)> {
     answers
 }
 
-/// Identifier and data; `None` when the text is no classic frame with data.
+/// Identifier and data, or `None` if the text is not a classic frame with data.
 fn frame_of(text: &str) -> Option<(CanId, Vec<u8>)> {
     let (id, data) = text.split_at_checked(3)?;
     let bytes = (0..data.len()).step_by(2).map(|at| u8::from_str_radix(data.get(at..at + 2)?, 16).ok());
@@ -168,13 +170,13 @@ fn frame_of(text: &str) -> Option<(CanId, Vec<u8>)> {
     (1..=8).contains(&bytes.len()).then_some((id, bytes))
 }
 
-/// Counts of compared values.
+/// Results of the comparison.
 #[derive(Debug, Default, PartialEq)]
 struct Comparison {
     equal: usize,
     clamped: usize,
     enumerations: usize,
-    /// Cases without a complete answer: a line is no CAN frame.
+    /// Cases without a complete answer, because a line is not a CAN frame.
     damaged: usize,
     different: Vec<String>,
 }
@@ -208,12 +210,12 @@ impl Comparison {
     }
 }
 
-/// Expectations are rounded to five decimals, large ones to seven digits.
+/// Expected values are rounded to five decimals, large ones to seven digits.
 fn near(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 6e-6 + 1e-6 * expected.abs()
 }
 
-/// The name without the leading zeros of its numbers: a series drops them.
+/// The name without leading zeros in its numbers; a series drops them.
 fn without_zeros(name: &str) -> String {
     let mut short = String::new();
     let mut chars = name.chars().peekable();
@@ -252,7 +254,7 @@ fn compare_car(folder: &Path, car: &str, prefix: &str) -> Comparison {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn every_expected_value_of_three_cars_is_read_through_the_imported_file() {
+fn imported_signals_read_all_expected_values() {
     let folder = folder();
     for (car, prefix) in [("hyundai_kona", "KONAEV"), ("hyundai_ioniq5", "IONIQ5"), ("nissan_leaf", "LEAF")] {
         let comparison = compare_car(&folder, car, prefix);
@@ -268,7 +270,7 @@ fn every_expected_value_of_three_cars_is_read_through_the_imported_file() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_cells_of_a_kona_are_one_pattern_over_five_answers() {
+fn kona_cells_form_one_pattern() {
     let folder = folder();
     let text = import(&[folder.join("hyundai_kona/signalset.json").to_str().unwrap(), "--name", "Kona"]);
     assert!(text.contains("CC BY-SA 4.0") && text.contains("OBDb"));

@@ -1,5 +1,6 @@
-//! Our ISO-TP against an independent one, PyPI `can-isotp`, run live with the interpreter `PACKWATCH_PYTHON` names. Both ways:
-//! what it cuts we put together, through loss, delay and interleaved senders, and what we cut it puts together.
+//! Compares our ISO-TP with an independent implementation, PyPI `can-isotp`, run by the interpreter that
+//! `PACKWATCH_PYTHON` names. We reassemble its segmented messages despite loss, delay and interleaved senders, and it
+//! reassembles ours.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -14,10 +15,10 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use crate::support::oracle::{hex, python};
 
 const MESSAGES: usize = 10_000;
-/// Senders with an identifier each, whose frames mix.
+/// Number of senders. Each has its own identifier, and their frames interleave.
 const SENDERS: usize = 5;
 
-/// What the peer makes of each line.
+/// The peer's answer to each line.
 fn ask(python: &std::ffi::OsString, way: &str, lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/isotp_oracle.py");
     let mut child =
@@ -41,7 +42,7 @@ impl Chance {
         usize::try_from(self.0.next_u32()).unwrap() % limit
     }
 
-    /// Messages of 1 to 4,095 bytes, mostly short ones, as diagnostics have.
+    /// Messages of 1 to 4,095 bytes, mostly short ones, as in diagnostics.
     fn messages(&mut self) -> Vec<Vec<u8>> {
         let lengths: Vec<usize> = (0..MESSAGES)
             .map(|_| match self.below(20) {
@@ -67,14 +68,14 @@ struct Sent {
 }
 
 #[test]
-fn what_the_peer_cuts_is_put_together_through_loss_delay_and_interleaving() {
+fn peer_messages_are_reassembled_despite_loss() {
     let Some(python) = python() else { return };
     let mut chance = Chance(ChaCha8Rng::seed_from_u64(16));
     let messages = chance.messages();
     let lines: Vec<String> = messages.iter().map(|message| hex(message)).collect();
     let cut = ask(&python, "send", &lines);
     assert_eq!(cut.len(), MESSAGES);
-    // Each sender sends its messages one after the other; the bus mixes the frames of all.
+    // Each sender sends its messages in order; the bus interleaves the frames of all senders.
     let mut bus: Vec<Sent> = Vec::new();
     let mut intact = vec![true; MESSAGES];
     let mut clocks = [0_i64; SENDERS];
@@ -122,11 +123,11 @@ fn what_the_peer_cuts_is_put_together_through_loss_delay_and_interleaving() {
             messages[message].len()
         );
     }
-    assert!(whole < MESSAGES && faults.len() >= 3, "the harm was done");
+    assert!(whole < MESSAGES && faults.len() >= 3, "too few frames were lost or damaged");
 }
 
 #[test]
-fn what_is_cut_here_the_peer_puts_together() {
+fn peer_reassembles_our_messages() {
     let Some(python) = python() else { return };
     let messages = Chance(ChaCha8Rng::seed_from_u64(17)).messages();
     let line = |message: &Vec<u8>| {

@@ -1,16 +1,16 @@
-//! Checks the code against the map in `src/lib.rs`: reads `src/` and fails, with file and line, when a module names
-//! one it may not import, or when the core names a run time, a clock, a file, a socket or a print.
+//! Checks the code against the map in `src/lib.rs`. Reads `src/` and reports, with file and line, each module that
+//! names a module it may not import, and each place where the core names a runtime, a clock, a file, a socket or a
+//! print.
 //!
-//! Comments, documentation and literals do not count; test modules do, so that they stay as pure as the code
-//! they test. Paths are followed from `crate::`, from chains of `super::` that reach the crate's root, and
-//! through braces.
+//! Comments, documentation and literals are ignored. Test modules are checked, so that they stay as pure as the code
+//! they test. Paths are resolved from `crate::`, from chains of `super::` that reach the crate root, and inside braces.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Module, the modules it may import, whether it belongs to the pure core. Lowest first.
+/// Each row: module, modules it may import, whether it belongs to the pure core. Lowest first.
 ///
-/// The crates under `src` re-export the modules of the crates below them, so a module has one name everywhere.
+/// The crates under `src` re-export the modules of lower crates, so a module has the same name everywhere.
 const TABLE: &[(&str, &[&str], Core)] = &[
     ("quantity", &[], Core::Pure),
     ("filter", &["quantity"], Core::Pure),
@@ -38,7 +38,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("wiring_check", MODULES.split_at(19).0, Core::Shell),
     ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
-    // A program of its own: it reads the daemon's status and has nothing of its loop.
+    // A separate program: it reads the daemon's status and uses nothing of its loop.
     ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status", "failure"], Core::Shell),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
@@ -76,7 +76,7 @@ const MODULES: [&str; 26] = [
 ];
 const CORE: &[&str] = MODULES.split_at(11).0;
 const BELOW_LAB: &[&str] = MODULES.split_at(25).0;
-/// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
+/// Crates under `src`. `Some`: the table has one row for the whole crate.
 const CRATES: [(&str, Option<&str>); 6] = [
     ("core", None),
     ("host", None),
@@ -92,19 +92,19 @@ enum Core {
     Shell,
 }
 
-/// Paths the core never names: they read a clock, a file, a socket or the surroundings, or log.
+/// Paths that the core must not name: they read a clock, a file, a socket or the environment, or log.
 const IMPURE_PATHS: &[&str] = &["tokio", "tracing", "std::fs", "std::net", "std::env", "std::process"];
-/// Names the core never uses, whatever path leads to them.
+/// Names that the core must not use, by any path.
 const IMPURE_NAMES: &[&str] = &["Instant", "SystemTime"];
-/// Macros the core never calls.
+/// Macros that the core must not call.
 const IMPURE_MACROS: &[&str] = &["println", "eprintln", "print", "eprint", "dbg"];
-/// Paths one module in particular never names: the truth must not be made by what is judged against it.
+/// Paths forbidden to a single module: the simulated truth must not use the code that is judged against it.
 const FORBIDDEN_TO: &[(&str, &str)] = &[("sim", "crate::cell::estimator")];
 
-/// Files of tests that may name one module more: a replay drives the store that it records to.
+/// Tests that may name one more module: a replay drives the store that it records to.
 const ALLOWED_IN_TESTS: &[(&str, &str)] = &[("host/store/tests.rs", "crate::replay")];
 
-/// A word or a punctuation mark of a source text, without comments and literals.
+/// A word or a punctuation mark of the source, without comments and literals.
 #[derive(Debug, Clone, PartialEq)]
 struct Token {
     line: usize,
@@ -129,7 +129,7 @@ fn tokens(source: &str) -> Vec<Token> {
     found
 }
 
-/// End of the white space, comment or literal that begins at `at`; `None` = a token begins there.
+/// End of the white space, comment or literal that starts at `at`; `None` if a token starts there.
 fn skipped(chars: &[char], at: usize) -> Option<usize> {
     let next = chars.get(at + 1).copied();
     match chars[at] {
@@ -171,7 +171,7 @@ fn string_end(chars: &[char], start: usize) -> usize {
     (at + 1).min(chars.len())
 }
 
-/// End of a raw string (`r"`, `br#"`, ...) at `at`; `None` = there is none.
+/// End of the raw string (`r"`, `br#"`, ...) that starts at `at`; `None` if there is no raw string.
 fn raw_string_end(chars: &[char], at: usize) -> Option<usize> {
     let r = find(chars, at, |rest| rest[0] != 'b' && rest[0] != 'c');
     let open = find(chars, r + 1, |rest| rest[0] != '#');
@@ -202,8 +202,8 @@ fn token_end(chars: &[char], at: usize) -> usize {
     }
 }
 
-/// Every path named in a text, braces spread out: `use std::{fs, net::TcpStream}` gives two. `depth` is how many
-/// modules deep the text lies; a chain of `super` that reaches the root becomes `crate`.
+/// Every path in a text, with braces expanded: `use std::{fs, net::TcpStream}` gives two. `depth` is the module depth
+/// of the text; a chain of `super` that reaches the root becomes `crate`.
 fn paths(tokens: &[Token], depth: usize) -> Vec<(usize, String)> {
     let mut found = Vec::new();
     let (mut at, mut braces) = (0, 0_usize);
@@ -237,7 +237,7 @@ fn paths(tokens: &[Token], depth: usize) -> Vec<(usize, String)> {
     found
 }
 
-/// Reads one path or tree of paths from `at`; returns where it ends.
+/// Reads one path or tree of paths from `at`. Returns its end.
 fn spread(tokens: &[Token], mut at: usize, prefix: &str, found: &mut Vec<(usize, String)>) -> usize {
     let text = |at: usize| tokens.get(at).map_or("", |token| token.text.as_str());
     let mut path = prefix.to_owned();
@@ -273,20 +273,20 @@ fn from_root(path: &str, depth: usize) -> String {
     relative.split("::").skip(supers).fold("crate".to_owned(), |root, part| root + "::" + part)
 }
 
-/// The module of a file below `src`, and how many modules deep the file lies in its crate.
+/// Module of a file below `src`, and the file's module depth in its crate.
 fn place(file: &str) -> (&str, usize) {
     let mut parts: Vec<&str> = file.trim_end_matches(".rs").split('/').filter(|part| *part != "mod").collect();
     let member = CRATES.iter().find(|(name, _)| parts.len() > 1 && parts[0] == *name);
     let Some((_, whole)) = member else { return (parts[0], parts.len()) };
     parts.remove(0);
-    // Programs and doors of their own may name their files as they like.
+    // Separate programs and language bindings may name their files freely.
     let is_apart = matches!(*whole, Some("python" | "uplink"));
     let is_known = !is_apart && TABLE.iter().any(|(name, ..)| *name == parts[0]);
     let module = if is_known { parts[0] } else { whole.unwrap_or(parts[0]) };
     (module, parts.len())
 }
 
-/// A path as if all crates were one: `packwatch_core::can` and `packwatch::can` become `crate::can`.
+/// Rewrites a path as if all crates were one: `packwatch_core::can` and `packwatch::can` become `crate::can`.
 fn in_one_crate(path: &str) -> String {
     let Some((first, rest)) = path.split_once("::") else { return path.to_owned() };
     match first {
@@ -298,7 +298,7 @@ fn in_one_crate(path: &str) -> String {
     }
 }
 
-/// What is wrong with one file, as `file:line: text`, a line each.
+/// Violations in one file, one per line, as `file:line: text`.
 fn violations(file: &str, source: &str) -> Vec<String> {
     let (module, depth) = place(file);
     let Some((_, allowed, core)) = TABLE.iter().find(|(name, ..)| *name == module) else {
@@ -352,7 +352,7 @@ fn source_files(folder: &Path, into: &mut Vec<PathBuf>) {
 }
 
 #[test]
-fn every_module_imports_only_what_the_map_allows() {
+fn modules_import_only_what_map_allows() {
     let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut files = Vec::new();
     source_files(&src, &mut files);
@@ -361,20 +361,20 @@ fn every_module_imports_only_what_the_map_allows() {
     let mut report = String::new();
     for path in files {
         let file = path.strip_prefix(&src).expect("below src").to_string_lossy().replace('\\', "/");
-        // A lib.rs declares modules and has no code of its own.
+        // A lib.rs only declares modules.
         if file == "lib.rs" || file.ends_with("/lib.rs") {
             continue;
         }
         let source = std::fs::read_to_string(&path).expect("a source file can be read");
         for fault in violations(&file, &source) {
-            writeln!(report, "{fault}").expect("writing to a string");
+            writeln!(report, "{fault}").expect("writing to a String cannot fail");
         }
     }
     assert!(report.is_empty(), "the layering of src/lib.rs is broken:\n{report}");
 }
 
 #[test]
-fn the_table_names_the_modules_that_the_crates_declare() {
+fn table_lists_all_declared_modules() {
     let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut declared = ["regress", "ident", "lab", "uplink", "python", "main"].map(str::to_owned).to_vec();
     for lib in ["lib.rs", "core/lib.rs", "host/lib.rs"] {
@@ -390,7 +390,7 @@ fn the_table_names_the_modules_that_the_crates_declare() {
 }
 
 #[test]
-fn planted_violations_are_found_with_file_and_line() {
+fn planted_violations_are_reported_with_line() {
     let planted: &[(&str, &str, &str)] = &[
         ("sample/mod.rs", "\nuse crate::can::Frame;", "src/sample/mod.rs:2: sample may not import crate::can::Frame"),
         ("sample/mod.rs", "use crate::{quantity::Fault,\n can::decode};", "src/sample/mod.rs:2:"),
@@ -433,7 +433,7 @@ fn planted_violations_are_found_with_file_and_line() {
 }
 
 #[test]
-fn allowed_imports_and_mere_mentions_are_no_violation() {
+fn allowed_imports_and_mentions_pass() {
     let clean: &[(&str, &str)] = &[
         ("alarm/mod.rs", "use crate::quantity::{CellIndex, Timestamp};\nuse crate::alarm::Rule;"),
         (

@@ -1,5 +1,5 @@
-//! Whole simulated lives, replayed: every frame decodes in `cantools`, by the DBC that `packwatch dbc` writes, to the
-//! values that the same replay reports as estimates and events, within one bit.
+//! Replays whole simulated lives. `cantools` decodes every frame with the DBC that `packwatch dbc` writes; the values
+//! must match the estimates and events of the same replay to within one bit.
 
 use std::ffi::OsString;
 use std::fs;
@@ -8,7 +8,7 @@ use std::process::Command;
 
 use packwatch::can::e2e::Protection;
 
-/// A life to be looked at.
+/// A life to replay.
 struct Life {
     config: String,
     simulate: &'static [&'static str],
@@ -19,11 +19,11 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The interpreter; `None`, and said so, when none is named.
+/// The interpreter. Prints a note and returns `None` if none is set.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
-        eprintln!("SKIPPED: PACKWATCH_PYTHON names no Python with cantools, no life was decoded");
+        eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with cantools");
     }
     python
 }
@@ -33,7 +33,7 @@ fn packwatch(arguments: &[&str], folder: &Path) {
     command.current_dir(folder).args(arguments).assert().success();
 }
 
-/// A shipped configuration with texts replaced, its files found from anywhere.
+/// A shipped configuration with texts replaced and absolute file paths.
 fn config(name: &str, replaced: &[(&str, &str)]) -> String {
     let mut text = fs::read_to_string(root().join("config").join(name)).unwrap();
     let folder = root().join("config").display().to_string();
@@ -48,7 +48,8 @@ fn config(name: &str, replaced: &[(&str, &str)]) -> String {
     text
 }
 
-/// The life's frames, estimates and events in `folder`, and what the tool found; panics unless all agrees.
+/// Writes the life's frames, estimates and events to `folder` and returns the tool's findings. Panics on any
+/// disagreement.
 fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     fs::write(folder.join("pack.toml"), &life.config).unwrap();
     let mut simulate = vec!["simulate", "paper", "-c", "pack.toml", "-o", "in.log"];
@@ -68,11 +69,15 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
         "{} cells: {} values in {}, {} restated",
         found["cells"], found["values"], found["frames"], found["restated"]
     );
-    // Not one frame is left out.
+    // Every frame must have been decoded.
     let sent = fs::read_to_string(folder.join("out.log")).unwrap().lines().count();
     let frames = ["Status", "Health", "Alarm", "Digest"].map(|name| found["frames"][name].as_u64().unwrap());
     assert_eq!(frames.iter().sum::<u64>(), u64::try_from(sent).unwrap());
-    assert!(found["restated"].as_u64().unwrap() < frames[1] / 100, "only at changes of mode: {}", found["restated"]);
+    assert!(
+        found["restated"].as_u64().unwrap() < frames[1] / 100,
+        "restated other than at changes of mode: {}",
+        found["restated"]
+    );
     found
 }
 
@@ -81,7 +86,7 @@ fn count(found: &serde_json::Value, of: &str) -> u64 {
 }
 
 #[test]
-fn every_frame_of_a_whole_life_says_what_the_replay_reports() {
+fn life_frames_decode_to_replay_values() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let life = Life { config: config("paper.toml", &[]), simulate: &[], rated_capacity_ah: "2.6" };
@@ -89,10 +94,10 @@ fn every_frame_of_a_whole_life_says_what_the_replay_reports() {
     assert!(found["frames"]["Status"].as_u64().unwrap() > 200_000, "a life of 2.2e5 s, every second");
     assert_eq!(found["frames"]["Alarm at once"], 2, "capacity and recharge period");
     assert!(count(&found, "Alarm.Value_CapacityLow") > 50_000 && count(&found, "Health.RechargePeriod") > 200_000);
-    assert!(found["untold"].as_u64().unwrap() < 100, "only the charge in which the log ends");
+    assert!(found["untold"].as_u64().unwrap() < 100, "only the unfinished charge at the log's end may be missing");
 }
 
-/// The example's pack cut to eight cells, each frame of another kind, protected by another profile.
+/// The example's pack reduced to eight cells; each kind of frame is protected by a different profile.
 fn protected_pack() -> String {
     let whole = config("example.toml", &[]);
     let (before, sensors) = whole.split_once("[[input.temperature]]").unwrap();
@@ -120,7 +125,7 @@ fn protected_pack() -> String {
 }
 
 #[test]
-fn every_protected_frame_of_a_pack_of_eight_cells_says_what_the_replay_reports() {
+fn protected_pack_frames_decode_to_replay_values() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let simulate = &[
@@ -138,13 +143,17 @@ fn every_protected_frame_of_a_pack_of_eight_cells_says_what_the_replay_reports()
     let life = Life { config: protected_pack(), simulate, rated_capacity_ah: "2.6" };
     let found = decode(&python, &life, folder.path());
     assert_eq!(found["cells"], 8);
-    assert!(found["frames"]["Alarm at once"].as_u64().unwrap() >= 8, "each cell has its own: {}", found["frames"]);
+    assert!(
+        found["frames"]["Alarm at once"].as_u64().unwrap() >= 8,
+        "each cell has its own alarm: {}",
+        found["frames"]
+    );
     assert!(count(&found, "Health.UsableCapacity") > 50_000);
     let checked = check_headers(&folder.path().join("out.log"), &folder.path().join("pack.toml"));
     assert_eq!(checked, fs::read_to_string(folder.path().join("out.log")).unwrap().lines().count());
 }
 
-/// Verifies checksum and counter of every frame of a log; how many there were.
+/// Verifies checksum and counter of every frame of a log. Returns the number of frames.
 fn check_headers(log: &Path, config: &Path) -> usize {
     let plan = packwatch::config::load(config).unwrap().monitor.output.unwrap().plan;
     let messages: Vec<_> = plan.messages().map(|sent| (sent.id, sent.protection)).collect();

@@ -1,4 +1,4 @@
-//! The log grammars as their users meet them: every form of candump line, the journal, CSV, and any bytes at all.
+//! The log grammars: every form of candump line, the journal, CSV, and arbitrary bytes.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ fn std_id(id: u32) -> CanId {
 }
 
 #[test]
-fn every_form_of_frame_is_read() {
+fn every_frame_form_is_read() {
     let ext = CanId::extended(0x1234_5678).expect("29 bits");
     let table = [
         ("123#", Frame::classic(std_id(0x123), &[])),
@@ -56,7 +56,7 @@ fn every_form_of_frame_is_read() {
 }
 
 #[test]
-fn a_foreign_interface_is_adopted_once_whatever_its_name_is_made_of() {
+fn unknown_interface_is_adopted_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
     let lines =
@@ -71,7 +71,7 @@ fn a_foreign_interface_is_adopted_once_whatever_its_name_is_made_of() {
 }
 
 #[test]
-fn stamps_names_and_directions_are_read() {
+fn timestamps_names_and_directions_are_read() {
     let parts = |line: &str| match parse_line(line.as_bytes()) {
         Ok(Line::Frame { time, interface, transmitted, .. }) => {
             (time.nanos(), String::from_utf8_lossy(interface).into_owned(), transmitted)
@@ -98,7 +98,7 @@ fn lines_without_a_data_frame_are_distinguished() {
 }
 
 #[test]
-fn a_broken_line_says_where_what_and_why() {
+fn malformed_line_reports_place_and_reason() {
     let table = [
         ("(", "column 2: found the end of the line, expected seconds"),
         ("(x.000000) can0 123#", "column 2: found \"x.000000) can0 123#\", expected seconds"),
@@ -151,12 +151,12 @@ proptest! {
     }
 
     #[test]
-    fn nearly_good_lines_never_panic(text in "\\([0-9.]{0,14}\\) {0,2}[a-z0-9]{0,3} {0,2}[0-9A-Fa-fRr#:_. ]{0,40}") {
+    fn nearly_valid_lines_never_panic(text in "\\([0-9.]{0,14}\\) {0,2}[a-z0-9]{0,3} {0,2}[0-9A-Fa-fRr#:_. ]{0,40}") {
         let _ = parse_line(text.as_bytes()).map_err(|e| e.describe(text.as_bytes()));
     }
 
     #[test]
-    fn a_written_line_reads_back(frame in any_frame(), nanos in any::<i64>()) {
+    fn written_line_reads_back(frame in any_frame(), nanos in any::<i64>()) {
         let time = Timestamp::from_nanos(nanos.max(-i64::MAX));
         let mut line = Vec::new();
         write_line(&mut line, time, StampDigits::Nanos, "can0", &frame).expect("memory");
@@ -165,7 +165,7 @@ proptest! {
     }
 
     #[test]
-    fn any_file_is_read_to_its_end(bytes in prop::collection::vec(any::<u8>(), 0..400), name in "(a\\.log|a\\.csv)") {
+    fn any_file_is_read_to_end(bytes in prop::collection::vec(any::<u8>(), 0..400), name in "(a\\.log|a\\.csv)") {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join(name);
         std::fs::write(&path, &bytes).expect("written");
@@ -173,7 +173,7 @@ proptest! {
     }
 }
 
-/// Frames with the current in byte 0, as the row encoder of the tests makes them.
+/// Options for frames with the current in byte 0, as the tests' row encoder makes them.
 fn options(strict: bool) -> LogOptions {
     LogOptions {
         interfaces: vec!["can0".into(), "can1".into()],
@@ -205,7 +205,7 @@ fn read(
     Ok((records, source.counts().clone()))
 }
 
-/// The same in batches of up to `max`.
+/// Reads the same files in batches of up to `max` records.
 fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Record>, LogCounts), LogError> {
     let mut source = LogSource::new(paths.to_vec(), options(strict));
     let (mut batch, mut records) = (Batch::new(max), Vec::new());
@@ -217,7 +217,7 @@ fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Reco
     Ok((records, source.counts().clone()))
 }
 
-/// Files whose lines are of every kind: usual ones, unusual ones, bad ones, other interfaces, ends of files.
+/// Log files with lines of every kind: usual, unusual, malformed, of other interfaces, and ends of files.
 fn any_log() -> impl Strategy<Value = Vec<u8>> {
     let usual = "\\(000000000[0-9]\\.[0-9]{6}\\) can[012] [0-7][0-9A-F]{2}#([0-9A-F]{2}){0,8}\r?\n";
     let unusual = "\\([0-9]{1,3}\\.[0-9]{6}\\)  ?can[01] [0-7][0-9A-F]{2}#[R#]?([0-9A-F]{2}){0,9}( [RTX])?\n";
@@ -234,7 +234,7 @@ fn any_log() -> impl Strategy<Value = Vec<u8>> {
 
 proptest! {
     #[test]
-    fn batches_give_the_records_one_by_one_gives(
+    fn batches_equal_single_records(
         logs in prop::collection::vec(any_log(), 1..4),
         strict in any::<bool>(),
         max in prop::sample::select(vec![1, 3, Batch::MAX]),
@@ -243,13 +243,13 @@ proptest! {
         let paths: Vec<_> = logs.iter().zip(0..).map(|(log, n)| file(folder.path(), &format!("{n}.log"), log)).collect();
         let one_by_one = read(&paths, strict, |_| {});
         prop_assert_eq!(read_batches(&paths, strict, max), one_by_one);
-        // Spread by blanks nothing is usual any more, and nothing else changes.
+        // With extra spaces no line takes the fast path; nothing else changes.
         let spread: Vec<_> = logs.iter().zip(0..).map(|(log, n)| {
             let text = String::from_utf8_lossy(log).replace(") can", ")  can");
             file(folder.path(), &format!("{n}.log"), text.as_bytes())
         }).collect();
         if !strict {
-            // A log whose first line has a comma is taken for a table, and refused: then both are.
+            // A log whose first line contains a comma is read as a table and rejected; then both reads must fail.
             match (read(&spread, strict, |_| {}), read_batches(&paths, strict, max)) {
                 (Ok((wide, mut counts)), Ok((records, mut plain))) => {
                     (counts.first_bad_line, plain.first_bad_line) = (None, None);
@@ -262,7 +262,7 @@ proptest! {
 }
 
 #[test]
-fn a_batch_ends_with_its_file_and_says_whether_it_carries_ticks() {
+fn batch_ends_with_file_and_reports_ticks() {
     let folder = tempfile::tempdir().expect("a folder");
     let lines: String = (1..100).map(|n| format!("({n:010}.000000) can0 123#11\n")).collect();
     let plain = file(folder.path(), "a.log", lines.as_bytes());
@@ -291,7 +291,7 @@ fn millis(records: &[Record]) -> Vec<i64> {
 }
 
 #[test]
-fn bad_lines_are_counted_and_the_first_is_shown() {
+fn malformed_lines_are_counted_and_first_shown() {
     let folder = tempfile::tempdir().expect("a folder");
     let text =
         b"(1.000000) can0 123#11\n(1.1) can0 123#11\n(1.2000000) x\n# note\n(1.300000) can7 123#\n(2.000000) can1 1#";
@@ -310,7 +310,7 @@ fn bad_lines_are_counted_and_the_first_is_shown() {
 }
 
 #[test]
-fn compressed_logs_are_the_same_and_a_torn_one_is_reported() {
+fn compressed_logs_match_and_truncation_is_reported() {
     let folder = tempfile::tempdir().expect("a folder");
     let text: Vec<u8> = (0..5000).flat_map(|n| format!("({n}.000000) can0 123#{:04X}\n", n).into_bytes()).collect();
     let plain = read(&[file(folder.path(), "a.log", &text)], true, |_| {}).expect("plain");
@@ -327,7 +327,7 @@ fn compressed_logs_are_the_same_and_a_torn_one_is_reported() {
 }
 
 #[test]
-fn a_later_log_that_begins_earlier_follows_an_unknown_gap() {
+fn earlier_log_follows_unknown_gap() {
     let folder = tempfile::tempdir().expect("a folder");
     let first = file(folder.path(), "a.log", b"(100.000000) can0 123#\n(105.000000) can0 123#\n");
     let second = file(folder.path(), "b.log", b"(000.500000) can0 123#\n(002.500000) can0 123#\n");
@@ -338,7 +338,7 @@ fn a_later_log_that_begins_earlier_follows_an_unknown_gap() {
 }
 
 #[test]
-fn a_journal_reads_back_as_written() {
+fn journal_reads_back_as_written() {
     let frame = Frame::classic(std_id(0x123), &[1, 2, 3]).expect("a frame");
     let at = Timestamp::from_nanos;
     let events = [
@@ -368,37 +368,37 @@ fn a_journal_reads_back_as_written() {
     assert_eq!(records[3..], inputs);
     assert_eq!((counts.bad_lines, counts.ignored_lines, counts.time_backwards), (0, 1, 1));
 
-    // Torn in the middle of its last line: that line is not taken for a shorter one.
+    // Cut the file in the middle of its last line: the line must not be read as a shorter one.
     let (records, counts) = read(&[file(folder.path(), "t", &text[..text.len() - 2])], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
 }
 
-/// Two notes of the largest number of lost frames behind a frame, as candump writes them.
+/// Two notes of the largest number of lost frames after a frame, as candump writes them.
 const MOST_DROPPED: &str = "(1.000000) can0 123#11\n\
     DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n\
     DROPCOUNT: dropped 18446744073709551615 CAN frames on 'can0' socket (total drops 18446744073709551615)\n";
 
 #[test]
-fn numbers_of_lost_frames_add_up_to_the_largest_and_not_beyond() {
+fn lost_frame_counts_saturate() {
     let folder = tempfile::tempdir().expect("a folder");
     let candump = file(folder.path(), "a.log", MOST_DROPPED.as_bytes());
     let lost = Record::bus(Timestamp::from_nanos(1_000_000_000), BusIndex(0), BusEvent::Dropped { frames: u64::MAX });
     let one_by_one = read(std::slice::from_ref(&candump), true, |_| {}).expect("read");
-    assert_eq!(one_by_one.0[1..], [lost, lost], "each line is a record with its number");
+    assert_eq!(one_by_one.0[1..], [lost, lost], "each line is a record with its own number");
     assert_eq!((one_by_one.1.dropped_frames, one_by_one.1.bad_lines), (u64::MAX, 0));
     assert_eq!(read_batches(&[candump], true, Batch::MAX).expect("read"), one_by_one);
     let line = "BUS (1.000000000) can0 dropped 18446744073709551615\n";
     let journal = file(folder.path(), "j", format!("PACKWATCH-JOURNAL 1\n{line}{line}").as_bytes());
     let (records, counts) = read(&[journal], true, |_| {}).expect("read");
     assert_eq!((records, counts.bad_lines), (vec![lost, lost], 0));
-    // One more than the largest is no number.
+    // A number above the largest is invalid.
     let beyond = MOST_DROPPED.replace("dropped 18446744073709551615", "dropped 18446744073709551616");
     let (records, counts) = read(&[file(folder.path(), "b.log", beyond.as_bytes())], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.dropped_frames, counts.ignored_lines), (1, 0, 2));
 }
 
 #[test]
-fn the_largest_numbers_of_lost_frames_are_events_and_leave_the_monitor_s_statistics_as_they_are() {
+fn lost_frame_counts_leave_statistics_unchanged() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     let before = rig.monitor.statistics().clone();
@@ -413,23 +413,28 @@ fn the_largest_numbers_of_lost_frames_are_events_and_leave_the_monitor_s_statist
         _ => None,
     });
     assert_eq!(noted.collect::<Vec<_>>(), [notes[0], notes[0], notes[1], notes[1]]);
-    assert_eq!(*rig.monitor.statistics(), before, "frames that were lost are counted by the interface");
+    assert_eq!(*rig.monitor.statistics(), before, "the interface counts lost frames");
     rig.seconds(1);
-    assert_eq!(rig.monitor.statistics().buses[0].frames, before.buses[0].frames + 20, "and it goes on");
+    assert_eq!(rig.monitor.statistics().buses[0].frames, before.buses[0].frames + 20, "the monitor continues to count");
 }
 
 #[test]
-fn broken_journal_lines_are_bad_lines() {
+fn malformed_journal_lines_are_counted() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = b"PACKWATCH-JOURNAL 1\nTICK (1.0)\nTICK (1.000000000) x\nBUS (1.000000000) can0 gone\nBUS (1.000000000) can0 up\nGAP\n";
     let (records, counts) = read(&[file(folder.path(), "j", text)], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines, counts.ignored_lines), (1, 3, 2));
     let newer = file(folder.path(), "n", b"PACKWATCH-JOURNAL 2\n");
-    assert!(read(&[newer], false, |_| {}).expect_err("another version").to_string().contains("this program reads"));
+    assert!(
+        read(&[newer], false, |_| {})
+            .expect_err("a newer version is rejected")
+            .to_string()
+            .contains("this program reads")
+    );
 }
 
 #[test]
-fn csv_rows_become_frames_and_bad_fields_are_reported_with_their_column() {
+fn csv_rows_become_frames_and_bad_fields_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = b"time_s,current_a,voltage_v,temperature_c\n0,1.5,4.0,25\n1.25,,3.9,25\n2,NaN,3.9,25\n3,1,oops,25\n4,1\n5,2,3.8,\n";
     let path = file(folder.path(), "a.csv", text);
@@ -451,10 +456,10 @@ fn csv_rows_become_frames_and_bad_fields_are_reported_with_their_column() {
 }
 
 #[test]
-fn csv_columns_can_be_mapped_and_a_missing_one_is_named() {
+fn csv_columns_are_mapped_and_missing_one_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = file(folder.path(), "a.csv", b"t,I (A),U1,U2\n0,1,3,4\n");
-    let error = read(std::slice::from_ref(&path), false, |_| {}).expect_err("no such column");
+    let error = read(std::slice::from_ref(&path), false, |_| {}).expect_err("a column is missing");
     assert!(
         error
             .to_string()
@@ -467,7 +472,7 @@ fn csv_columns_can_be_mapped_and_a_missing_one_is_named() {
 }
 
 #[test]
-fn csv_sections_follow_unknown_gaps_unless_their_starts_are_given() {
+fn csv_sections_follow_gaps_without_start_times() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = b"cycle,time_s,current_a,voltage_v\n0,0,1,4\n0,10,1,4\n1,0,1,4\n1,5,1,4\n";
     let path = file(folder.path(), "a.csv", text);

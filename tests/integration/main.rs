@@ -1,8 +1,8 @@
-//! The integration tests: one program, one module for each subject, so that they are compiled and linked once.
+//! The integration tests. They form one program with a module per subject, so that they are compiled and linked once.
 //!
-//! `cargo nextest run` runs each test in a process of its own, `cargo test` all of them as threads of one process; the
-//! tests depend on neither. One subject alone: `cargo test --test integration doctor::`.
-//! Shared helpers are in `support`. `tests/allocations.rs` is a program of its own: it replaces the global allocator.
+//! `cargo nextest run` runs each test in its own process, `cargo test` runs all of them as threads of one process; the
+//! tests work with both. To run one subject: `cargo test --test integration doctor::`. Shared helpers are in `support`.
+//! `tests/allocations.rs` is a separate program because it replaces the global allocator.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,

@@ -1,8 +1,10 @@
-//! Measured cells' whole lives (NASA PCoE B0005, B0006) through `packwatch replay`, against their published capacities.
+//! Whole lives of measured cells (NASA PCoE B0005, B0006) through `packwatch replay`, against their published
+//! capacities.
 //!
-//! The published capacity is what 2 A delivers down to 2.7 V (both cells, even where the cycler discharged further), so it is held
-//! against the usable capacity. Discharge numbers count from 1; published values of B0005 first fall below 1.4 Ah at
-//! discharge 125 and never below 1.2 Ah, those of B0006 at 109. Each model knows its cell's first five cycles only.
+//! The published capacity is the charge delivered at 2 A down to 2.7 V (for both cells, even where the cycler
+//! discharged further), so the test compares it with the usable capacity. Discharges are numbered from 1. The published
+//! capacity of B0005 first falls below 1.4 Ah at discharge 125 and never below 1.2 Ah; that of B0006 falls below 1.4 Ah
+//! at 109. Each model was fitted to its cell's first five cycles only.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -11,7 +13,7 @@ use crate::support::measured;
 use crate::support::window::{By, windowed};
 use serde_json::Value;
 
-/// One discharge of the table: when it started (s) and its published capacity (Ah).
+/// One discharge of the table: start time (s) and published capacity (Ah).
 struct Discharge {
     start_s: f64,
     capacity_ah: f64,
@@ -23,7 +25,7 @@ fn discharges(folder: &Path, cell: &str) -> Vec<Discharge> {
     rows.map(|row| Discharge { start_s: seconds(&row[2]), capacity_ah: row[4].parse().unwrap() }).collect()
 }
 
-/// `2008-04-02T15:25:41.593` as UTC; all of the record is in April and May 2008.
+/// Parses `2008-04-02T15:25:41.593` as UTC. The whole record lies in April and May 2008.
 fn seconds(stamp: &str) -> f64 {
     let number = |from: usize, to: usize| stamp[from..to].parse::<f64>().unwrap();
     let days = number(8, 10) - 1.0 + if number(5, 7) == 5.0 { 30.0 } else { 0.0 };
@@ -35,7 +37,7 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// The shipped configuration for `cell` with `changes` made to its text, beside absolute paths, as a file in `folder`.
+/// Writes the shipped configuration for `cell`, with absolute paths and `changes` made to its text, to `folder`.
 fn configuration(folder: &Path, cell: &str, changes: &[(&str, &str)], more: &str) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -74,22 +76,22 @@ fn events(path: &Path) -> Vec<Value> {
     text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// Number of the latest discharge begun by the event's time.
+/// Number of the last discharge that started before the event.
 fn discharge_of(event: &Value, discharges: &[Discharge]) -> usize {
     let time_s = event["time"].as_f64().unwrap() * 1e-9;
     discharges.iter().filter(|discharge| discharge.start_s <= time_s).count()
 }
 
-/// The usable capacity stated after a discharge.
+/// The usable capacity reported after a discharge.
 struct Stated {
     discharge: usize,
     usable_ah: f64,
     std_ah: f64,
-    /// Against the published one.
+    /// Difference from the published capacity.
     error_ah: f64,
 }
 
-/// What was stated after each discharge from number 11 on.
+/// Usable capacities reported after each discharge from number 11 on.
 fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
     let mut stated = Vec::new();
     let mut mode = "";
@@ -113,7 +115,7 @@ fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn the_alarm_comes_at_the_end_of_life_and_not_before() {
+fn alarm_comes_at_end_of_life() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let lower = "\n[[alarm]]\nrule = \"usable_capacity_low\"\ninfo = 1.2\n";
@@ -132,14 +134,14 @@ fn the_alarm_comes_at_the_end_of_life_and_not_before() {
     let at = raised(1.4).expect("the cell falls below 1.4 Ah");
     println!("alarm at 1.4 Ah after discharge {at}");
     assert!((120..=130).contains(&at), "published below 1.4 Ah at discharge 125, alarm at {at}");
-    assert_eq!(raised(1.2), None, "published never below 1.2 Ah");
+    assert_eq!(raised(1.2), None, "the published capacity never falls below 1.2 Ah");
 }
 
-/// How the usable capacity of a whole life came out.
+/// Errors of the usable capacity over a whole life.
 struct Score {
     mean_absolute_ah: f64,
     covered: f64,
-    /// Number of the first discharge after which it was below 1.4 Ah.
+    /// Number of the first discharge after which the usable capacity was below 1.4 Ah.
     first_below: Option<usize>,
 }
 
@@ -156,7 +158,7 @@ fn score(events: &[Value], discharges: &[Discharge]) -> Score {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn usable_capacity_follows_the_published_one_from_a_start_twenty_percent_wrong() {
+fn usable_capacity_converges_from_wrong_start() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     for (cell, new_ah, end_of_life) in [("B0005", 1.9216, 125), ("B0006", 2.1059, 109)] {
@@ -175,18 +177,18 @@ fn usable_capacity_follows_the_published_one_from_a_start_twenty_percent_wrong()
             );
             assert!(life.mean_absolute_ah < 0.015, "{cell} {part}: {} Ah", life.mean_absolute_ah);
             assert!(life.covered > 0.9, "{cell} {part}: {}", life.covered);
-            let at = life.first_below.expect("below 1.4 Ah in the end");
+            let at = life.first_below.expect("falls below 1.4 Ah");
             assert!(at.abs_diff(end_of_life) <= 3, "{cell} {part}: below 1.4 Ah at {at}, published {end_of_life}");
         }
     }
 }
 
-/// Seed of the windows, and what they are counted in.
+/// Seed and unit of the windows.
 const RUNS: [(u64, By); 4] = [(1, By::Duration), (2, By::Duration), (3, By::Charge), (4, By::Charge)];
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn usable_capacity_is_learned_from_windows_of_the_swings() {
+fn usable_capacity_is_learned_from_windows() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let rows = folder.path().join("windows.csv");
@@ -208,17 +210,17 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
             assert!(life.mean_absolute_ah < 0.085, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
             (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
-        // One set of windows can be unlucky for long, since each fault of the voltage curve repeats at its SOC.
+        // A single set of windows can be bad throughout, since each error of the voltage curve recurs at its SOC.
         let (mean_ah, covered) = (sum_ah / RUNS.len() as f64, sum_covered / RUNS.len() as f64);
         assert!(mean_ah < 0.065, "{cell}: {mean_ah} Ah");
-        // Too narrow: faults of the curve that differ between the two ends of a window are not in the interval.
+        // Coverage is too low: the interval does not include curve errors that differ between the two ends of a window.
         assert!(covered > 0.4, "{cell}: {covered}");
     }
 }
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn one_log_twice_is_the_same_bytes() {
+fn repeated_replay_is_byte_identical() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let config = configuration(folder.path(), "B0005", &[], "");

@@ -1,4 +1,4 @@
-//! `packwatch cells` and `packwatch model` as their user runs them.
+//! Runs `packwatch cells` and `packwatch model` as a user does.
 
 use std::path::{Path, PathBuf};
 use std::process::Output;
@@ -20,7 +20,7 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&good(args)).unwrap()
 }
 
-/// Standard error of a run that must fail with this code.
+/// Standard error of a run that must fail with this exit code.
 fn refused(code: i32, args: &[&str]) -> String {
     let output = packwatch(args);
     assert_eq!(output.status.code(), Some(code), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -29,7 +29,7 @@ fn refused(code: i32, args: &[&str]) -> String {
 
 const PANASONIC: &str = "config/cells/panasonic_18650pf.toml";
 
-/// A file in a folder of its own.
+/// A temporary folder.
 struct Place(tempfile::TempDir);
 
 impl Place {
@@ -47,7 +47,7 @@ impl Place {
 }
 
 #[test]
-fn cells_lists_the_shipped_models_with_their_data_and_every_chemistry() {
+fn cells_lists_shipped_models_and_chemistries() {
     let page = good(&["cells"]);
     for part in ["Panasonic NCR18650PF", "NASA PCoE B0005", "licence: MIT", "lfp-graphite", "not stated"] {
         assert!(page.contains(part), "no {part} in\n{page}");
@@ -68,7 +68,7 @@ fn cells_lists_the_shipped_models_with_their_data_and_every_chemistry() {
 }
 
 #[test]
-fn a_file_that_is_no_cell_model_is_reported_after_the_others() {
+fn invalid_cell_model_is_reported_last() {
     let place = Place::new();
     std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join(PANASONIC), place.path("good.toml")).unwrap();
     std::fs::write(place.path("bad.toml"), "format = 1\n").unwrap();
@@ -90,14 +90,14 @@ fn numbers(value: &Value, found: &mut Vec<(String, f64)>, path: &str) {
 }
 
 #[test]
-fn show_states_bands_that_are_never_negative_and_what_is_prior() {
+fn show_states_valid_bands_and_priors() {
     for source in ["nca-graphite:2.9", "lfp-graphite:280", PANASONIC, "config/cells/nasa_b0005.toml"] {
         let document = json(&["model", "show", "--json", source]);
         let mut found = Vec::new();
         numbers(&document, &mut found, "");
         let bands: Vec<_> = found.iter().filter(|(path, _)| path.contains("std")).collect();
         assert!(bands.len() > 5 && bands.iter().all(|(_, value)| *value >= 0.0), "{source}: {bands:?}");
-        // JSON has no NaN: it would be null, which stands only where the model states no error.
+        // JSON has no NaN: it would be written as null, which is allowed only if the model states no error.
         let is_stated = document["soc_error_points"].is_number();
         assert_eq!(is_stated, !source.contains("nasa"), "{source}");
         let nulls = document["curve"].as_array().unwrap().iter().filter(|row| row["ocv_std_v"].is_null()).count();
@@ -113,7 +113,7 @@ fn show_states_bands_that_are_never_negative_and_what_is_prior() {
 }
 
 #[test]
-fn an_exported_model_is_read_again_and_is_no_different() {
+fn exported_model_reads_back_unchanged() {
     let place = Place::new();
     let (out, again) = (place.name("out.toml"), place.name("again.toml"));
     for source in ["nmc811-graphite:60", PANASONIC, "config/cells/nasa_b0005.toml"] {
@@ -128,11 +128,14 @@ fn an_exported_model_is_read_again_and_is_no_different() {
         let body = |text: &str| text.split_once('\n').unwrap().1.to_owned();
         assert_eq!(body(&first), body(&second), "{source}");
     }
-    assert!(refused(1, &["model", "export", &out, "-o", &out]).contains("out.toml"), "an input is not overwritten");
+    assert!(
+        refused(1, &["model", "export", &out, "-o", &out]).contains("out.toml"),
+        "an input must not be overwritten"
+    );
 }
 
 #[test]
-fn the_export_of_a_label_serves_a_configuration_with_the_same_intervals() {
+fn exported_label_gives_same_intervals() {
     let place = Place::new();
     let model = place.name("cell.toml");
     good(&["model", "export", "nca-graphite:2.9", "-o", &model]);
@@ -152,7 +155,7 @@ fn the_export_of_a_label_serves_a_configuration_with_the_same_intervals() {
 }
 
 #[test]
-fn compare_says_how_far_apart_models_are() {
+fn compare_reports_distance_of_models() {
     let document = json(&["model", "compare", "--json", "nca-graphite:2.9", PANASONIC]);
     let rms_v = document["ocv_v"]["rms"].as_f64().unwrap();
     assert!(rms_v > 0.005 && rms_v < 0.2, "{document}");
@@ -165,7 +168,7 @@ fn compare_says_how_far_apart_models_are() {
 }
 
 #[test]
-fn a_source_that_is_none_is_named_with_what_is_allowed() {
+fn invalid_source_error_lists_allowed_sources() {
     assert!(refused(1, &["model", "show", "nosuch"]).contains("nosuch: no such file; must be a cell model file"));
     assert!(refused(1, &["model", "show", "nmc:3"]).contains("chemistries: nmc811-graphite, nmc-graphite, "));
     assert!(refused(1, &["model", "show", "nca-graphite:-3"]).contains("must be a finite number above 0 (Ah)"));
@@ -176,8 +179,8 @@ fn a_source_that_is_none_is_named_with_what_is_allowed() {
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history there"));
 }
 
-/// A folder with the log of a vehicle of one cell, whose model was learned on board from the label alone: deep swings of the load
-/// for most of a day, and the first readings after the night.
+/// A folder with the log of a one-cell vehicle whose model was learned on board from the label alone: deep swings for
+/// most of a day, and the first readings after the night.
 fn learned() -> Place {
     let place = Place::new();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -206,7 +209,7 @@ fn learned() -> Place {
 }
 
 #[test]
-fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
+fn learned_model_is_shown_exported_and_reported() {
     let place = learned();
     let (snapshot, pack) = (place.name("snapshot.json"), place.name("pack.toml"));
     let document = json(&["model", "show", "--json", &snapshot]);
@@ -233,7 +236,7 @@ fn what_a_vehicle_has_learned_is_shown_exported_and_in_the_report() {
     check_report(&place, &document);
 }
 
-/// The same document; numbers within 1e-6 of each other, because a stored state keeps nine digits.
+/// Asserts that two documents agree, numbers to within 1e-6, because a stored state keeps nine digits.
 fn assert_close(found: &Value, wanted: &Value) {
     match (found, wanted) {
         (Value::Array(found), Value::Array(wanted)) if found.len() == wanted.len() => {
@@ -251,7 +254,7 @@ fn assert_close(found: &Value, wanted: &Value) {
 }
 
 #[test]
-fn what_a_vehicle_has_learned_of_its_model_is_in_the_history() {
+fn learned_model_is_in_history() {
     let place = learned();
     let state = place.name("state");
     let document = json(&["history", "--state", &state, "--kind", "model", "--json"]);
@@ -272,12 +275,12 @@ fn what_a_vehicle_has_learned_of_its_model_is_in_the_history() {
     let heads = "cell,state,capacity_ah,capacity_std_ah,residual_v,chemistry,taken_back";
     assert!(csv.lines().next().unwrap().ends_with(heads) && csv.lines().count() == 1 + rows.len(), "{csv}");
     let one_cell = json(&["history", "--state", &state, "--kind", "model", "--cell", "1", "--json"]);
-    assert_eq!(one_cell["rows"], Value::Array(Vec::new()), "it is the model of all cells");
+    assert_eq!(one_cell["rows"], Value::Array(Vec::new()), "the model belongs to all cells, not to one");
     let later = json(&["history", "--state", &state, "--kind", "model", "--since", "4000000000", "--json"]);
     assert_eq!(later["rows"], Value::Array(Vec::new()));
 }
 
-/// Checks that reports of the log and of the store give the advice of `model show`.
+/// Checks that reports of the log and of the store give the same advice as `model show`.
 #[cfg(feature = "lab")]
 fn check_report(place: &Place, document: &Value) {
     let page = place.name("page.html");
@@ -299,7 +302,7 @@ fn check_report(place: &Place, document: &Value) {
 
 #[cfg(feature = "lab")]
 #[test]
-fn plot_draws_every_picture_as_svg() {
+fn plot_writes_all_pictures_as_svg() {
     let place = Place::new();
     let out = place.name("model.svg");
     good(&["model", "plot", "nca-graphite:2.9", "-o", &out]);

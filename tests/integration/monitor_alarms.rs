@@ -7,17 +7,17 @@ use packwatch::monitor::{BusEvent, Command, EventKind, Record, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 
 #[test]
-fn the_hottest_sensor_raises_and_a_lost_sensor_neither_clears_nor_hides() {
+fn hottest_sensor_raises_despite_lost_sensor() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.seconds(2);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 0));
-    // One sensor gone: what is known is cool, the other may be hot.
+    // One sensor is lost. The known temperature is low, but the other may be high.
     rig.temperatures_c[1] = None;
     rig.seconds(4);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 2));
     rig.temperatures_c[0] = Some(60.0);
     rig.seconds(1);
-    assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised], "hot enough whatever the other one says");
+    assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised], "one hot sensor suffices");
     rig.temperatures_c[0] = Some(30.0);
     rig.seconds(1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised, Change::Suppressed]);
@@ -30,7 +30,7 @@ fn the_hottest_sensor_raises_and_a_lost_sensor_neither_clears_nor_hides() {
 }
 
 #[test]
-fn alarms_health_digest_and_replies_announce_and_the_status_does_not() {
+fn all_frames_except_status_are_announced() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.temperatures_c[0] = Some(60.0);
     rig.seconds(12);
@@ -44,19 +44,19 @@ fn alarms_health_digest_and_replies_announce_and_the_status_does_not() {
 }
 
 #[test]
-fn the_emptiest_cell_and_the_spread_raise_their_alarms() {
+fn empty_cell_and_spread_raise_alarms() {
     let mut rig = Rig::new(
         "[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n[[alarm]]\nrule = \"cell_imbalance\"\nsevere = \"30 %\"\n\
          [estimator]\nlost_after_s = 5\n",
     );
     rig.seconds(5);
     assert_eq!((rig.changes(Rule::SocLow), rig.changes(Rule::CellImbalance)), (vec![], vec![]));
-    // Cell 2 stands for good at a voltage that only an empty cell has.
+    // Cell 2 stays at a voltage that only an empty cell has.
     rig.voltages_v[1] = Some(3.2);
     rig.seconds(120);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
     assert_eq!(rig.changes(Rule::CellImbalance), [Change::Raised]);
-    // Without the full one the spread is not known; the empty one is as empty as before.
+    // Without the full cell the spread is unknown; the empty cell is unchanged.
     rig.voltages_v[0] = None;
     rig.seconds(5);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
@@ -64,7 +64,7 @@ fn the_emptiest_cell_and_the_spread_raise_their_alarms() {
 }
 
 #[test]
-fn a_pack_that_reports_another_soc_disagrees_when_that_lasts() {
+fn lasting_soc_disagreement_raises_alarm() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"bms_disagrees\"\nwarning = \"15 %\"\ndebounce_s = 30\n");
     rig.seconds(40);
     let ours = rig.monitor.pack().unwrap().soc;
@@ -73,7 +73,7 @@ fn a_pack_that_reports_another_soc_disagrees_when_that_lasts() {
     rig.seconds(20);
     rig.reported_soc = Some(ours);
     rig.seconds(20);
-    assert_eq!(rig.changes(Rule::BmsDisagrees), [], "it did not last");
+    assert_eq!(rig.changes(Rule::BmsDisagrees), [], "a short disagreement must not raise");
     rig.reported_soc = Some(ours + 0.2);
     rig.seconds(31);
     assert_eq!(rig.changes(Rule::BmsDisagrees), [Change::Raised]);
@@ -85,12 +85,12 @@ fn a_pack_that_reports_another_soc_disagrees_when_that_lasts() {
 }
 
 #[test]
-fn interfaces_and_files_out_of_order_raise_their_alarms() {
+fn interface_and_file_faults_raise_alarms() {
     let mut rig = Rig::new(
         "[[alarm]]\nrule = \"bus_fault\"\nwarning = 1\nlatched = true\n[[alarm]]\nrule = \"store_failed\"\nsevere = 0\n",
     );
     rig.seconds(1);
-    assert_eq!(rig.unknown_rules(), 1, "it is not known whether files can be written");
+    assert_eq!(rig.unknown_rules(), 1, "the state of the files is still unknown");
     rig.give(Record::store(rig.now(), true));
     rig.give(Record::bus(rig.now(), BusIndex(0), BusEvent::Up));
     rig.seconds(1);
@@ -109,11 +109,11 @@ fn interfaces_and_files_out_of_order_raise_their_alarms() {
 }
 
 #[test]
-fn a_learned_alarm_whose_inputs_are_lost_is_suppressed_and_comes_back_as_it_was() {
+fn learned_alarm_is_suppressed_while_inputs_lost() {
     let mut rig = learned();
     let before = rig.last_wire(Rule::CapacityLow);
     assert_eq!((before.state, rig.unknown_rules()), (1, 0));
-    // One input still comes: the buses do not sleep.
+    // The current is still received, so the buses are not asleep.
     (rig.current_a, rig.voltages_v, rig.temperatures_c) = (None, [None; 2], [None; 2]);
     rig.seconds(10);
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Suppressed, Change::Suppressed]);
@@ -127,7 +127,7 @@ fn a_learned_alarm_whose_inputs_are_lost_is_suppressed_and_comes_back_as_it_was(
 }
 
 #[test]
-fn a_rule_that_cannot_be_judged_is_reported_as_unknown_in_turn() {
+fn unjudged_rule_is_sent_as_unknown() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"capacity_low\"\nwarning = 2.0\n");
     rig.seconds(5);
     assert_eq!(rig.unknown_rules(), 2);
@@ -137,17 +137,18 @@ fn a_rule_that_cannot_be_judged_is_reported_as_unknown_in_turn() {
 }
 
 #[test]
-fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
+fn bus_commands_need_protection_and_sequence() {
     let mut rig = learned();
     let reported = |rig: &Rig| rig.events.iter().filter(|e| matches!(e.kind, EventKind::Command { .. })).count();
     let bad = |rig: &Rig| rig.events.iter().filter(|e| matches!(e.kind, EventKind::BadCommand { .. })).count();
     rig.command(1, 31, 2047);
-    assert_eq!((reported(&rig), bad(&rig)), (0, 1), "the first frame only shows the counter");
+    assert_eq!((reported(&rig), bad(&rig)), (0, 1), "the first frame only synchronises the counter");
     rig.command(1, 1, 0);
     assert_eq!((reported(&rig), bad(&rig)), (1, 1));
     let marked = rig.last_wire(Rule::CapacityLow);
     assert!((marked.acknowledged, marked.cell, marked.state) == (true, 0, 1), "{marked:?}");
-    // The same frame again, one with a wrong CRC, one with an unknown command: none is applied, one a second is reported.
+    // Repeat the frame, then send one with a wrong CRC and one with an unknown command: none is applied, one per second
+    // is reported.
     rig.seconds(2);
     let again = command_frame(1, 1, 0, 1);
     rig.give(Record::frame(rig.now(), BusIndex(0), &again));
@@ -159,7 +160,7 @@ fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
     rig.give(Record::frame(rig.now(), BusIndex(0), &harmed));
     rig.command(9, 31, 2047);
     assert_eq!((reported(&rig), bad(&rig)), (1, 2));
-    // Clearing what is beyond its threshold is refused, and erases nothing.
+    // Clearing an alarm whose value is beyond its threshold is rejected and erases nothing.
     let capacity = rig.monitor.capacity(CellIndex(0));
     rig.command(2, 31, 2047);
     let refused = rig.events.iter().rev().find_map(|event| match event.kind {
@@ -171,7 +172,7 @@ fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
 }
 
 #[test]
-fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() {
+fn new_pack_starts_from_configuration() {
     let mut rig = learned();
     let old_ah = rig.monitor.capacity(CellIndex(0)).mean.min(rig.monitor.capacity(CellIndex(1)).mean);
     rig.give(Record::command(rig.now(), Command::PackReplaced));
@@ -188,17 +189,17 @@ fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() 
 }
 
 #[test]
-fn a_test_is_marked_carries_no_value_and_hides_no_real_alarm() {
+fn alarm_test_is_marked_and_hides_nothing() {
     let mut rig = learned();
     rig.frames.clear();
     rig.give(Record::command(rig.now(), Command::Test { rule: Rule::CapacityLow, seconds: 2.0 }));
     rig.seconds(3);
     let (tests, real): (Vec<Wire>, Vec<Wire>) = rig.wire().into_iter().partition(|wire| wire.test);
-    assert_eq!(tests.len(), 21, "ten a second, and the end");
+    assert_eq!(tests.len(), 21, "ten per second, and the final frame");
     assert!(tests.iter().all(|test| (test.rule, test.value, test.cell) == (1, NO_VALUE, WHOLE_PACK)));
     assert_eq!((tests[0].state, tests[20].state), (1, 0));
     assert!(real.len() >= 5 && real.iter().all(|wire| wire.state == 1 && wire.value != NO_VALUE));
-    assert_eq!(rig.monitor.alarms().count(), 2, "a test raises nothing");
+    assert_eq!(rig.monitor.alarms().count(), 2, "a test must not raise an alarm");
     let selector = Selector::default();
     rig.give(Record::command(rig.now(), Command::Acknowledge(selector)));
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Acknowledged, Change::Acknowledged]);

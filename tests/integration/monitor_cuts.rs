@@ -1,10 +1,11 @@
-//! A snapshot taken after any input, restored on the same clock, continues byte-identical: frames, events and estimates.
+//! A snapshot taken after any input and restored on the same clock continues byte-identical: frames, events and
+//! estimates.
 //!
-//! A pack of three cells with protected inputs, alarms of every kind, commands from both sides, a J1939 node and diagnostic requests
-//! is put through random drives, faults, holes, sleep and clocks that are set back. One monitor runs through; the other is
-//! replaced by its own snapshot (through JSON) at random inputs. So is a pack that learns the model of its cells, and one whose frames
-//! are authenticated; of the latter all but the freshness is compared, which begins again by design. `PACKWATCH_CUTS` sets the
-//! number of cuts.
+//! A pack of three cells with protected inputs, all kinds of alarms, commands from both sides, a J1939 node and
+//! diagnostic requests runs through random drives, faults, gaps, sleep and backward clock steps. One monitor runs
+//! through; the other is replaced by its own snapshot (through JSON) after random inputs. The same is done with a pack
+//! that learns its cell model, and with one whose frames are authenticated. The latter is compared without the
+//! freshness, which restarts by design. `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};
 use packwatch::can::e2e::{Profile, Protection};
@@ -19,7 +20,7 @@ use crate::support::config_texts;
 use crate::support::dice::Dice;
 use crate::support::rig::{PACK, command_frame};
 
-/// The rig's signals, with room for the protection of the current's message.
+/// The rig's signals, with space for the protection of the current's message.
 const DBC: &str = r#"VERSION ""
 NS_ :
 BS_:
@@ -121,9 +122,9 @@ fn is_command(record: &Record) -> bool {
     matches!(record.kind, RecordKind::Frame { frame, .. } if frame.id() == CanId::Standard(1715))
 }
 
-/// A pack with a model file; one that learns its model from a label; one with authenticated frames.
+/// A pack with a model file, one that learns its model from a label, and one with authenticated frames.
 fn configs() -> [MonitorConfig; 3] {
-    // Three cells: fewer are not compared with each other.
+    // packwatch compares cells with each other only if there are at least three.
     let pack = PACK
         .replace("Status.Soc", "Pack.Soc")
         .replace("cells = 2\n", "cells = 3\n")
@@ -140,7 +141,7 @@ fn configs() -> [MonitorConfig; 3] {
     [pack, learning, format!("{secured}{tables}")].map(|pack| config_texts::load(&format!("{pack}{MORE}"), DBC).monitor)
 }
 
-/// The vehicle and its faults at one moment.
+/// The vehicle's state and its faults.
 struct Vehicle {
     encoder: InputEncoder,
     now_ns: i64,
@@ -158,7 +159,7 @@ impl Vehicle {
         Timestamp::from_nanos(self.now_ns)
     }
 
-    /// A tenth of a second: frames and ticks, and at times something else.
+    /// Advances by 0.1 s: frames, ticks, and occasional rare inputs.
     fn step(&mut self, dice: &mut Dice, records: &mut Vec<Record>) {
         if dice.one_in(60) {
             self.current_a = [0.0, 0.0, 5.0, -5.0, 12.0, -1.0][dice.below(6)];
@@ -249,7 +250,7 @@ impl Vehicle {
                 records.push(Record::frame(time, BusIndex(0), if dice.one_in(4) { &damaged } else { &frame }));
             }
             16 => self.identity = f64::from(u8::try_from(dice.below(3)).expect("small")),
-            // An answer in one frame, one of two frames, of which the second may not come, and a refusal.
+            // A single-frame answer, a two-frame answer whose second frame may be missing, or a refusal.
             17..=30 => {
                 records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0])))
             }
@@ -297,7 +298,7 @@ fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> String 
     format!("{frames:?}{:?}{:?}", out.events, out.estimates)
 }
 
-/// A frame without the trailer of an authenticated one; of an announced freshness nothing is left.
+/// A sent frame without the authentication trailer. Of an announced freshness only the identifier is kept.
 fn without_freshness(sent: &Transmit) -> String {
     let Some(secured) = sent.secured else { return format!("{sent:?}") };
     let data = sent.frame.data();
@@ -306,14 +307,14 @@ fn without_freshness(sent: &Transmit) -> String {
 }
 
 fn restored(monitor: &Monitor, config: &MonitorConfig) -> Monitor {
-    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
     let mut restored = Monitor::new(config.clone());
     restored.restore(snapshot, Downtime::AsStamped).expect("fits");
     restored
 }
 
-/// Cuts one run at random inputs; the number of cuts.
+/// Cuts one run at random inputs. Returns the number of cuts.
 fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut dice = Dice::new(seed ^ 0x5555);
     let (mut whole, mut cut) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
@@ -322,11 +323,11 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut before = Timestamp::from_nanos(0);
     let is_secured = !config.authentications().is_empty();
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
-        // Whether a forged command is an old one depends on the freshness.
+        // The freshness decides whether a forged command counts as old.
         if is_secured && is_command(record) {
             continue;
         }
-        // After a longer time without an input the restored one takes it that the program was off.
+        // After a long time without input, the restored monitor assumes that the program was off.
         let is_break = record.time.since(before).abs() > 30.0;
         before = record.time;
         if nth > 0 && !is_break && dice.one_in(one_in) {
@@ -340,7 +341,7 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
 }
 
 #[test]
-fn a_monitor_cut_at_any_input_continues_byte_identical() {
+fn restored_snapshot_continues_byte_identical() {
     let wanted: usize = std::env::var("PACKWATCH_CUTS").map_or(3000, |cuts| cuts.parse().expect("a number"));
     let configs = configs();
     let first: u64 = std::env::var("PACKWATCH_FIRST").map_or(1, |seed| seed.parse().expect("a number"));

@@ -1,13 +1,13 @@
-//! A stored state with one damaged number: rejected, or restored with finite outputs.
+//! A stored state with one damaged number is rejected, or restored with finite outputs.
 //!
-//! In: the state of a pack of two cells whose capacities are learned, as JSON, with each of its numbers in turn replaced
-//! by what damage or a failed calculation may leave. A restored state is fed a charge and a discharge.
+//! Takes the state of a two-cell pack with learned capacities as JSON and replaces each number in turn by values that
+//! damage or a failed calculation may leave. A restored state then runs through a charge and a discharge.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{Downtime, EventKind, Monitor, RestoreError, Snapshot};
 use serde_json::Value;
 
-/// The way to every number of a document.
+/// The JSON path of every number of a document.
 fn numbers(value: &Value, path: &str, found: &mut Vec<String>) {
     match value {
         Value::Number(_) => found.push(path.to_owned()),
@@ -17,7 +17,7 @@ fn numbers(value: &Value, path: &str, found: &mut Vec<String>) {
     }
 }
 
-/// What a number may have become; JSON writes what is not finite as null.
+/// Possible damaged values of a number; JSON writes non-finite numbers as null.
 fn damages(number: &Value) -> [Value; 4] {
     let negative =
         number.as_i64().map_or_else(|| (-number.as_f64().unwrap().abs() - 1e-3).into(), |n| (-n.abs() - 1).into());
@@ -25,12 +25,12 @@ fn damages(number: &Value) -> [Value; 4] {
 }
 
 impl Rig {
-    /// A second of frames; whether everything that came out is finite.
+    /// Runs one second of frames. Returns whether all outputs are finite.
     fn is_finite_for_a_second(&mut self) -> bool {
         self.out.want_estimates = true;
         self.events.clear();
         self.tick_with_frames();
-        // Signals age by seconds: a step of one is as good as ten of a tenth.
+        // Signals age in seconds, so one step of a second replaces ten of 0.1 s.
         self.deci += 9;
         let finite = self.out.estimates.drain(..).all(|estimate| {
             let e =
@@ -40,7 +40,8 @@ impl Rig {
         finite && !self.events.iter().any(|event| is_odd(&format!("{event:?}")))
     }
 
-    /// 1,000 samples of the two cells with a charge, a discharge, and rests; the moment of the first odd output.
+    /// Feeds 1,000 samples of the two cells with a charge, a discharge, and rests. Returns the time of the first
+    /// implausible output.
     fn first_odd_second(&mut self) -> Option<i64> {
         (0..500).find(|second| {
             let current_a = [-20.0, 0.0, 20.0, 0.0][usize::try_from(second / 125).unwrap()];
@@ -56,7 +57,7 @@ fn is_odd(text: &str) -> bool {
 }
 
 #[test]
-fn one_damaged_number_is_refused_or_harmless() {
+fn damaged_number_is_rejected_or_harmless() {
     let mut rig = learned();
     let whole = serde_json::to_value(rig.monitor.snapshot().for_restart()).unwrap();
     let start_deci = rig.deci;
@@ -83,12 +84,12 @@ fn one_damaged_number_is_refused_or_harmless() {
             assert!(!resets, "{path} = {damage}: the filter never stops resetting");
         }
     }
-    println!("{} numbers: {unreadable} times no state, {refused} times refused, {taken} times harmless", paths.len());
+    println!("{} numbers: {unreadable} unreadable states, {refused} rejected, {taken} harmless", paths.len());
     assert!(refused > paths.len() / 2 && taken > 0);
 }
 
 #[test]
-fn a_refused_state_names_the_number_and_its_range() {
+fn rejected_state_names_number_and_range() {
     let mut document = serde_json::to_value(learned().monitor.snapshot()).unwrap();
     let covariance = document.pointer_mut("/cells/1/estimator/covariance").unwrap().as_array_mut().unwrap();
     *covariance.last_mut().unwrap() = (-0.25).into();
@@ -97,12 +98,12 @@ fn a_refused_state_names_the_number_and_its_range() {
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
     let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-150 to 1e20";
     assert_eq!(error.to_string(), reported);
-    // Nothing of it was used: the monitor begins as a new one.
+    // Nothing of the state was used: the monitor starts fresh.
     rig.seconds(5);
     assert!(rig.monitor.latest().flatten().count() == 2);
 }
 
-/// Names of a JSON object itself, in their order; no string in it holds a bracket.
+/// Names of a JSON object's own members, in order. No string in it may contain a bracket.
 fn names_of(text: &str) -> Vec<&str> {
     let (mut depth, mut names, mut rest) = (0, Vec::new(), text);
     while let Some(at) = rest.find(['{', '}', '[', ']', '"']) {
@@ -124,7 +125,7 @@ fn names_of(text: &str) -> Vec<&str> {
 }
 
 #[test]
-fn the_stored_form_keeps_its_names_and_their_order() {
+fn stored_state_keeps_names_and_order() {
     let snapshot = learned().monitor.snapshot();
     let expected = "version time may_continue time_backwards intake sampling estimation cells modelling learning diagnosis \
                     alarming sending statistics asleep_since packs";
@@ -132,5 +133,8 @@ fn the_stored_form_keeps_its_names_and_their_order() {
     let mut document = serde_json::to_value(snapshot).unwrap();
     assert!(serde_json::from_value::<Snapshot>(document.clone()).is_ok());
     document["surprise"] = 1.into();
-    assert!(serde_json::from_value::<Snapshot>(document).is_err(), "a state of a later program is not half read");
+    assert!(
+        serde_json::from_value::<Snapshot>(document).is_err(),
+        "a state of a newer version must be rejected as a whole"
+    );
 }

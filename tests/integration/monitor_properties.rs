@@ -1,7 +1,7 @@
-//! Properties of the core that no single module can promise: a restored monitor behaves as if it had never stopped, and
-//! ticks before `next_due` may be left out. Inputs: the paper's cell (with a recharge window, transitions and alarms in
-//! it) and a pack of 96 cells whose voltages come in many frames, both from the simulator. Outputs are compared bit for
-//! bit (floats by their shortest text that reads back the same).
+//! Properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before `next_due` may
+//! be omitted. Inputs from the simulator: the paper's cell (with a recharge window, transitions and alarms) and a pack
+//! of 96 cells whose voltages come in many frames. Outputs are compared bit for bit (floats by their shortest text that
+//! reads back unchanged).
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ fn load(file: &str) -> MonitorConfig {
     config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor
 }
 
-/// The paper's cell, two and a half cycles, and a threshold that is crossed at the first half-cycle.
+/// The paper's cell for two and a half cycles, with a threshold that is crossed at the first half-cycle.
 fn paper() -> (MonitorConfig, Vec<Record>) {
     let mut config = load("paper.toml");
     config.rules[0].threshold = 2.6;
@@ -27,7 +27,7 @@ fn paper() -> (MonitorConfig, Vec<Record>) {
     (config, records)
 }
 
-/// 96 cells once a second, 20 minutes of the drive.
+/// 96 cells once a second for 20 minutes of the drive.
 fn pack() -> (MonitorConfig, Vec<Record>) {
     let config = load("example.toml");
     let capacity_ah = config.model.capacity_ah;
@@ -44,7 +44,7 @@ fn pack() -> (MonitorConfig, Vec<Record>) {
     (config, records)
 }
 
-/// The simulator's frames and every tick; frames of one moment are spread over a few milliseconds, as a bus would.
+/// The simulator's frames and every tick. Simultaneous frames are spread over a few milliseconds, as on a bus.
 fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Record> {
     let mut sim = Simulation::new(config.model.clone(), settings, wiring);
     let encoder = InputEncoder::new(&config.input);
@@ -65,7 +65,7 @@ fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Rec
     records
 }
 
-/// What came out of one input, as text.
+/// Outputs for one input, as text.
 fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> [String; 3] {
     out.clear();
     monitor.handle(record, out);
@@ -94,7 +94,8 @@ fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
 
 const WHAT: [&str; 3] = ["estimates", "events", "frames"];
 
-/// The differences between a monitor that never stopped and ones restored at `splits`: a line for the first of each kind.
+/// Compares an uninterrupted monitor with ones restored at `splits`. Returns a line for the first difference of each
+/// kind.
 fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Downtime) -> Vec<String> {
     let mut found = Vec::new();
     for &split in splits {
@@ -103,7 +104,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
             out.clear();
             whole.handle(record, &mut out);
         }
-        let text = serde_json::to_string(&whole.snapshot()).expect("a snapshot is a document");
+        let text = serde_json::to_string(&whole.snapshot()).expect("a snapshot serialises to JSON");
         let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
         let mut restored = Monitor::new(config.clone());
         restored.restore(snapshot, away).expect("fits");
@@ -134,7 +135,8 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
     found
 }
 
-/// Splits anywhere, and (for `away` = 0 s, which says that no time passed) between two inputs of one stamp.
+/// Random splits. If `same_stamp` is set (for `away` = 0 s, which means that no time passed), they lie between two
+/// inputs of equal time.
 fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
     draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
         .map(|k| k + 1)
@@ -147,27 +149,27 @@ fn assert_same(found: &[String]) {
     assert!(found.is_empty(), "{} differences\n{}", found.len(), found.join("\n"));
 }
 
-/// What the core works out, and what it sends: two promises, since the second also needs the schedule of the frames.
+/// Filters the differences: the core's results, or its frames, which also depend on the transmission schedule.
 fn results(found: Vec<String>, frames: bool) -> Vec<String> {
     found.into_iter().filter(|line| line.contains("frames differ") == frames).collect()
 }
 
 #[test]
-fn a_restored_cell_estimates_as_if_it_had_never_stopped() {
+fn restored_cell_estimates_match_uninterrupted_run() {
     let (config, records) = paper();
     assert_same(&results(differences(&config, &records, &splits(&records, 6, false), Downtime::AsStamped), false));
 }
 
 #[test]
-fn a_restored_cell_that_was_not_away_estimates_as_if_it_had_never_stopped() {
+fn cell_restored_at_once_matches_uninterrupted_run() {
     let (config, records) = paper();
     assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Downtime::Seconds(0.0)), false));
 }
 
 #[test]
-fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
+fn restored_cell_learns_from_ended_mode() {
     let (config, records) = paper();
-    // The input at which the monitor that never stopped reports its first half-cycle.
+    // The input at which the uninterrupted monitor reports its first half-cycle.
     let (mut monitor, mut out) = (Monitor::new(config.clone()), Outputs::default());
     let reported = records.iter().position(|record| {
         out.clear();
@@ -179,13 +181,13 @@ fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
 }
 
 #[test]
-fn a_restored_pack_estimates_as_if_it_had_never_stopped() {
+fn restored_pack_estimates_match_uninterrupted_run() {
     let (config, records) = pack();
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), false));
 }
 
 #[test]
-fn a_restored_cell_sends_as_if_it_had_never_stopped() {
+fn restored_cell_frames_match_uninterrupted_run() {
     let (config, records) = paper();
     let mut found = differences(&config, &records, &splits(&records, 3, false), Downtime::AsStamped);
     found.extend(differences(&config, &records, &splits(&records, 2, true), Downtime::Seconds(0.0)));
@@ -193,13 +195,13 @@ fn a_restored_cell_sends_as_if_it_had_never_stopped() {
 }
 
 #[test]
-fn a_restored_pack_sends_as_if_it_had_never_stopped() {
+fn restored_pack_frames_match_uninterrupted_run() {
     let (config, records) = pack();
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
 }
 
-/// The whole run against one that continues with an `edit`ed configuration from one split to the next: a line for the first
-/// difference of each kind. (The event that says so is not among them: it comes between two inputs.)
+/// Compares a whole run with one whose configuration is `edit`ed between two splits. Returns a line for the first
+/// difference of each kind. (The event that reports the reload is excluded, because it occurs between two inputs.)
 fn reload_differences(
     config: &MonitorConfig,
     records: &[Record],
@@ -237,27 +239,27 @@ fn reload_differences(
 }
 
 #[test]
-fn a_reload_of_the_same_configuration_changes_nothing() {
+fn reload_of_same_configuration_changes_nothing() {
     for (config, records) in [paper(), pack()] {
         assert_same(&reload_differences(&config, &records, &splits(&records, 20, false), |_| {}));
     }
 }
 
 #[test]
-fn other_thresholds_and_periods_change_no_estimate() {
+fn reload_of_thresholds_changes_no_estimate() {
     for (config, records) in [paper(), pack()] {
         let found = reload_differences(&config, &records, &splits(&records, 20, false), |config| {
             config.rules.iter_mut().for_each(|rule| rule.threshold = rule.clear);
             config.flood.max_frames_per_s = config.flood.max_frames_per_s.saturating_add(2000);
             config.output.as_mut().expect("sends").status_period_s *= 10.0;
         });
-        assert!(found.iter().any(|line| line.starts_with("frames")), "the edit does something");
+        assert!(found.iter().any(|line| line.starts_with("frames")), "the edit must change the frames");
         assert_same(&found.into_iter().filter(|line| line.starts_with("estimates")).collect::<Vec<_>>());
     }
 }
 
-/// All ticks against only those at `next_due`: every frame and event must be the same, in order.
-fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
+/// Compares a run with all ticks and one with only those at `next_due`: frames and events must be equal, in order.
+fn assert_early_ticks_have_no_effect(config: &MonitorConfig, records: &[Record]) {
     let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
     let (mut out_all, mut out_few) = (wanting_estimates(), wanting_estimates());
     let (mut given, mut skipped) = (0_u32, 0_u32);
@@ -266,7 +268,7 @@ fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
         let cares = few.next_due().is_none_or(|due| record.time >= due);
         if record.kind == RecordKind::Tick && !cares {
             skipped += 1;
-            assert_eq!(expected, [const { String::new() }; 3], "input {nth}: a tick that was not due did something");
+            assert_eq!(expected, [const { String::new() }; 3], "input {nth}: a tick that was not due had an effect");
             continue;
         }
         given += 1;
@@ -277,19 +279,19 @@ fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
 }
 
 #[test]
-fn ticks_before_the_due_time_change_nothing_for_a_cell() {
+fn early_ticks_have_no_effect_on_cell() {
     let (config, records) = paper();
-    ticks_may_be_left_out(&config, &records);
+    assert_early_ticks_have_no_effect(&config, &records);
 }
 
 #[test]
-fn ticks_before_the_due_time_change_nothing_for_a_pack() {
+fn early_ticks_have_no_effect_on_pack() {
     let (config, records) = pack();
-    ticks_may_be_left_out(&config, &records);
+    assert_early_ticks_have_no_effect(&config, &records);
 }
 
-/// The paper's cell, each record changed, moved or left out.
-/// (The cut over time asleep lies between two ticks that are due: the last tick before it is one that may be left out.)
+/// The paper's cell with each record changed, moved or removed. (The cut over the sleep lies between two due ticks,
+/// because the last tick before it may be omitted.)
 fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<Record>) {
     let (config, records) = paper();
     let records = records.into_iter().filter_map(|record| edit(record.time.secs(), record)).collect();
@@ -297,25 +299,25 @@ fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<R
 }
 
 #[test]
-fn ticks_before_the_due_time_change_nothing_while_a_sensor_is_silent() {
+fn early_ticks_have_no_effect_on_silent_sensor() {
     let silent = |time_s: f64| (3000.0..3120.0).contains(&time_s);
     let (config, records) = edited(|time_s, record| {
         (!(silent(time_s) && matches!(record.kind, RecordKind::Frame { .. }))).then_some(record)
     });
-    ticks_may_be_left_out(&config, &records);
+    assert_early_ticks_have_no_effect(&config, &records);
 }
 
 #[test]
-fn ticks_before_the_due_time_change_nothing_over_time_asleep() {
+fn early_ticks_have_no_effect_over_sleep() {
     let (config, records) = edited(|time_s, record| (!(5000.035..8600.0).contains(&time_s)).then_some(record));
-    ticks_may_be_left_out(&config, &records);
+    assert_early_ticks_have_no_effect(&config, &records);
 }
 
 #[test]
-fn ticks_before_the_due_time_change_nothing_when_the_clock_is_set_back() {
+fn early_ticks_have_no_effect_on_clock_step() {
     let (config, records) = edited(|time_s, record| {
         let back_s = if time_s >= 12_000.0 { -20.0 } else { 0.0 };
         Some(Record { time: record.time.plus_secs(back_s), ..record })
     });
-    ticks_may_be_left_out(&config, &records);
+    assert_early_ticks_have_no_effect(&config, &records);
 }

@@ -1,4 +1,5 @@
-//! Another configuration while the core runs: what is applied, what continues unchanged, and what needs a restart.
+//! Reload of the configuration while the core runs: what is applied, what continues unchanged, and what needs a
+//! restart.
 
 use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{AlarmState, Change, Rule, Severity};
@@ -25,7 +26,7 @@ impl Rig {
     }
 }
 
-/// A hot pack whose alarm was raised and acknowledged.
+/// A hot pack with a raised and acknowledged alarm.
 fn hot() -> Rig {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 2);
@@ -37,7 +38,7 @@ fn hot() -> Rig {
 }
 
 #[test]
-fn a_raised_alarm_is_as_it_was_while_its_threshold_holds() {
+fn reload_keeps_raised_alarm_with_same_threshold() {
     let mut rig = hot();
     let done = rig.reload(|config| config.health.transition.min_duration_s += 1.0).unwrap();
     assert_eq!((done.changed, done.alarms_ended), (vec!["[transition]"], 0));
@@ -50,7 +51,7 @@ fn a_raised_alarm_is_as_it_was_while_its_threshold_holds() {
 }
 
 #[test]
-fn a_changed_threshold_is_judged_at_once_and_keeps_the_past() {
+fn changed_threshold_is_judged_at_once() {
     let mut rig = hot();
     let changed = |set: f64, clear: f64| {
         move |config: &mut MonitorConfig| (config.rules[0].threshold, config.rules[0].clear) = (set, clear)
@@ -64,7 +65,7 @@ fn a_changed_threshold_is_judged_at_once_and_keeps_the_past() {
 }
 
 #[test]
-fn a_debounce_towards_the_old_threshold_does_not_count() {
+fn changed_threshold_restarts_debounce() {
     let mut rig = Rig::new(&(HOT.to_owned() + "debounce_s = 10\n"));
     rig.heat(60.0, 9);
     rig.reload(|config| config.rules[0].threshold = 55.0).unwrap();
@@ -72,7 +73,7 @@ fn a_debounce_towards_the_old_threshold_does_not_count() {
     assert_eq!(rig.changes(Rule::TemperatureHigh), []);
     rig.heat(60.0, 2);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised]);
-    // One that is the same counts on.
+    // With an unchanged threshold the debounce continues.
     let mut rig = Rig::new(&(HOT.to_owned() + "debounce_s = 10\n"));
     rig.heat(60.0, 9);
     rig.reload(|config| config.sample.ambient_c += 1.0).unwrap();
@@ -81,15 +82,15 @@ fn a_debounce_towards_the_old_threshold_does_not_count() {
 }
 
 #[test]
-fn an_alarm_nothing_watches_any_more_ends_with_an_event_and_a_frame() {
+fn removed_rule_ends_its_alarm() {
     let mut rig = hot();
     let done = rig.reload(|config| config.rules[0].severity = Severity::Severe).unwrap();
     assert_eq!(done.alarms_ended, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten]);
     let wire = rig.last_wire(Rule::TemperatureHigh);
-    assert_eq!((wire.state, wire.test), (6, false), "it is not known");
+    assert_eq!((wire.state, wire.test), (6, false), "the alarm state is unknown");
     assert!(rig.events.iter().any(|event| event.kind == EventKind::Reconfigured { alarms_ended: 1 }));
-    // The other severity's has a life of its own.
+    // The alarm of the other severity is independent.
     rig.heat(60.0, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten, Change::Raised]);
     assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, false));
@@ -98,7 +99,7 @@ fn an_alarm_nothing_watches_any_more_ends_with_an_event_and_a_frame() {
 }
 
 #[test]
-fn learned_values_are_compared_with_another_threshold_at_once() {
+fn new_threshold_applies_to_learned_values() {
     let mut rig = learned();
     let capacity_ah = [0, 1].map(|cell| rig.monitor.capacity(CellIndex(cell)).mean);
     rig.events.clear();
@@ -110,10 +111,11 @@ fn learned_values_are_compared_with_another_threshold_at_once() {
 }
 
 #[test]
-fn another_end_of_life_is_not_judged_by_the_remaining_life_to_the_old_one() {
+fn changed_end_of_life_discards_old_forecast() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"remaining_life_low\"\nwarning = 30\n");
     rig.seconds(2);
-    // 2.36 Ah are left, 0.004 Ah are lost in a cycle: some 60 cycles to 2.08 Ah, some 80 to 1.82 Ah: a knee is expected.
+    // 2.36 Ah are left and 0.004 Ah are lost per cycle: about 60 cycles to 2.08 Ah and, because a knee is expected,
+    // about 80 to 1.82 Ah.
     let mut forecast = Forecast::new(Axis::Cycles, 2.6);
     for cycle in 0..60 {
         let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };
@@ -135,7 +137,11 @@ fn another_end_of_life_is_not_judged_by_the_remaining_life_to_the_old_one() {
     })
     .unwrap();
     assert!(cycles(&rig) > 74.0, "{}", cycles(&rig));
-    assert_eq!(rig.changes(Rule::RemainingLifeLow), [], "what remained until the old end is below the new threshold");
+    assert_eq!(
+        rig.changes(Rule::RemainingLifeLow),
+        [],
+        "the remaining life to the old end of life is below the new threshold"
+    );
     let reported = rig.events.iter().filter_map(|event| match event.kind {
         EventKind::RemainingLife { cycles, .. } => cycles,
         _ => None,
@@ -146,7 +152,7 @@ fn another_end_of_life_is_not_judged_by_the_remaining_life_to_the_old_one() {
 }
 
 #[test]
-fn a_usable_capacity_of_another_load_is_unknown() {
+fn changed_load_makes_usable_capacity_unknown() {
     let mut rig = Rig::with({
         let mut config = learned().config;
         config.health.usable =
@@ -162,7 +168,7 @@ fn a_usable_capacity_of_another_load_is_unknown() {
 }
 
 #[test]
-fn counters_of_the_frames_go_on_and_a_shorter_period_begins_now() {
+fn reload_keeps_counters_and_applies_period() {
     let protected = "[output.status]\nperiod_ms = 200\ne2e = \"1A\"\ndata_id = 1\n\
         [output.health]\nperiod_ms = 60000\ne2e = \"1A\"\ndata_id = 2\n";
     let mut rig = Rig::new(protected);
@@ -173,7 +179,7 @@ fn counters_of_the_frames_go_on_and_a_shorter_period_begins_now() {
     assert_eq!(status.len(), 40);
     assert!(status.windows(2).all(|pair| pair[1] == (pair[0] + 1) % 15), "{status:?}");
     let health = rig.frames_of(0x6B1);
-    assert!((15..=20).contains(&health.len()), "five pages at the start, and five a second: {health:?}");
+    assert!((15..=20).contains(&health.len()), "five pages at the start, then five per second: {health:?}");
     assert!(health.windows(2).all(|pair| pair[1] == (pair[0] + 1) % 15), "{health:?}");
     rig.frames.clear();
     rig.reload(|config| config.output = None).unwrap();
@@ -182,17 +188,17 @@ fn counters_of_the_frames_go_on_and_a_shorter_period_begins_now() {
 }
 
 #[test]
-fn commands_of_the_bus_keep_their_sequence() {
+fn reload_keeps_command_sequence() {
     let mut rig = learned();
     rig.command(1, 31, 2047);
     rig.reload(|config| config.rules[0].threshold = 4.9).unwrap();
-    // A check that had been reset would take this for a first frame and not apply the command.
+    // A counter check that had been reset would treat this frame as the first one and ignore the command.
     rig.command(1, 31, 2047);
     assert!(rig.events.iter().any(|event| matches!(event.kind, EventKind::Command { changed: 2, .. })));
 }
 
 #[test]
-fn settings_that_need_a_restart_are_refused_by_name_and_change_nothing() {
+fn restart_only_settings_are_rejected_by_name() {
     type Edit = fn(&mut MonitorConfig);
     let edits: [(Edit, &str); 11] = [
         (|config| config.interfaces = 2, "[[interface]]: 2, running with 1: needs a restart"),
@@ -226,7 +232,7 @@ fn settings_that_need_a_restart_are_refused_by_name_and_change_nothing() {
 }
 
 #[test]
-fn a_node_keeps_its_address_and_sends_the_other_codes() {
+fn reload_keeps_address_and_changes_codes() {
     let j1939 = "[j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
     let mut rig = Rig::new(&(HOT.to_owned() + j1939));
     rig.heat(60.0, 3);
@@ -241,7 +247,7 @@ fn a_node_keeps_its_address_and_sends_the_other_codes() {
     assert_eq!(spn(&rig), 7001);
     let claims = |rig: &Rig| rig.frames.iter().filter(|frame| frame.id() == CanId::Extended(0x18EE_FFF9)).count();
     assert_eq!(claims(&rig), 0);
-    // Another NAME must claim the address for itself.
+    // A new NAME must claim its own address.
     rig.reload(|config| {
         let other = j1939.replace("number = 1", "number = 2");
         config.j1939 = load(&(HOT.to_owned() + &other)).monitor.j1939;

@@ -1,4 +1,4 @@
-//! What a restart and time asleep do to estimates and alarms, on hand-made frames of a pack of two cells.
+//! Effects of a restart and of sleep on estimates and alarms, with hand-made frames of a two-cell pack.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};
@@ -18,10 +18,10 @@ impl Rig {
 }
 
 #[test]
-fn after_an_unknown_downtime_only_learned_values_are_sure() {
+fn unknown_downtime_keeps_only_learned_values() {
     let mut rig = learned();
     let (capacity, before) = (rig.monitor.capacity(CellIndex(1)), rig.soc_std(0));
-    // No current is measured: only the gap counts.
+    // No current is measured, so only the gap has an effect.
     rig.current_a = None;
     rig.restart(Downtime::Unknown);
     rig.seconds(1);
@@ -31,14 +31,14 @@ fn after_an_unknown_downtime_only_learned_values_are_sure() {
 }
 
 #[test]
-fn a_state_from_the_future_is_of_unknown_age() {
+fn state_from_future_has_unknown_age() {
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 36_000);
     rig.restart(Downtime::AsStamped);
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(rig.soc_std(0) > 0.25, "{}", rig.soc_std(0));
-    // Interfaces that merge out of order are no clock that was set.
+    // Interfaces that merge out of order do not mean that the clock was set.
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 5);
     rig.restart(Downtime::AsStamped);
@@ -47,14 +47,14 @@ fn a_state_from_the_future_is_of_unknown_age() {
     assert!(rig.soc_std(0) < 0.05, "{}", rig.soc_std(0));
 }
 
-/// What was learned, as it is stored: capacities with what drifts beside them, and the filters' resistances.
+/// Learned values as stored: capacities with their drift terms, and the filters' resistances.
 fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
     let document = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     let learner = &document["learning"]["learner"];
     let mut parts = vec![learner["capacity"].clone(), learner["drift"].clone(), learner["learned"].clone()];
     for cell in document["cells"].as_array().unwrap() {
         let mean = cell["estimator"]["mean"].as_array().unwrap();
-        // SOC and branches before it, capacity behind it.
+        // The filter's mean ends with resistance ratio and capacity, after SOC and branches.
         parts.push(mean[mean.len() - 2].clone());
         parts.extend([cell["usable"].clone(), cell["discharge_resistance"].clone()]);
     }
@@ -62,7 +62,7 @@ fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
 }
 
 #[test]
-fn learned_values_survive_every_restart_bit_for_bit() {
+fn learned_values_survive_restart_bit_identical() {
     for away in [
         Downtime::Seconds(0.5),
         Downtime::Seconds(3.0),
@@ -103,7 +103,7 @@ impl Rig {
     }
 }
 
-/// Every way to be away.
+/// All kinds of downtime.
 const AWAYS: [Downtime; 5] = [
     Downtime::Seconds(0.0),
     Downtime::Seconds(2.0),
@@ -113,7 +113,7 @@ const AWAYS: [Downtime; 5] = [
 ];
 
 #[test]
-fn raised_acknowledged_latched_and_past_alarms_come_back_as_they_were() {
+fn all_alarm_states_survive_restart() {
     for away in AWAYS {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 12);
@@ -142,7 +142,7 @@ fn raised_acknowledged_latched_and_past_alarms_come_back_as_they_were() {
 }
 
 #[test]
-fn no_frame_after_a_restart_says_that_a_raised_alarm_is_over() {
+fn raised_alarm_is_never_sent_as_cleared() {
     for away in AWAYS {
         let mut rig = learned();
         let states = |rig: &Rig| rig.wire().iter().map(|wire| wire.state).collect::<Vec<_>>();
@@ -157,21 +157,25 @@ fn no_frame_after_a_restart_says_that_a_raised_alarm_is_over() {
 }
 
 #[test]
-fn the_count_of_a_debounce_is_kept_and_the_downtime_is_not_counted() {
+fn debounce_survives_restart_without_downtime() {
     for away in [Downtime::Seconds(60.0), Downtime::Seconds(3e5)] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 7);
         assert_eq!(rig.stands(Rule::TemperatureHigh).0, AlarmState::Pending);
         rig.restart(away);
         rig.heat(60.0, 2);
-        assert_eq!(rig.changes(Rule::TemperatureHigh), [], "{away:?}: seven seconds and two");
+        assert_eq!(
+            rig.changes(Rule::TemperatureHigh),
+            [],
+            "{away:?}: seven seconds and two are less than the debounce"
+        );
         rig.heat(60.0, 3);
         assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised], "{away:?}");
     }
 }
 
 #[test]
-fn a_stored_alarm_without_a_rule_is_reported_and_ended() {
+fn stored_alarm_without_rule_is_ended() {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 12);
     rig.config.rules.clear();
@@ -190,7 +194,7 @@ fn a_stored_alarm_without_a_rule_is_reported_and_ended() {
 }
 
 #[test]
-fn a_missing_input_stays_missing_over_a_restart_until_it_is_back() {
+fn missing_input_stays_missing_across_restart() {
     for away in AWAYS {
         let mut rig = Rig::new("[[alarm]]\nrule = \"input_missing\"\nwarning = 5\n");
         rig.seconds(3);
@@ -211,7 +215,7 @@ fn a_missing_input_stays_missing_over_a_restart_until_it_is_back() {
 }
 
 #[test]
-fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
+fn faulty_interface_stays_faulty_across_restart() {
     let fault = |event| move |rig: &mut Rig| rig.give(Record::bus(rig.now(), BusIndex(0), event));
     for (event, away) in [
         (BusEvent::Down, Downtime::Seconds(2.0)),
@@ -242,7 +246,7 @@ fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
 }
 
 #[test]
-fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
+fn low_soc_is_not_judged_by_old_value() {
     for (restarted, away_s) in [(false, 36_000.0), (true, 36_000.0), (true, 60.0)] {
         let mut rig = Rig::new("[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n[estimator]\nlost_after_s = 5\n");
         rig.voltages_v = [Some(3.2); 2];
@@ -253,7 +257,7 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
         } else {
             rig.deci += 360_000;
         }
-        // Charged meanwhile. First come voltages alone: nothing says what they mean.
+        // Charged during the sleep. Only voltages are received at first, which leave the SOC ambiguous.
         (rig.voltages_v, rig.current_a) = ([Some(4.0); 2], None);
         rig.seconds(1);
         assert_eq!(rig.stands(Rule::SocLow), (AlarmState::Suppressed, 1, false), "{restarted} {away_s}");
@@ -262,11 +266,11 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
             rig.seconds(1);
             let heard = rig.changes(Rule::SocLow);
             assert_eq!((heard[1], heard.last()), (Change::Suppressed, Some(&Change::Cleared)));
-            // After a sleep the filter is surer than after time off, and lets go of the old SOC a moment later.
+            // After a sleep the filter is more certain than after downtime, so it corrects the old SOC slightly later.
             assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
     }
-    // The other way round: full before, empty after.
+    // The opposite case: full before, empty after.
     let mut rig = Rig::new("[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n");
     rig.voltages_v = [Some(4.0); 2];
     rig.seconds(60);
@@ -274,19 +278,19 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
     rig.restart(Downtime::Seconds(36_000.0));
     (rig.voltages_v, rig.current_a) = ([Some(3.1); 2], None);
     rig.seconds(1);
-    assert_eq!(rig.stands(Rule::SocLow).0, AlarmState::Unknown, "the old SOC must not say that all is well");
+    assert_eq!(rig.stands(Rule::SocLow).0, AlarmState::Unknown, "the old SOC must not report a healthy pack");
     rig.current_a = Some(0.0);
     rig.seconds(1);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
 }
 
 #[test]
-fn an_untrusted_estimate_without_a_current_is_suppressed_once() {
+fn untrusted_estimate_is_suppressed_once() {
     let mut rig = Rig::new(
         "[[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n[estimator]\nlost_after_s = 1e6\ngate_sigma = 1e3\n",
     );
     rig.seconds(30);
-    // A load that no voltage shows.
+    // A load that does not appear in the voltages.
     rig.voltages_v = [Some(3.0), Some(3.7)];
     rig.seconds(2);
     for _ in 0..200 {
@@ -300,7 +304,7 @@ fn an_untrusted_estimate_without_a_current_is_suppressed_once() {
 }
 
 #[test]
-fn a_latched_alarm_that_is_beyond_again_and_counting_is_not_cleared() {
+fn latched_alarm_in_debounce_is_not_cleared() {
     for away in [None, Some(Downtime::Seconds(2.0)), Some(Downtime::Seconds(600.0))] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 12);
@@ -319,7 +323,7 @@ fn a_latched_alarm_that_is_beyond_again_and_counting_is_not_cleared() {
 }
 
 #[test]
-fn a_flood_of_bad_commands_is_reported_once_a_second() {
+fn bad_command_flood_is_reported_once_per_second() {
     let mut rig = Rig::new(HOT);
     rig.seconds(1);
     for _ in 0..50 {
@@ -334,7 +338,7 @@ fn a_flood_of_bad_commands_is_reported_once_a_second() {
 }
 
 #[test]
-fn a_test_of_no_length_ends_the_one_that_runs_and_begins_none() {
+fn zero_length_test_ends_running_test() {
     let mut rig = Rig::new(HOT);
     rig.seconds(1);
     let tests = |rig: &Rig| {
@@ -352,11 +356,11 @@ fn a_test_of_no_length_ends_the_one_that_runs_and_begins_none() {
     rig.seconds(2);
     assert!(rig.wire().iter().all(|wire| !wire.test));
     rig.ask(test(0.0));
-    assert_eq!(tests(&rig), [true, false], "there was none to end");
+    assert_eq!(tests(&rig), [true, false], "no test was running");
 }
 
 #[test]
-fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
+fn trouble_codes_wait_for_address_after_restart() {
     let j1939 = "[j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
     for away in [Downtime::Seconds(0.5), Downtime::Seconds(20.0), Downtime::Unknown] {
         let mut rig = Rig::new(&(HOT.to_owned() + j1939));
@@ -381,7 +385,7 @@ fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
 
 const IDENTITY: &str = "[input.pack_identity]\nsignal = \"Cells.Serial\"\nreadings = 5\naccept_unprotected = true\n";
 
-/// Every pack that was connected, and how often one was another.
+/// Identities of all connected packs, and the number of pack changes.
 fn packs(rig: &Rig) -> (Vec<f64>, usize) {
     let of = |kind| if let EventKind::PackIdentity { identity } = kind { Some(identity) } else { None };
     let replaced = rig.events.iter().filter(|event| matches!(event.kind, EventKind::PackReplaced { .. })).count();
@@ -389,7 +393,7 @@ fn packs(rig: &Rig) -> (Vec<f64>, usize) {
 }
 
 #[test]
-fn another_pack_identity_is_another_pack_also_when_it_was_changed_while_off() {
+fn changed_identity_means_new_pack() {
     let mut rig = Rig::new(&("[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n".to_owned() + IDENTITY));
     assert_eq!(rig.monitor.pack_identity(), None);
     rig.identity = Some(1001.0);
@@ -397,7 +401,7 @@ fn another_pack_identity_is_another_pack_also_when_it_was_changed_while_off() {
     assert_eq!((rig.monitor.pack_identity(), packs(&rig)), (Some(1001.0), (vec![1001.0], 0)));
     rig.discharge();
     let learned = rig.monitor.capacity(CellIndex(0));
-    // Odd readings, and none, say nothing.
+    // Invalid and missing readings must not change the identity.
     for odd in [Some(7.0), Some(1001.0), None, Some(8.0), Some(9.0), Some(1001.0)] {
         rig.identity = odd;
         rig.tick_with_frames();
@@ -405,7 +409,7 @@ fn another_pack_identity_is_another_pack_also_when_it_was_changed_while_off() {
     rig.restart(Downtime::Seconds(3600.0));
     rig.seconds(2);
     assert_eq!((packs(&rig).1, rig.monitor.capacity(CellIndex(0))), (0, learned));
-    // Changed while the computer was off.
+    // The pack is changed while the computer is off.
     rig.restart(Downtime::Seconds(3600.0));
     rig.identity = Some(1002.0);
     (0..4).for_each(|_| rig.tick_with_frames());

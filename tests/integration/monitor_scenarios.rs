@@ -1,5 +1,5 @@
-//! What must not go out on the bus: scenarios on hand-made frames of one measured cell in which an earlier version
-//! published something false, lost something, or flickered.
+//! Regression scenarios, with hand-made frames of one measured cell: an earlier version published a false value, lost
+//! one, or flickered.
 
 use std::path::Path;
 
@@ -26,7 +26,7 @@ struct Bench {
     events: Vec<Event>,
     frames: Vec<(f64, Frame)>,
     t: f64,
-    // truth
+    // True state.
     soc: f64,
     u1: f64,
     capacity_ah: f64,
@@ -79,7 +79,7 @@ impl Bench {
         }
         self.take();
     }
-    /// `seconds` at `i` with a sample a second, ticks every 0.1 s.
+    /// Runs `seconds` at current `i` with one sample per second and a tick every 0.1 s.
     fn run(&mut self, i: f64, seconds: u32) {
         for _ in 0..seconds {
             self.second(i, true, true);
@@ -165,14 +165,14 @@ fn alarm(kind: &EventKind, r: Rule, on: bool) -> bool {
 }
 
 #[test]
-fn capacity_is_not_available_before_a_half_cycle_taught_it() {
+fn capacity_is_unavailable_before_first_half_cycle() {
     let mut b = Bench::new(load("paper.toml"), 0.8);
     b.run(0.0, 5);
     assert_eq!(b.health0(), (0xFFFF, 0xFFFF, 0xFFF), "capacity 0.01 Ah, std 0.001 Ah, SOH 0.05 %");
 }
 
 #[test]
-fn papers_settings_do_not_publish_an_assumed_capacity_as_certain() {
+fn assumed_capacity_is_not_published_as_certain() {
     let mut c = load("paper.toml");
     c.estimator.capacity_state = CapacityState::Held;
     c.health.capacity.method = CapacityMethod::Nominal { swing: 0.6, variance_ah2: 0.1 };
@@ -182,9 +182,9 @@ fn papers_settings_do_not_publish_an_assumed_capacity_as_certain() {
 }
 
 #[test]
-fn stop_and_go_is_joined_to_one_half_cycle_or_at_least_learned_from() {
+fn stop_and_go_drive_gives_half_cycle() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
-    // 2.6 A: 1 C. 60 s on, 30 s off, from 95 % to 12 %.
+    // 2.6 A = 1 C. 60 s on, 30 s off, from 95 % to 12 %.
     for _ in 0..50 {
         b.run(2.6, 60);
         b.run(0.0, 30);
@@ -192,14 +192,14 @@ fn stop_and_go_is_joined_to_one_half_cycle_or_at_least_learned_from() {
     b.run(-1.3, 300);
     let n = b.count(|k| matches!(k, EventKind::HalfCycle { .. }));
 
-    assert!(n >= 1, "83 % of the charge went out and no half-cycle was seen");
+    assert!(n >= 1, "no half-cycle after a discharge of 83 %");
 }
 
 #[test]
-fn soc_of_a_lost_voltage_is_not_published_as_it_was() {
+fn lost_voltage_makes_soc_uncertain() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
-    // Voltage and temperature frames are one message here: send current with voltage "not available".
+    // Voltage and temperature share a message here, so send the current with the voltage as "not available".
     for _ in 0..1800 {
         b.second(2.6, true, false);
     }
@@ -213,7 +213,7 @@ fn soc_of_a_lost_voltage_is_not_published_as_it_was() {
 }
 
 #[test]
-fn all_inputs_gone_for_hours() {
+fn lost_inputs_grow_soc_deviation() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     let before = b.status();
@@ -224,7 +224,7 @@ fn all_inputs_gone_for_hours() {
 }
 
 #[test]
-fn waking_does_not_publish_the_old_soc_as_valid() {
+fn waking_does_not_publish_old_soc() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     b.frames.clear();
@@ -235,7 +235,7 @@ fn waking_does_not_publish_the_old_soc_as_valid() {
 }
 
 #[test]
-fn after_an_unknown_gap_the_old_soc_is_not_valid() {
+fn unknown_gap_invalidates_old_soc() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     b.frames.clear();
@@ -247,7 +247,7 @@ fn after_an_unknown_gap_the_old_soc_is_not_valid() {
 }
 
 #[test]
-fn restart_after_hours_raises_no_input_missing() {
+fn restart_after_hours_keeps_inputs_present() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 5.0)];
     let mut b = Bench::new(c, 0.9);
@@ -262,21 +262,21 @@ fn restart_after_hours_raises_no_input_missing() {
 }
 
 #[test]
-fn waking_does_not_clear_input_missing_without_an_input() {
+fn waking_alone_does_not_clear_input_missing() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 0.0)];
     let mut b = Bench::new(c, 0.9);
     b.run(2.6, 300);
     b.quiet(30);
-    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 2, "the cell's voltage, the pack's current");
+    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 2, "cell voltage and pack current");
     b.t += 3600.0;
     b.quiet(30);
 
-    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, false)), 0, "cleared though nothing came");
+    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, false)), 0, "cleared without an input");
 }
 
 #[test]
-fn a_filter_that_keeps_being_lost_is_not_trusted() {
+fn repeatedly_lost_filter_is_not_trusted() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::EstimateUntrusted, 4.0, 60.0)];
     let mut b = Bench::new(c, 0.6);
@@ -296,12 +296,12 @@ fn a_filter_that_keeps_being_lost_is_not_trusted() {
 }
 
 #[test]
-fn a_jump_of_the_soc_is_no_recharge_period() {
+fn soc_jump_is_not_a_recharge_period() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::RechargePeriodLow, 1500.0, 0.0)];
     let mut b = Bench::new(c, 0.2);
     b.run(-1.3, 60);
-    // Asleep or mis-wired: the filter is lost while charging and starts again at 0.9.
+    // While asleep or miswired the filter is lost during a charge and restarts at 0.9.
     b.soc = 0.88;
     b.run(-1.3, 200);
 
@@ -309,7 +309,7 @@ fn a_jump_of_the_soc_is_no_recharge_period() {
 }
 
 #[test]
-fn recharge_period_does_not_run_over_time_away() {
+fn recharge_period_excludes_downtime() {
     let mut b = Bench::new(load("paper.toml"), 0.25);
     b.run(-1.3, 3000);
     b.restart(6.0 * 3600.0);
@@ -322,7 +322,7 @@ fn recharge_period_does_not_run_over_time_away() {
 }
 
 #[test]
-fn half_cycle_before_an_unknown_gap_has_its_own_charge() {
+fn half_cycle_before_gap_has_own_charge() {
     let mut c = load("measured.toml");
     c.health.transition.min_duration_s = 10.0;
     let mut b = Bench::new(c, 0.95);
@@ -339,13 +339,13 @@ fn half_cycle_before_an_unknown_gap_has_its_own_charge() {
 }
 
 #[test]
-fn half_cycle_behind_an_unknown_gap_knows_how_little_it_knows_of_its_beginning() {
+fn half_cycle_after_gap_has_large_deviation() {
     let mut c = load("measured.toml");
     c.health.transition.min_duration_s = 10.0;
     let mut b = Bench::new(c, 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
-    // Not measured: the cell discharges to 30 %.
+    // Without measurement the cell discharges to 30 %.
     b.t += 3600.0;
     b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     (b.soc, b.u1) = (0.3, 0.0);
@@ -363,7 +363,7 @@ fn half_cycle_behind_an_unknown_gap_knows_how_little_it_knows_of_its_beginning()
 }
 
 #[test]
-fn half_cycle_before_a_step_back_has_a_duration() {
+fn half_cycle_before_clock_step_has_duration() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
@@ -404,7 +404,7 @@ fn euler_survives_a_night() {
 }
 
 #[test]
-fn snapshot_of_a_waiting_restore_is_the_restored_state() {
+fn snapshot_before_first_input_is_restored_state() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 60);
     let snap = b.monitor.snapshot();
@@ -415,7 +415,7 @@ fn snapshot_of_a_waiting_restore_is_the_restored_state() {
 }
 
 #[test]
-fn a_half_cycle_that_ends_right_after_a_restart_is_learned() {
+fn half_cycle_ending_after_restart_is_learned() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
@@ -438,7 +438,7 @@ fn wide_capacity_start() {
 }
 
 #[test]
-fn ticks_go_on_after_a_record_whose_clock_was_set_back() {
+fn ticks_continue_after_clock_step_back() {
     let mut ticks = Ticks::new(10, 30.0);
     let every = Some(Timestamp::from_nanos(i64::MIN));
     let mut last = 0;
@@ -449,7 +449,7 @@ fn ticks_go_on_after_a_record_whose_clock_was_set_back() {
             last += 1;
         }
     }
-    assert_eq!(last, 100, "ticks between the last two records, one second apart");
+    assert_eq!(last, 100, "ticks between the last two records, which are one second apart");
 }
 
 #[test]
@@ -465,7 +465,7 @@ fn swing_of_the_first_half_cycle() {
 }
 
 #[test]
-fn bad_share_unknown_or_silent_is_no_new_value() {
+fn silent_input_adds_no_bad_share() {
     let mut c = load("paper.toml");
     c.rules = vec![RuleConfig { debounce_events: 50, ..rule(Rule::InputImplausible, 0.5, 3.0) }];
     let mut b = Bench::new(c, 0.9);
@@ -476,11 +476,15 @@ fn bad_share_unknown_or_silent_is_no_new_value() {
     }
     b.quiet(20);
 
-    assert_eq!(b.count(|k| alarm(k, Rule::InputImplausible, true)), 0, "10 bad readings, 50 asked for, then silence");
+    assert_eq!(
+        b.count(|k| alarm(k, Rule::InputImplausible, true)),
+        0,
+        "10 bad readings, fewer than the required 50, then silence"
+    );
 }
 
 #[test]
-fn a_gap_of_unknown_length_is_reported_once() {
+fn unknown_gap_is_reported_once() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(2.0, 60);
     b.t += 3600.0;
@@ -492,7 +496,7 @@ fn a_gap_of_unknown_length_is_reported_once() {
 }
 
 #[test]
-fn a_restart_after_hours_is_a_gap_like_any_other() {
+fn restart_after_hours_is_reported_as_gap() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(0.0, 60);
     b.run(1.3, 900);
@@ -506,7 +510,7 @@ fn a_restart_after_hours_is_a_gap_like_any_other() {
 }
 
 #[test]
-fn input_missing_pending_before_a_restart_does_not_count_the_time_away() {
+fn input_missing_debounce_excludes_downtime() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 0.0)];
     let mut b = Bench::new(c, 0.9);
@@ -519,7 +523,7 @@ fn input_missing_pending_before_a_restart_does_not_count_the_time_away() {
 }
 
 #[test]
-fn a_state_restored_on_an_earlier_clock_keeps_sending() {
+fn state_restored_on_earlier_clock_keeps_sending() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 60);
     let mut monitor = Monitor::new(b.config.clone());
@@ -529,7 +533,7 @@ fn a_state_restored_on_an_earlier_clock_keeps_sending() {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
         monitor.handle(&Record::tick(time), &mut out);
     }
-    // Three seconds: a status frame, five pages of health and three of the digest each, from wherever in the period the state
-    // was taken.
+    // Three seconds give a status frame, five health pages and three digest pages each. The state may have been taken
+    // anywhere in the period.
     assert!((21..=36).contains(&out.frames.len()), "{} frames", out.frames.len());
 }

@@ -1,4 +1,4 @@
-//! What the core counts, and what it shows to those who look: on hand-made frames of a pack of two cells.
+//! The core's counters and the values it shows, with hand-made frames of a two-cell pack.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{BusStatistics, CellView, Downtime, Statistics, Validity};
@@ -6,28 +6,28 @@ use packwatch::quantity::catalogue::{CellValues, PackValues, Quantity};
 use packwatch::quantity::{CellIndex, Mode};
 
 #[test]
-fn readings_are_counted_by_their_outcome() {
+fn readings_are_counted_by_outcome() {
     let mut rig = Rig::new("");
     rig.seconds(10);
-    // 100 frames of three kinds; every signal of them but one feeds something.
+    // 100 frames of three kinds. All signals but one are bound to an input.
     let before = rig.monitor.reading_counts();
     assert_eq!((before.accepted, before.out_of_range), (600, 0));
     assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
     assert_eq!(rig.monitor.statistics().voltages.used, 200);
-    // Above the pack's limits, and for so long that it is reported only once.
+    // Above the pack's limits, long enough to be reported once.
     rig.voltages_v[1] = Some(4.9);
     rig.seconds(2);
     let after = rig.monitor.reading_counts();
     let refused = after.out_of_range + after.rate_too_high - before.out_of_range - before.rate_too_high;
     assert_eq!((refused, after.accepted - before.accepted), (20, 100));
-    // What does not come is stale once, not with every look.
+    // A missing input is counted as stale once, not on every check.
     (rig.voltages_v, rig.temperatures_c, rig.current_a) = ([None; 2], [None; 2], None);
     rig.seconds(20);
     assert!((1..=6).contains(&rig.monitor.reading_counts().stale), "{:?}", rig.monitor.reading_counts());
 }
 
 #[test]
-fn counts_go_on_after_a_restart() {
+fn counts_continue_after_restart() {
     let mut rig = learned();
     let (before, readings) = (rig.monitor.statistics().clone(), rig.monitor.reading_counts());
     assert_eq!(
@@ -42,7 +42,7 @@ fn counts_go_on_after_a_restart() {
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
-    // The difference is what was added since.
+    // The difference contains what was counted since.
     let added = after.since(&before);
     assert_eq!((added.learning.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
     assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
@@ -50,11 +50,11 @@ fn counts_go_on_after_a_restart() {
 }
 
 #[test]
-fn bad_commands_are_all_counted_and_reported_once_a_second() {
+fn bad_commands_are_counted_and_reports_limited() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     for _ in 0..5 {
-        // There is no rule of that number.
+        // No rule has that number.
         rig.command(0, 30, 0x7FF);
     }
     let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();
@@ -62,14 +62,14 @@ fn bad_commands_are_all_counted_and_reported_once_a_second() {
 }
 
 #[test]
-fn values_no_longer_known_are_not_shown() {
+fn stale_values_are_not_shown() {
     let mut rig = learned();
     let pack = rig.monitor.pack_view();
     assert_eq!((pack.validity, pack.mode), (Validity::Valid, Mode::Rest));
     let voltage_v = pack.values.mean(Quantity::Voltage).unwrap();
     assert!((voltage_v - rig.voltages_v.iter().flatten().sum::<f64>()).abs() < 1e-3, "{voltage_v}");
     assert!(pack.weakest_cell.is_some() && pack.values.mean(Quantity::Soh).is_some_and(|soh| soh > 0.0));
-    // One cell is silent: nothing of it is shown but what was learned, and of the pack nothing that needs it.
+    // One cell is silent: only its learned values are shown, and no pack value that depends on it.
     rig.voltages_v[1] = None;
     rig.seconds(20);
     let cells: Vec<_> = rig.monitor.cell_views().collect();
@@ -88,12 +88,12 @@ fn values_no_longer_known_are_not_shown() {
 }
 
 #[test]
-fn the_highest_temperature_is_not_known_while_a_sensor_is_silent() {
+fn silent_sensor_hides_highest_temperature() {
     let mut rig = Rig::new("");
     rig.temperatures_c = [Some(25.0), Some(60.0)];
     rig.seconds(3);
     assert_eq!(rig.monitor.pack_view().values.mean(Quantity::TemperatureMax), Some(60.0));
-    // The hot one: what the other says is no "at most".
+    // The hot sensor is silent: the other gives no upper bound.
     rig.temperatures_c[1] = None;
     rig.seconds(10);
     assert_eq!(
@@ -104,7 +104,7 @@ fn the_highest_temperature_is_not_known_while_a_sensor_is_silent() {
 }
 
 #[test]
-fn nothing_is_known_before_the_first_frame() {
+fn values_are_unknown_before_first_frame() {
     let rig = Rig::new("");
     let is_unknown = |cell: CellView| cell.values == CellValues::default() && cell.trusted.is_none();
     assert!(rig.monitor.cell_views().all(is_unknown));

@@ -1,6 +1,8 @@
-//! A cell known by its label alone: its model is learned from simulated drives and charges, through the whole monitor.
+//! Learns the model of a cell that is known only by its label, from simulated drives and charges, through the whole
+//! monitor.
 //!
-//! In: cycles of the paper's scenario by a cell with less capacity and resistance than its label says, a night between two.
+//! Input: cycles of the paper's scenario by a cell with less capacity and other resistances than its label says, with a
+//! night between cycles.
 
 use std::path::Path;
 
@@ -14,20 +16,20 @@ use packwatch::monitor::{Downtime, Event, EventKind, ModelState, Monitor, Monito
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
-/// On the label, and in truth.
+/// Label capacity and true capacity.
 const RATED_AH: f64 = 5.0;
 const TRUE_AH: f64 = 4.7;
 const TRUE_RESISTANCE: f64 = 0.7;
-/// Between two cycles, s.
+/// Pause between two cycles, s.
 const NIGHT_S: f64 = 30_000.0;
-/// At the end of a deep cycle, at rest, V.
+/// Rest voltage at the end of a deep cycle, V.
 const FULL_V: f64 = 4.14;
 
 fn configuration(chemistry: &str) -> MonitorConfig {
     configuration_with(chemistry, "")
 }
 
-/// `more`: further tables of the file.
+/// `more`: further tables of the configuration.
 fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
@@ -40,7 +42,7 @@ fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
         .monitor
 }
 
-/// The cell in truth: of the label's chemistry, with other resistances.
+/// The true cell: the label's chemistry with other resistances.
 fn true_model(config: &MonitorConfig) -> CellModel {
     let scaled = |table: &Table, factor: f64| Table {
         values: table.values.iter().map(|row| row.iter().map(|value| factor * value).collect()).collect(),
@@ -55,12 +57,12 @@ fn true_model(config: &MonitorConfig) -> CellModel {
     model
 }
 
-/// Swings of the SOC of deep cycles.
+/// SOC ranges of deep cycles.
 const DEEP: [(f64, f64); 1] = [(0.08, 0.97)];
-/// Of partial ones: 60 % of the charge, now and then charged until it is full.
+/// SOC ranges of partial cycles: 60 % of the charge, occasionally charged until full.
 const PARTIAL: [(f64, f64); 3] = [(0.4, 1.0), (0.1, 0.7), (0.25, 0.85)];
 
-/// Frames of some cycles of a cell with a capacity, Ah, in time order; the swings are taken in turn.
+/// Frames of some cycles of a cell with the given capacity, Ah, in time order. The SOC ranges are used in turn.
 fn vehicle(
     model: &CellModel,
     config: &MonitorConfig,
@@ -88,7 +90,7 @@ fn vehicle(
     all
 }
 
-/// The same with the vehicle awake for some minutes after each cycle.
+/// The same, with the vehicle awake for some minutes after each cycle.
 fn with_rests(
     config: &MonitorConfig,
     frames: Vec<(Timestamp, BusIndex, Frame)>,
@@ -109,7 +111,7 @@ fn with_rests(
     all
 }
 
-/// A monitor and all it has said.
+/// A monitor and all its events.
 struct Live {
     monitor: Monitor,
     out: Outputs,
@@ -125,7 +127,7 @@ impl Live {
 
     fn restored(config: &MonitorConfig, snapshot: Snapshot) -> Self {
         let mut live = Self::new(config);
-        live.monitor.restore(snapshot, Downtime::AsStamped).expect("its own state");
+        live.monitor.restore(snapshot, Downtime::AsStamped).expect("restores its own state");
         live
     }
 
@@ -147,7 +149,7 @@ impl Live {
 }
 
 #[test]
-fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
+fn model_is_learned_at_night_with_true_capacity() {
     let config = configuration("nmc811-graphite");
     let mut live = Live::new(&config);
     vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 4).iter().for_each(|frame| live.take(frame));
@@ -156,7 +158,7 @@ fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
     let own = view.own.expect("a learned model");
     let off = (own.capacity.mean - TRUE_AH) / own.capacity.std();
     assert!(off.abs() < 1.96 && own.capacity.std() < 0.05 * TRUE_AH, "{:?}", own.capacity);
-    assert!(view.fits >= 2 && view.taken_back == 0, "{} fits, {} taken back", view.fits, view.taken_back);
+    assert!(view.fits >= 2 && view.taken_back == 0, "{} fits, {} reverted", view.fits, view.taken_back);
     let published = live.monitor.capacity(CellIndex(0));
     assert!((published.mean - TRUE_AH).abs() < 1.96 * published.std(), "{published:?}");
     let learned_at = |event: &Event| matches!(event.kind, EventKind::Model { .. }).then_some(event.time);
@@ -169,7 +171,7 @@ fn the_model_is_learned_in_the_nights_and_holds_the_true_capacity() {
 }
 
 #[test]
-fn a_capacity_learned_with_the_model_is_judged_at_once() {
+fn capacity_learned_with_model_is_judged_at_once() {
     let limit_ah = 0.5 * (RATED_AH + TRUE_AH) + 0.1;
     let rule = format!("\n[[alarm]]\nrule = \"capacity_low\"\nwarning = {limit_ah}\n");
     let config = configuration_with("nmc811-graphite", &rule);
@@ -192,7 +194,7 @@ fn a_capacity_learned_with_the_model_is_judged_at_once() {
 }
 
 #[test]
-fn five_partial_cycles_show_that_the_label_is_wrong() {
+fn five_partial_cycles_reveal_wrong_label() {
     let config = configuration("nmc811-graphite");
     for capacity_ah in [0.9 * RATED_AH, 1.1 * RATED_AH] {
         let mut live = Live::new(&config);
@@ -205,18 +207,18 @@ fn five_partial_cycles_show_that_the_label_is_wrong() {
             live.monitor.model().fits
         );
         let is_unfit = |event: &Event| matches!(event.kind, EventKind::Model { state: ModelState::Unfit, .. });
-        assert!(!live.events.iter().any(is_unfit), "{capacity_ah}: another chemistry was told");
+        assert!(!live.events.iter().any(is_unfit), "{capacity_ah}: another chemistry was reported");
     }
 }
 
 #[test]
-fn a_state_of_any_moment_continues_as_if_there_had_been_no_restart() {
+fn restored_state_continues_learning_unchanged() {
     let config = configuration("nmc811-graphite");
     let frames = vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 3);
     let mut whole = Live::new(&config);
     let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
     for (at, frame) in frames.iter().enumerate() {
-        // Each stored state is followed over a night, then the next one.
+        // Follow each stored state for a night, then take the next one.
         if at % (frames.len() / 7) == frames.len() / 14 {
             twin = Some(Live::restored(&config, whole.monitor.snapshot()));
             from = whole.said.len();
@@ -235,7 +237,7 @@ fn a_state_of_any_moment_continues_as_if_there_had_been_no_restart() {
 }
 
 #[test]
-fn a_fit_beside_the_monitor_is_the_one_that_it_would_make_itself() {
+fn external_fit_equals_monitor_fit() {
     let config = configuration("nmc811-graphite");
     let (mut alone, mut helped, mut fits) = (Live::new(&config), Live::new(&config), 0);
     let frames = vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 2);
@@ -248,14 +250,14 @@ fn a_fit_beside_the_monitor_is_the_one_that_it_would_make_itself() {
             helped.monitor.give_model_fit(task, findings);
         }
     }
-    assert!(fits >= 2, "{fits} fits begun at rest");
+    assert!(fits >= 2, "{fits} fits started at rest");
     let differ = alone.said.iter().zip(&helped.said).find(|(a, b)| a != b);
     assert_eq!((differ, alone.said.len()), (None, helped.said.len()));
     assert!(alone.monitor.model().own.is_some());
 }
 
 #[test]
-fn findings_count_for_their_own_task_only() {
+fn findings_apply_only_to_their_task() {
     let config = configuration("nmc811-graphite");
     let frames = with_rests(&config, vehicle(&true_model(&config), &config, TRUE_AH, &DEEP, 2), FULL_V);
     let unfit_with = |is_first: bool| {
@@ -271,12 +273,12 @@ fn findings_count_for_their_own_task_only() {
         }
         live.monitor.model().state == ModelState::Unfit
     };
-    assert!(unfit_with(false), "what is given is used");
-    assert!(!unfit_with(true), "findings of an earlier task are not");
+    assert!(unfit_with(false), "findings of the current task must be used");
+    assert!(!unfit_with(true), "findings of an earlier task must be ignored");
 }
 
 #[test]
-fn a_wrong_chemistry_on_the_label_is_found_within_one_cycle() {
+fn wrong_label_chemistry_is_found_in_one_cycle() {
     let truth = configuration("nmc811-graphite");
     let model = true_model(&truth);
     for (wrong, right) in [("lfp-graphite", "nmc"), ("lco-graphite", "n")] {
@@ -288,12 +290,12 @@ fn a_wrong_chemistry_on_the_label_is_found_within_one_cycle() {
         assert_eq!(view.state, ModelState::Unfit, "{wrong}");
         let better = view.chemistry.map(Chemistry::name).unwrap_or_default();
         assert!(better.starts_with(right), "{wrong}: {better}");
-        assert!(view.own.is_none(), "the label's model stays");
+        assert!(view.own.is_none(), "the label's model must be kept");
     }
 }
 
 #[test]
-fn a_corrected_label_keeps_the_rows_and_forgets_the_model() {
+fn corrected_label_keeps_rows_and_discards_model() {
     let wrong = configuration("lfp-graphite");
     let right = configuration("nmc811-graphite");
     let mut live = Live::new(&wrong);

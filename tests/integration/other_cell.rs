@@ -1,6 +1,6 @@
-//! A model of another cell on a measured drive, through `packwatch replay`: the estimate is not trusted within half an hour.
+//! Replays a measured drive with the model of another cell: the estimate must become untrusted within half an hour.
 //!
-//! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah; each drives with the model of either.
+//! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah; each drive runs with both models.
 
 use std::path::Path;
 use std::process::Command;
@@ -23,7 +23,7 @@ fn fit(folder: &Path, capacity_ah: &str, slow: &str, drives: &[&str], model: &Pa
     run(&arguments);
 }
 
-/// When the estimate was first not trusted, s since the first row; `None` = never.
+/// Time at which the estimate first became untrusted, s since the first row; `None` = never.
 fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(shipped.join("score.toml")).unwrap();
@@ -42,7 +42,7 @@ fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_drive_with_the_model_of_another_cell_is_untrusted_within_half_an_hour_and_with_its_own_never() {
+fn wrong_cell_model_is_untrusted_within_half_hour() {
     let root = measured::root();
     let folder = tempfile::tempdir().unwrap();
     let (panasonic, lg) = (root.join("panasonic_18650pf"), root.join("lg_18650hg2"));

@@ -1,5 +1,5 @@
-//! The DBC that is written, in `cantools`: it loads strictly, and every frame made by the same layout decodes with it
-//! to the values that went in, within one bit, for every kind of frame, protection, identifier and cell.
+//! The written DBC loads strictly in `cantools`, and every frame encoded by the same layout decodes to the original
+//! values within one bit, for every kind of frame, protection, identifier and cell.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -19,10 +19,10 @@ use packwatch::quantity::{CellIndex, Mode};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Frames of each message in each configuration.
+/// Frames per message and configuration.
 const FRAMES: usize = 40;
 
-/// Rules in the order of their numbers: inside unit to the wire's, largest value tried.
+/// Rules in numerical order: factor from the internal unit to the wire unit, and the largest tested value.
 const RULES: [(&str, f64, f64); 17] = [
     ("CapacityLow", 1.0, 5.0),
     ("UsableCapacityLow", 1.0, 5.0),
@@ -43,7 +43,7 @@ const RULES: [(&str, f64, f64); 17] = [
     ("ChannelFaulty", 1.0, 1.0),
 ];
 
-/// Rules on page `rules` of the digest; the others are on page `rules_2`.
+/// Rules on page `rules` of the digest; the other rules are on page `rules_2`.
 const RULES_ON_PAGE_1: usize = 14;
 
 const REFUSALS: [CommandRefusal; 8] = [
@@ -57,7 +57,7 @@ const REFUSALS: [CommandRefusal; 8] = [
     CommandRefusal::RepeatNeeded,
 ];
 
-/// A configuration of the matrix.
+/// A configuration of the test matrix.
 #[derive(Debug, Clone, Copy)]
 struct Case {
     fd: bool,
@@ -73,7 +73,7 @@ impl Case {
             for profile in [None, Some(Profile::P01A), Some(Profile::P01C), Some(Profile::P05)] {
                 for extended in [false, true] {
                     for rated_capacity_ah in [2.6, 280.0] {
-                        // Profile 5 needs FD.
+                        // Profile 5 needs CAN FD.
                         if fd || profile != Some(Profile::P05) {
                             cases.push(Self { fd, profile, extended, rated_capacity_ah });
                         }
@@ -110,7 +110,7 @@ impl Case {
     }
 }
 
-/// What a consumer must read: name, value in the DBC's unit, and how far off it may be (half a step).
+/// Values that a receiver must read: name, value in the DBC's unit, and tolerance (half a step).
 type Wanted = Vec<(String, f64, f64)>;
 
 struct Maker {
@@ -130,12 +130,12 @@ impl Maker {
         self.random.next_u32() % count
     }
 
-    /// Half the step of a signal as the layout has it, so that what is compared is the layout's own promise.
+    /// Half the step of a signal in the layout. The test thus checks the resolution that the layout promises.
     fn half_step(&self, name: &str) -> f64 {
         self.database.signal(name).unwrap().1.layout.factor / 2.0
     }
 
-    /// A configured threshold of a rule, and what it reads.
+    /// A random threshold of a rule, and the value a receiver must read.
     fn threshold(&mut self, number: usize) -> (ThresholdFields, f64) {
         let (_, scale, largest) = RULES[number - 1];
         let (threshold, severity) = (self.below(largest), 1 + self.one_of(3));
@@ -302,7 +302,7 @@ impl Maker {
             2 => {
                 let (rule, severity) = (f64::from(threshold.rule), f64::from(threshold.severity));
                 let mut wanted = self.wanted("Digest", &[("ThresholdRule", rule), ("ThresholdSeverity", severity)]);
-                // Unrounded: what a 32-bit float cannot hold is all that is lost.
+                // Not rounded: the only error is that of a 32-bit float.
                 wanted.push(("Threshold".to_owned(), threshold_read, threshold_read * f64::from(f32::EPSILON)));
                 wanted
             }
@@ -318,7 +318,7 @@ impl Maker {
         (self.plan.digest(page, &fields, &mut self.counters).unwrap(), wanted)
     }
 
-    /// An executed, a refused or an unreadable command, in turn.
+    /// Makes an executed, a rejected or an unreadable command, in turn.
     fn reply(&mut self, turn: usize) -> (Frame, Wanted) {
         const KINDS: [Command; 3] = [Command::Acknowledge, Command::Clear, Command::PackReplaced];
         let (kind, rule) = (turn % KINDS.len(), 1 + turn % RULES.len());
@@ -363,7 +363,7 @@ impl Maker {
     }
 }
 
-/// The header as a consumer finds it with the DBC, against our own check of it.
+/// Compares the header that a receiver reads with the DBC to our own check of it.
 fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 7]) {
     let Some(profile) = case.profile else {
         assert!(!read.contains_key("E2eCrc") && frame.data()[..2] == [0, 0], "{case:?}");
@@ -379,7 +379,7 @@ fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f
     }
 }
 
-/// `Message.Signal` of all that is sent.
+/// `Message.Signal` of everything that is sent.
 fn sent_signals(database: &Database) -> BTreeSet<String> {
     let sent = database.messages.iter().filter(|message| message.name != "PACKWATCH_Command");
     let signals = |message: &packwatch::can::dbc::Message| -> Vec<String> {
@@ -389,7 +389,7 @@ fn sent_signals(database: &Database) -> BTreeSet<String> {
 }
 
 #[test]
-fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a_step() {
+fn written_dbc_decodes_frames_within_half_step() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("written.dbc");
@@ -435,20 +435,24 @@ fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a
             }
             let header =
                 if case.profile.is_some() { read.keys().filter(|name| name.starts_with("E2e")).count() } else { 0 };
-            assert_eq!(read.len(), wanted.len() + header, "{case:?}: nothing but what was meant is read: {read:?}");
+            assert_eq!(
+                read.len(),
+                wanted.len() + header,
+                "{case:?}: the receiver reads other signals than expected: {read:?}"
+            );
             check_header(*case, *number, frame, &read, &mut expected);
             decoded.extend(read.into_keys().map(|signal| format!("{message}.{signal}")));
             frames += 1;
             compared += wanted.len() + header;
         }
-        assert_eq!(decoded, sent_signals(&maker.database), "{case:?}: every signal that is sent is compared");
+        assert_eq!(decoded, sent_signals(&maker.database), "{case:?}: every sent signal must be compared");
     }
     assert_eq!(cases.len(), 28);
     eprintln!("{} configurations, {frames} frames, {compared} values compared", cases.len());
 }
 
 #[test]
-fn a_consumer_reads_the_configuration_from_the_dbc() {
+fn dbc_carries_configuration() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("written.dbc");
@@ -466,27 +470,27 @@ fn a_consumer_reads_the_configuration_from_the_dbc() {
     }
 }
 
-/// `capacity_low` as the DBC writes it: `CapacityLow`.
+/// Converts `capacity_low` to the DBC's form `CapacityLow`.
 fn camel_case(name: &str) -> String {
     let capital = |word: &str| word[..1].to_uppercase() + &word[1..];
     name.split('_').map(capital).collect()
 }
 
 #[test]
-fn a_threshold_of_whole_seconds_is_sent_as_it_is() {
+fn whole_second_threshold_is_sent_exactly() {
     let layout = Case::all()[0].layout();
     for name in ["PACKWATCH_Alarm.Threshold_StoreFailed", "PACKWATCH_Alarm.Threshold_BusFault"] {
         let (_, signal) = layout.signal(name).unwrap();
-        assert_eq!((signal.layout.factor, signal.layout.offset), (1.0, 0.0), "{name}: 1 s was sent as 2 s");
+        assert_eq!((signal.layout.factor, signal.layout.offset), (1.0, 0.0), "{name}: the resolution must be 1 s");
     }
 }
 
 #[test]
-fn the_rules_tried_are_all_rules_in_the_order_of_their_numbers() {
+fn tested_rules_are_complete_and_ordered() {
     assert_eq!(RULES.map(|(name, ..)| name.to_owned()), Rule::ALL.map(|rule| camel_case(rule.name())));
 }
 
-/// Word of a refusal in the value table of `Reason`.
+/// Word for a refusal in the value table of `Reason`.
 const fn reason_word(refusal: CommandRefusal) -> &'static str {
     match refusal {
         CommandRefusal::FirstFrame => "first frame",
@@ -501,7 +505,7 @@ const fn reason_word(refusal: CommandRefusal) -> &'static str {
 }
 
 #[test]
-fn every_refusal_is_sent_as_the_code_that_the_dbc_names_and_the_dbc_names_no_other() {
+fn refusal_codes_match_dbc_value_table() {
     let database = Case::all()[0].layout();
     let plan = OutputPlan::new(&database).unwrap();
     let reason = &database.signal("PACKWATCH_Reply.Reason").unwrap().1;
@@ -524,7 +528,7 @@ fn words<'d>(database: &'d Database, signal: &str) -> Vec<(i64, &'d str)> {
 }
 
 #[test]
-fn every_rule_is_named_in_the_value_tables_by_its_number() {
+fn rule_value_tables_match_rule_numbers() {
     let text = include_str!("../../config/packwatch.dbc");
     let dbc = Database::parse(text).unwrap();
     let rules = Rule::ALL.map(|rule| (i64::from(rule as u8), camel_case(rule.name())));
@@ -532,18 +536,18 @@ fn every_rule_is_named_in_the_value_tables_by_its_number() {
         let signal = &format!("PACKWATCH_{message}");
         let table = &dbc.signal(signal).unwrap().1.values;
         assert_eq!(table[..rules.len()], rules, "{signal}");
-        assert_eq!(table.len(), rules.len() + 1, "{signal}: and one code for none or all");
+        assert_eq!(table.len(), rules.len() + 1, "{signal}: every rule, and a code for none or all");
     }
 }
 
 const CONTRACT: &str = include_str!("../../docs/src/ecu/contract.md");
 
-/// The messages of the table on the contract page, without their prefix.
+/// Messages in the table on the contract page, without their prefix.
 fn contract_rows() -> Vec<&'static str> {
     contract_table().map(|cells| cells[1].trim_matches('`').trim_start_matches("PACKWATCH_")).collect()
 }
 
-/// Identifier, period, repetition and time-out of each.
+/// Identifier, period, repetition and timeout of each message.
 fn contract_cells() -> impl Iterator<Item = [String; 4]> {
     contract_table().map(|cells| [2, 3, 5, 6].map(|at| cells[at].to_owned()))
 }
@@ -553,11 +557,11 @@ fn contract_table() -> impl Iterator<Item = Vec<&'static str>> {
     rows.map(|line| line.split('|').map(str::trim).collect())
 }
 
-/// As the manual's contract page has it: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
+/// Compares with the manual's contract page: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
 #[test]
-fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
+fn dbc_timing_matches_contract_page() {
     let base = LayoutBase::BuiltIn { rated_capacity_ah: 2.6 };
-    // A reply is sent where commands are accepted, the freshness where they are authenticated.
+    // Replies are sent if commands are accepted, freshness values if commands are authenticated.
     let secoc = |profile, data_id| Some(Authentication { profile, data_id });
     let command = MessageSettings { secoc: secoc(secoc::Profile::P1, 1), ..MessageSettings::default() };
     let freshness = MessageSettings { secoc: secoc(secoc::Profile::Announcement, 2), ..MessageSettings::default() };
@@ -570,7 +574,7 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
     };
     assert_eq!(stated("Status"), (Some(100), None, None, None));
     assert_eq!(stated("Health"), (Some(1000), None, None, None));
-    assert_eq!(stated("Alarm"), (Some(1000), Some(3), Some(100), Some(10)), "3 times, 100 ms apart, 100 a second");
+    assert_eq!(stated("Alarm"), (Some(1000), Some(3), Some(100), Some(10)), "3 times, 100 ms apart, 100 per second");
     assert_eq!(stated("Digest"), (Some(1000), None, None, None));
     assert_eq!(stated("Reply"), (None, None, None, Some(100)), "10 a second");
     assert_eq!(stated("Freshness"), (Some(1000), None, None, None));
@@ -591,7 +595,7 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
         assert!(first_ms(&timeout) == three_periods || ["Alarm", "Reply"].contains(name), "{name}: {timeout}");
     }
     let pass_time = &database.signal("PACKWATCH_Digest.PassTime").unwrap().1.layout;
-    // The last code is "not available", and 20 ms are the share of one alarm.
+    // The last code is "not available", and each alarm takes 20 ms.
     let longest_s = f64::from((1_u32 << pass_time.length_bits) - 2) * pass_time.factor;
     let ends =
         format!("`PassTime` ends at {longest_s:.1} s, the pass of 10,{:03.0} raised", longest_s / 0.02 - 10_000.0);
@@ -661,7 +665,7 @@ fn the_dbc_states_cycle_times_repetitions_and_pauses_of_every_message() {
 }
 
 #[test]
-fn a_command_that_a_consumer_encodes_with_the_dbc_is_understood() {
+fn command_encoded_with_dbc_is_understood() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("written.dbc");
@@ -695,7 +699,7 @@ fn frame(id: CanId, fd: bool, hex: &str) -> Frame {
 }
 
 #[test]
-fn the_command_line_writes_the_dbc_of_the_configuration() {
+fn dbc_command_writes_configured_dbc() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("out.dbc");
@@ -704,7 +708,7 @@ fn the_command_line_writes_the_dbc_of_the_configuration() {
     let config = root.join("config/example.toml");
     let shown = packwatch().arg("dbc").arg("-c").arg(&config).assert().success().get_output().stdout.clone();
     packwatch().arg("dbc").arg("-c").arg(&config).arg("-o").arg(&path).assert().success();
-    assert_eq!(std::fs::read(&path).unwrap(), shown, "an old file is replaced");
+    assert_eq!(std::fs::read(&path).unwrap(), shown, "an existing file must be replaced");
     let written = Database::parse_bytes(&shown).unwrap();
     assert_eq!(written, packwatch::config::load(&config).unwrap().output_layout.unwrap());
     let silent = std::fs::read_to_string(&config).unwrap().replace("[output]", "[output]\nenabled = false");

@@ -1,4 +1,4 @@
-//! Learned values belong to a pack number: they come back with it, whatever numbers were between, and over restarts.
+//! Learned values belong to a pack's identity number: they return with it, even after other packs and restarts.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::monitor::{CellView, Command, Downtime, EventKind, Record};
@@ -11,7 +11,7 @@ const IDENTITY: &str = "[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n[esti
 const A: f64 = 1001.0;
 const B: f64 = 1002.0;
 
-/// What half-cycles have taught of each cell, exactly: capacity, usable capacity, remaining life, loss modes.
+/// Exact learned values of each cell: capacity, usable capacity, remaining life, loss modes.
 fn learned(rig: &Rig) -> Vec<String> {
     let quantities = [
         Quantity::Capacity,
@@ -28,7 +28,7 @@ fn learned(rig: &Rig) -> Vec<String> {
     rig.monitor.cell_views().map(cell).collect()
 }
 
-/// Resistances relative to new, after the next voltages, each of which moves them a little.
+/// Resistances relative to new after the next voltages, each of which changes them slightly.
 fn resistances(rig: &mut Rig) -> Vec<f64> {
     rig.tick_with_frames();
     rig.monitor.cell_views().map(|view| view.values.mean(Quantity::ResistanceRatio).unwrap()).collect()
@@ -47,7 +47,7 @@ fn connect(rig: &mut Rig, number: f64) {
     assert_eq!(rig.monitor.pack_identity(), Some(number));
 }
 
-/// A rig with pack A, of which half-cycles have taught something.
+/// A rig with pack A, after some half-cycles.
 fn with_pack_a() -> Rig {
     let mut rig = Rig::new(IDENTITY);
     connect(&mut rig, A);
@@ -75,12 +75,12 @@ fn returned(rig: &Rig) -> Vec<f64> {
 }
 
 #[test]
-fn what_was_learned_of_a_pack_is_back_when_its_number_returns() {
+fn returning_pack_restores_learned_values() {
     let mut rig = with_pack_a();
     let resistances_of_a = resistances(&mut rig);
     let of_a = learned(&rig);
     connect(&mut rig, B);
-    assert_ne!(learned(&rig), of_a, "another pack begins anew");
+    assert_ne!(learned(&rig), of_a, "another pack must start from the configuration");
     assert!(rig.monitor.cell_views().all(|view| view.values.get(Quantity::Capacity).is_none()));
     assert!(
         (resistances(&mut rig)[0] - resistances_of_a[0]).abs() > 0.02 * resistances_of_a[0],
@@ -95,7 +95,7 @@ fn what_was_learned_of_a_pack_is_back_when_its_number_returns() {
     connect(&mut rig, A);
     assert_eq!((learned(&rig), returned(&rig)), (of_a.clone(), vec![A]));
     assert_near(&resistances(&mut rig), &resistances_of_a);
-    assert_eq!(rig.changes(Rule::CapacityLow).last(), Some(&Change::Raised), "and its alarms");
+    assert_eq!(rig.changes(Rule::CapacityLow).last(), Some(&Change::Raised), "the pack's alarms return too");
     connect(&mut rig, B);
     assert_eq!((learned(&rig), returned(&rig)), (of_b, vec![A, B]));
     connect(&mut rig, A);
@@ -109,7 +109,7 @@ fn what_was_learned_of_a_pack_is_back_when_its_number_returns() {
 }
 
 #[test]
-fn forged_numbers_take_nothing_away() {
+fn forged_numbers_lose_no_learned_values() {
     let mut rig = with_pack_a();
     let of_a = learned(&rig);
     for forged in 0..40 {
@@ -120,14 +120,14 @@ fn forged_numbers_take_nothing_away() {
 }
 
 #[test]
-fn the_pack_that_was_connected_least_lately_is_forgotten_first() {
+fn least_recently_connected_pack_is_evicted() {
     let mut rig = with_pack_a();
     for number in 1..=8 {
         connect(&mut rig, f64::from(number));
         rig.voltages_v = [Some(3.65); 2];
         rig.discharge();
     }
-    // A and seven others are kept beside the eighth; with the ninth A would be the ninth kept.
+    // The monitor keeps A and seven others in addition to the connected pack. A ninth pack would exceed that limit.
     let snapshot = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     let numbers = |value: &serde_json::Value| {
         value["packs"]["packs"]
@@ -142,11 +142,11 @@ fn the_pack_that_was_connected_least_lately_is_forgotten_first() {
     assert!(bytes < 8 * 2 * 4000, "{bytes} bytes for 16 cells");
     connect(&mut rig, 9.0);
     connect(&mut rig, A);
-    assert!(returned(&rig).is_empty(), "the ninth took its place");
+    assert!(returned(&rig).is_empty(), "the ninth pack must replace A");
 }
 
 #[test]
-fn a_command_forgets_a_pack_whatever_its_number() {
+fn forget_command_clears_pack_of_any_number() {
     let mut rig = with_pack_a();
     let of_a = learned(&rig);
     rig.give(Record::command(rig.now(), Command::PackReplaced));

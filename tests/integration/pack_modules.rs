@@ -1,4 +1,4 @@
-//! A pack of two cells of which one is of another kind: `[[pack.module]]`.
+//! A pack of two cells of different kinds: `[[pack.module]]`.
 
 use packwatch::cell::CellModel;
 use packwatch::monitor::Downtime;
@@ -9,14 +9,14 @@ use crate::support::rig::{DBC, PACK, Rig};
 
 const MODULE: &str = "[[pack.module]]\ncells = \"2\"\nchemistry = \"lfp-graphite\"\nrated_capacity_ah = 2.6\n";
 
-/// A cell of the model, discharged at 25 degrees C.
+/// A cell that follows the model, discharged at 25 degrees C.
 struct Truth<'a> {
     model: &'a CellModel,
     branches_v: Vec<f64>,
 }
 
 impl Truth<'_> {
-    /// Its voltage after `seconds` of this current, V.
+    /// Its voltage after `seconds` at this current, V.
     fn after(&mut self, seconds: f64, soc: f64, current_a: f64) -> f64 {
         let position = self.model.grid_position(soc, 25.0);
         for (i, branch_v) in self.branches_v.iter_mut().enumerate() {
@@ -28,7 +28,7 @@ impl Truth<'_> {
     }
 }
 
-/// From 95 to 15 % with half the capacity per hour, after a rest.
+/// Discharges from 95 to 15 % at half the capacity per hour, after a rest.
 fn discharge(rig: &mut Rig, models: [&CellModel; 2]) {
     let (capacity_ah, current_a, period_s) = (2.6, 1.3, 5);
     let mut cells = models.map(|model| Truth { model, branches_v: vec![0.0; model.branches.len()] });
@@ -50,7 +50,7 @@ fn socs(rig: &Rig) -> [(f64, f64); 2] {
 }
 
 #[test]
-fn each_kind_of_cell_is_estimated_by_its_own_model() {
+fn each_cell_kind_uses_its_own_model() {
     let config = config_texts::load(&format!("{PACK}{MODULE}"), DBC).monitor;
     let models = [config.model.clone(), config.modules[0].model.clone()];
     let models = [&models[0], &models[1]];
@@ -59,13 +59,13 @@ fn each_kind_of_cell_is_estimated_by_its_own_model() {
     let [own, module] = socs(&mixed);
     assert!((own.0 - 0.15).abs() < 0.02, "{own:?}");
     assert!((module.0 - 0.15).abs() < 1.96 * module.1, "{module:?}");
-    // Without the module its cell is taken for one of the pack's own.
+    // Without the module table, its cell is treated as one of the pack's own kind.
     let mut alone = Rig::with(config_texts::load(PACK, DBC).monitor);
     discharge(&mut alone, models);
     let [own_alone, taken] = socs(&alone);
     assert!((own_alone.0 - own.0).abs() < 0.005, "{own_alone:?} {own:?}");
     assert!((taken.0 - 0.15).abs() > 0.1, "{taken:?}");
-    // What was stored continues.
+    // Stored values continue.
     mixed.restart(Downtime::Seconds(1.0));
     mixed.seconds(5);
     let [own_after, module_after] = socs(&mixed);
@@ -76,7 +76,7 @@ fn each_kind_of_cell_is_estimated_by_its_own_model() {
 }
 
 #[test]
-fn a_module_that_is_new_in_the_configuration_begins_anew_and_the_other_cells_continue() {
+fn new_module_starts_fresh_others_continue() {
     let plain = config_texts::load(PACK, DBC).monitor;
     let mut before = Rig::with(plain.clone());
     discharge(&mut before, [&plain.model, &plain.model]);
@@ -85,7 +85,7 @@ fn a_module_that_is_new_in_the_configuration_begins_anew_and_the_other_cells_con
     let [own, old] = [0, 1].map(|cell| before.monitor.capacity(CellIndex(cell)));
     assert!(own.std() < 0.25 && old.std() < 0.25, "both learned: {own:?} {old:?}");
     let snapshot = before.monitor.snapshot();
-    // Other branches than the cell before had, and another capacity.
+    // A cell with other branches and another capacity.
     let text = format!("{PACK}{MODULE}initial_capacity_ah = 2.4\ninitial_capacity_std_ah = 0.5\n");
     let mut rig = Rig::with(config_texts::load(&text, DBC).monitor);
     assert_ne!(rig.config.model.branches.len(), rig.config.modules[0].model.branches.len());
@@ -98,7 +98,7 @@ fn a_module_that_is_new_in_the_configuration_begins_anew_and_the_other_cells_con
 }
 
 #[test]
-fn half_cycles_teach_a_module_with_a_model_file_and_none_with_a_label() {
+fn only_module_with_model_file_learns() {
     let file = "[[pack.module]]\ncells = \"2\"\ncell_model = \"cells/example_nmc_2600.toml\"\n";
     for (module, is_taught) in [(file, true), (MODULE, false)] {
         let config = config_texts::load(&format!("{PACK}{module}"), DBC).monitor;
@@ -115,7 +115,7 @@ fn half_cycles_teach_a_module_with_a_model_file_and_none_with_a_label() {
 }
 
 #[test]
-fn other_cells_in_a_module_need_a_restart_and_other_capacities_do_not() {
+fn changed_module_cells_need_restart() {
     let config = config_texts::load(&format!("{PACK}{MODULE}"), DBC).monitor;
     let mut rig = Rig::with(config);
     rig.seconds(5);

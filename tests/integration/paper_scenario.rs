@@ -1,9 +1,9 @@
 //! The paper's scenario through the whole core: truth -> sensors -> frames of the DBC -> Monitor, judged per cycle.
 //!
-//! 2.6 Ah, 0.05 Ah lost per cycle between SOC 0.3 and 0.9 until 0.25 Ah, 1 s samples; sensor errors: voltage 5 mV,
-//! current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error| of 1 to 5 % through life and
-//! about 20 % at the end, and a capacity that is late by one event, with a dip to 2.2 Ah at the first.
-//! `cargo test --release --test integration paper_scenario -- --nocapture` prints the table.
+//! 2.6 Ah, fading by 0.05 Ah per cycle between SOC 0.3 and 0.9 to 0.25 Ah, 1 s samples. Sensor errors: voltage 5 mV;
+//! current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error| of 1 to 5 % during life and
+//! about 20 % at the end, and a capacity that lags by one event, with a dip to 2.2 Ah at the first.
+//! To print the table: `cargo test --release --test integration paper_scenario -- --nocapture`.
 
 use std::path::Path;
 
@@ -13,18 +13,18 @@ use packwatch::monitor::MonitorConfig;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
 
-/// Cycles in which the filter may still settle from what it starts with.
+/// Number of cycles in which the filter may still settle from its initial values.
 const SETTLING_CYCLES: usize = 1;
-/// Cycles until the sensor's offset and the loss per cycle are known.
+/// Number of cycles until the sensor offset and the fade per cycle are known.
 const LEARNING_CYCLES: usize = 3;
-/// Largest |SOC error| at any sample; the paper's figures: 0.05, at the end of life 0.20.
+/// Largest |SOC error| of any sample. The paper's figures: 0.05, and 0.20 at the end of life.
 const MAX_SOC_ERROR: f64 = 0.005;
-/// Largest |capacity error| after a half-cycle, relative; the current sensor's gain error alone is half of it.
+/// Largest relative |capacity error| after a half-cycle. The current sensor's gain error alone makes up half of it.
 const MAX_CAPACITY_ERROR: f64 = 0.01;
-/// Smallest share of cycles whose true capacity lies within two stated standard deviations.
+/// Smallest fraction of cycles whose true capacity lies within two stated standard deviations.
 const MIN_COVERAGE: f64 = 0.90;
 
-/// What one cycle came to.
+/// Errors of one cycle.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cycle {
     true_ah: f64,
@@ -81,7 +81,7 @@ fn print(cycles: &[Cycle]) {
 }
 
 #[test]
-fn paper_scenario_is_estimated_within_the_papers_own_errors() {
+fn paper_scenario_errors_stay_below_papers() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")));
     let settings = Settings::of(Scenario::Paper, 2.6);

@@ -1,8 +1,9 @@
-//! `packwatch passport` as its user runs it: values against the store's own numbers, what is unknown, the forms of both standards.
+//! Runs `packwatch passport` as a user does: values against the store's own numbers, unknown values, and the formats of
+//! both standards.
 //!
-//! Peers: IDTA's template through `aas-submodel-validate`, where `PACKWATCH_PYTHON` names a Python that has it; the published JSON
-//! schemas, where `PACKWATCH_SCHEMAS` names a folder with `ProductConditionBattery-schema.json` (1.0.1) and `BatteryPass-schema.json` (6.0.0)
-//! as well. Without them a test says that it was skipped.
+//! Peers: IDTA's template through `aas-submodel-validate`, if `PACKWATCH_PYTHON` names a Python that has it; and the
+//! published JSON schemas, if `PACKWATCH_SCHEMAS` also names a folder with `ProductConditionBattery-schema.json`
+//! (1.0.1) and `BatteryPass-schema.json` (6.0.0). Otherwise the tests report that they were skipped.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,11 +12,11 @@ use std::process::Output;
 use assert_cmd::Command;
 use serde_json::{Value, json};
 
-/// Strings of the simulated pack: each carries half of its current.
+/// Strings of the simulated pack; each carries half of the pack current.
 const STRINGS: f64 = 2.0;
 const RATED_AH: f64 = 2.0;
 
-/// What Catena-X's part `performance.dynamic` has of packwatch, and its unit.
+/// Values in Catena-X's part `performance.dynamic` that packwatch provides, with their units.
 const MEASURED: [(&str, &str); 12] = [
     ("/stateOfCharge", "%"),
     ("/fullCycles", "1"),
@@ -32,7 +33,7 @@ const MEASURED: [(&str, &str); 12] = [
 ];
 
 fn packwatch(args: &[&str]) -> Output {
-    let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+    let mut command = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
     command.env("RUNTIME_DIRECTORY", "/nonexistent").args(args).output().expect("it runs")
 }
 
@@ -42,7 +43,7 @@ fn good(args: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// What a refused command says; it writes nothing.
+/// Standard error of a rejected command, which must not write anything.
 fn refused(args: &[&str]) -> String {
     let output = packwatch(args);
     assert_eq!(output.status.code(), Some(1), "{args:?}: {}", String::from_utf8_lossy(&output.stdout));
@@ -58,13 +59,13 @@ fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
 }
 
-/// The manufacturer's part of the measured cell.
+/// The manufacturer's part for the measured cell.
 fn cell_part() -> Value {
     let text = fs::read_to_string(shipped("tests/integration/passport_cli/manufacturer.json")).expect("a file");
     serde_json::from_str(&text).expect("JSON")
 }
 
-/// The same of the simulated pack, of two such cells.
+/// The manufacturer's part for the simulated pack of two such cells.
 fn manufacturer() -> Value {
     let mut part = cell_part();
     part["performance"]["rated"]["capacity"]["value"] = json!(4.0);
@@ -76,7 +77,7 @@ fn close(a: f64, b: f64) -> bool {
     (a - b).abs() <= 1e-6 * b.abs().max(1.0)
 }
 
-/// A simulated life of a pack of one cell in series and two strings, with a store.
+/// A simulated life of a pack with one cell in series and two strings, with a store.
 struct Life(tempfile::TempDir);
 
 impl Life {
@@ -87,7 +88,7 @@ impl Life {
         life
     }
 
-    /// A place with a configuration; `more` is added to it.
+    /// A folder with a configuration, to which `more` is appended.
     fn configured(more: &str) -> Self {
         let life = Self(tempfile::tempdir().expect("a folder"));
         let mut text = fs::read_to_string(shipped("config/measured.toml")).expect("a file");
@@ -121,13 +122,13 @@ impl Life {
         good(&[&args, more].concat());
     }
 
-    /// Two minutes at rest after the end of a log, which the simulation ends under load.
+    /// Appends two minutes at rest to a log, because the simulation ends under load.
     fn rest(&self, log: &str) {
         let mut text = fs::read_to_string(self.path(log)).expect("a log");
         let last = text.lines().last().expect("a line").to_owned();
         let (end_s, data) = (&last[1..last.find('.').expect("a stamp")], &last[last.find('#').expect("a frame") + 1..]);
         let end_s: u64 = end_s.parse().expect("a number");
-        // Bytes 3 to 5 are the current.
+        // Bytes 3 to 5 contain the current.
         let (voltage, temperature) = (&data[..6], &data[12..]);
         (1..=120).for_each(|s| text += &format!("({}.000000000) vcan0 100#{voltage}000000{temperature}\n", end_s + s));
         fs::write(self.path(log), text).expect("written");
@@ -139,7 +140,7 @@ impl Life {
         good(&[&["replay", "-c", &self.path("pack.toml"), "--state", &self.path("state")], &logs[..]].concat());
     }
 
-    /// Arguments of a passport from the store, of a battery recorded since new.
+    /// Arguments for a passport from the store, for a battery recorded since new.
     fn of_store(&self) -> Vec<String> {
         let args = ["-c", &self.path("pack.toml"), "--state", &self.path("state"), "--throughput-before-ah", "0"];
         args.map(str::to_owned).to_vec()
@@ -156,7 +157,7 @@ fn with<'a>(args: &'a [String], more: &[&'a str]) -> Vec<&'a str> {
 }
 
 #[test]
-fn values_are_those_of_the_store_and_the_same_bytes_come_again() {
+fn passport_matches_store_and_is_reproducible() {
     let life = Life::new();
     let (args, accidents, details) = (life.of_store(), life.path("accidents.json"), life.path("details.json"));
     let args = with(&args, &["--static", &accidents, "--details", &details]);
@@ -184,7 +185,7 @@ fn values_are_those_of_the_store_and_the_same_bytes_come_again() {
     assert_eq!(known["time"], condition["RemainingCapacity"]["LastUpdate"]);
     let increase = detail("cell_resistance_increase").unwrap();
     assert!(close(increase["value"].as_f64().unwrap(), 100.0 * (number("resistance_ratio") - 1.0)));
-    assert_eq!(increase["path"], Value::Null, "IDTA has no member for it");
+    assert_eq!(increase["path"], Value::Null, "IDTA has no member for the increase");
     let soc = condition["StateOfCharge"]["StateOfChargeValue"].as_f64().unwrap();
     assert!((0.0..=100.0).contains(&soc), "{soc}");
     assert!((10.0..40.0).contains(&condition["TemperatureInformation"]["MeasuredTemp"].as_f64().unwrap()));
@@ -200,7 +201,7 @@ fn values_are_those_of_the_store_and_the_same_bytes_come_again() {
 }
 
 #[test]
-fn a_replay_gives_what_its_store_gives_and_the_energy() {
+fn replay_passport_matches_store_plus_energy() {
     let life = Life::new();
     let (args, accidents, log) = (life.of_store(), life.path("accidents.json"), life.path("life.log"));
     let stored = passport(&with(&args, &["--static", &accidents]));
@@ -210,25 +211,25 @@ fn a_replay_gives_what_its_store_gives_and_the_energy() {
     let mut whole = replayed("0");
     let energy = whole.as_object_mut().unwrap().remove("EnergyThroughput").expect("a replay has voltages");
     let energy_wh = 1e3 * energy["EnergyThroughputValue"].as_f64().unwrap();
-    // The last charge, of some 2.3 Ah, is not complete: its energy has been counted, its charge not yet.
+    // The last charge, of about 2.3 Ah, is incomplete: its energy has been counted, its charge has not.
     let moved_ah = stored["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!((3.5 * moved_ah..4.3 * (moved_ah + 2.3)).contains(&energy_wh), "{energy_wh} Wh, {moved_ah} Ah");
     for group in stored.as_object().unwrap().keys() {
         let pairs = stored[group].as_object().into_iter().flatten();
         for (name, value) in pairs.filter(|(name, _)| *name != "LastUpdate") {
             let (one, other) = (value.as_f64().unwrap(), whole[group][name].as_f64().unwrap());
-            // The store keeps rows in full and its last state rounded to what matters.
+            // The store keeps complete rows but rounds its last state.
             assert!((one - other).abs() <= 1e-3 * one.abs().max(1.0), "{group}.{name}: {one} and {other}");
         }
     }
     let later = replayed("100");
-    assert!(later.get("EnergyThroughput").is_none(), "not since new");
+    assert!(later.get("EnergyThroughput").is_none(), "not recorded since new");
     let moved = |document: &Value| document["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!(close(moved(&later), moved(&whole) + 100.0));
 }
 
 #[test]
-fn what_is_required_and_unknown_is_refused_with_the_reason() {
+fn unknown_required_value_is_rejected_with_reason() {
     let life = Life::new();
     let (config, state, accidents) = (life.path("pack.toml"), life.path("state"), life.path("accidents.json"));
     let base = ["passport", "-c", &config, "--state", &state];
@@ -250,13 +251,13 @@ fn what_is_required_and_unknown_is_refused_with_the_reason() {
 }
 
 #[test]
-fn the_state_of_certified_energy_needs_the_certified_energy() {
+fn soce_needs_certified_energy() {
     let life = Life::new();
     let (args, accidents) = (life.of_store(), life.path("accidents.json"));
     let condition = passport(&with(&args, &["--static", &accidents, "--certified-energy-kwh", "0.014"]));
     let energy_kwh = condition["RemainingEnergy"]["RemainingEnergyValue"].as_f64().unwrap();
     let soce = condition["StateOfCertifiedEnergy"]["StateOfCertifiedEnergyValue"].as_f64().unwrap();
-    // 3.8 Ah at some 3.6 V.
+    // 3.8 Ah at about 3.6 V.
     assert!((0.011..0.0150).contains(&energy_kwh), "{energy_kwh} kWh");
     assert!((soce - 100.0 * energy_kwh / 0.014).abs() < 0.01, "{soce} %");
     let path = life.write("manufacturer.json", &manufacturer());
@@ -269,7 +270,7 @@ fn the_state_of_certified_energy_needs_the_certified_energy() {
 }
 
 #[test]
-fn a_battery_pass_has_every_measured_value_with_its_time_and_its_static_part_unchanged() {
+fn battery_pass_adds_measured_values_to_static_part() {
     let life = Life::new();
     let (log, config, details) = (life.path("life.log"), life.path("pack.toml"), life.path("details.json"));
     let path = life.write("manufacturer.json", &manufacturer());
@@ -301,10 +302,10 @@ fn a_battery_pass_has_every_measured_value_with_its_time_and_its_static_part_unc
     for measured in ["stateOfCharge", "fullCycles", "capacity", "resistance", "energy"] {
         dynamic.remove(measured);
     }
-    assert_eq!(pass, manufacturer(), "nothing else was added or changed");
+    assert_eq!(pass, manufacturer(), "no other value may be added or changed");
 }
 
-/// Pointers to every member of objects in a document.
+/// JSON pointers to every member of all objects in a document.
 fn members(document: &Value, at: &str, found: &mut Vec<String>) {
     match document {
         Value::Object(object) => object.iter().for_each(|(name, value)| {
@@ -318,7 +319,7 @@ fn members(document: &Value, at: &str, found: &mut Vec<String>) {
     }
 }
 
-/// Removes a member; its path as a fault names it.
+/// Removes a member. Returns its path as an error names it.
 fn removed(document: &mut Value, pointer: &str) -> String {
     let (parent, name) = pointer.rsplit_once('/').unwrap();
     document.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(name);
@@ -327,7 +328,7 @@ fn removed(document: &mut Value, pointer: &str) -> String {
 }
 
 #[test]
-fn each_missing_member_of_the_manufacturers_part_is_named() {
+fn missing_static_members_are_named() {
     let life = Life::new();
     let args = life.of_store();
     let optional = [
@@ -358,11 +359,12 @@ fn each_missing_member_of_the_manufacturers_part_is_named() {
     ];
     let mut pointers = Vec::new();
     members(&manufacturer(), "", &mut pointers);
-    // One document stands for all of them.
+    // A single document represents all of them.
     let is_wanted = |pointer: &&String| !pointer.contains("/0/c") && !pointer.contains("/0/header");
     let mut document = manufacturer();
     let mut expected = Vec::new();
-    // From the deepest on, so that each is missing by itself; those above others are removed in tests of the module.
+    // Remove from the deepest level up, so that each member is missing alone. The module's tests remove members that
+    // contain others.
     for pointer in pointers.iter().rev().filter(is_wanted) {
         let is_leaf = manufacturer().pointer(pointer).is_some_and(|value| !value.is_object() && !value.is_array());
         let (_, name) = pointer.rsplit_once('/').unwrap();
@@ -380,11 +382,11 @@ fn each_missing_member_of_the_manufacturers_part_is_named() {
         let line = format!("{path}: required, and no record holds it: --static gives it");
         assert!(said.lines().any(|one| one == line), "{path} in {said}");
     }
-    assert_eq!(said.lines().count(), expected.len(), "nothing else is missing: {said}");
+    assert_eq!(said.lines().count(), expected.len(), "only the removed members may be missing: {said}");
 }
 
 #[test]
-fn faults_of_the_static_part_are_named_by_their_paths() {
+fn static_part_faults_are_named_by_path() {
     let life = Life::new();
     let args = life.of_store();
     let mut document = manufacturer();
@@ -410,7 +412,7 @@ fn faults_of_the_static_part_are_named_by_their_paths() {
 }
 
 #[test]
-fn a_new_pack_has_no_learned_value_and_a_record_without_dates_no_passport() {
+fn new_pack_or_undated_record_gives_no_passport() {
     let life = Life::configured("");
     life.simulate("life.log", "1700000000", &["--duration", "300"]);
     let (config, log, accidents) = (life.path("pack.toml"), life.path("life.log"), life.path("accidents.json"));
@@ -441,10 +443,10 @@ fn a_new_pack_has_no_learned_value_and_a_record_without_dates_no_passport() {
 }
 
 #[test]
-fn half_cycles_that_the_store_deleted_count_in_the_sums_of_its_state() {
+fn deleted_half_cycles_count_in_sums() {
     let life = Life::configured("\n[store]\nkeep_years = 0.1\n");
     life.simulate("old.log", "1700000000", &["--cycles", "2"]);
-    // Two months later: the old half-cycles are beyond their age.
+    // Two months later the old half-cycles exceed their maximum age.
     life.simulate("new.log", "1706000000", &["--cycles", "2"]);
     life.rest("old.log");
     life.replay(&["old.log", "new.log"]);
@@ -458,13 +460,13 @@ fn half_cycles_that_the_store_deleted_count_in_the_sums_of_its_state() {
     let (config, old, new) = (life.path("pack.toml"), life.path("old.log"), life.path("new.log"));
     let of_logs = ["-c", &config, &old, &new, "--static", &accidents, "--throughput-before-ah", "0"];
     let replayed_ah = moved_ah(&passport(&of_logs));
-    // The state is stored to nine digits.
+    // The state is stored with nine digits.
     assert!((stored_ah - replayed_ah).abs() < 1e-4 * replayed_ah, "{stored_ah} and {replayed_ah} Ah");
-    assert!(kept_ah < 0.7 * stored_ah, "{kept_ah} of {stored_ah} Ah are left");
+    assert!(kept_ah < 0.7 * stored_ah, "{kept_ah} of {stored_ah} Ah remain");
 }
 
 #[test]
-fn a_history_whose_half_cycles_others_deleted_gives_no_passport() {
+fn tampered_history_gives_no_passport() {
     let life = Life::new();
     let (args, accidents) = (life.of_store(), life.path("accidents.json"));
     let database = rusqlite::Connection::open(Path::new(&life.path("state")).join("packwatch.db")).expect("a database");
@@ -475,7 +477,7 @@ fn a_history_whose_half_cycles_others_deleted_gives_no_passport() {
     assert!(said.contains("the history was changed: rows 1 to ") && said.contains("no passport is made"), "{said}");
 }
 
-/// Arguments of a passport from logs, of a battery recorded since new.
+/// Arguments for a passport from logs, for a battery recorded since new.
 fn of_logs(life: &Life, logs: &[&str]) -> Vec<String> {
     let mut args = vec!["-c".to_owned(), life.path("pack.toml")];
     args.extend(logs.iter().map(|log| life.path(log)));
@@ -484,11 +486,11 @@ fn of_logs(life: &Life, logs: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn a_record_without_its_current_has_no_sums() {
+fn record_without_current_has_no_sums() {
     let life = Life::configured("");
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
     fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", "max_age_s = 5.0")).expect("written");
-    // Each reading of the current may be used for half of the time until the next.
+    // Each current reading is valid for half of the interval to the next.
     life.simulate("sparse.log", "1700000000", &["--cycles", "2", "--period", "10000"]);
     let args = of_logs(&life, &["sparse.log"]);
     let said = refused(&with(&[&["passport".to_owned()], &args[..]].concat(), &["--throughput-before-ah", "0"]));
@@ -499,12 +501,12 @@ fn a_record_without_its_current_has_no_sums() {
 }
 
 #[test]
-fn a_record_with_a_hole_under_load_or_without_its_beginning_has_no_sums() {
+fn record_with_gap_has_no_sums() {
     let life = Life::configured("");
     life.simulate("life.log", "1700000000", &["--cycles", "2"]);
     let text = fs::read_to_string(life.path("life.log")).expect("a log");
     let stamp = |line: &str| line.split(['(', ')']).nth(1).and_then(|stamp| stamp.parse::<f64>().ok()).unwrap_or(0.0);
-    // Ten minutes of the first hour, in a discharge.
+    // Ten minutes of the first hour, during a discharge.
     let is_kept = |line: &&str| !(1_700_001_200.0..1_700_001_800.0).contains(&stamp(line));
     let cut: Vec<&str> = text.lines().filter(is_kept).collect();
     fs::write(life.path("cut.log"), cut.join("\n")).expect("written");
@@ -522,13 +524,13 @@ fn a_record_with_a_hole_under_load_or_without_its_beginning_has_no_sums() {
 }
 
 #[test]
-fn a_car_that_sleeps_between_its_trips_loses_nothing() {
+fn sleep_between_trips_loses_no_charge() {
     let life = Life::configured("");
     life.simulate("first.log", "1700000000", &["--cycles", "1"]);
     life.rest("first.log");
     life.simulate("second.log", "1700040000", &["--cycles", "1"]);
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
-    // With the shorter age the buses fall asleep before the recorder does.
+    // With the shorter age the buses fall asleep before the recorder.
     for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
         fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
         let args = of_logs(&life, &["first.log", "second.log"]);
@@ -540,7 +542,7 @@ fn a_car_that_sleeps_between_its_trips_loses_nothing() {
 }
 
 #[test]
-fn a_store_of_another_configuration_is_refused_with_both_values() {
+fn store_of_other_configuration_is_rejected() {
     let life = Life::new();
     let (args, accidents) = (life.of_store(), life.path("accidents.json"));
     let pack = fs::read_to_string(life.path("pack.toml")).expect("a file");
@@ -556,11 +558,11 @@ fn a_store_of_another_configuration_is_refused_with_both_values() {
     fs::write(life.path("larger.toml"), larger).expect("written");
     let capacity = said(pack.replace(&format!("{model:?}"), "\"larger.toml\""));
     assert!(capacity.contains("cells of 2 Ah, the configuration has cells of 3 Ah"), "{capacity}");
-    assert!(capacity.contains("state: "), "the folder is named: {capacity}");
+    assert!(capacity.contains("state: "), "the state folder must be named: {capacity}");
 }
 
 #[test]
-fn a_value_of_a_clock_that_was_not_set_is_not_dated() {
+fn value_from_unset_clock_is_undated() {
     let life = Life::configured("");
     life.simulate("unset.log", "0", &["--cycles", "3"]);
     life.simulate("set.log", "1700000000", &["--duration", "300"]);
@@ -583,11 +585,11 @@ fn a_value_of_a_clock_that_was_not_set_is_not_dated() {
     assert!(moved.contains("a log begins before the end of the previous log"), "{moved}");
 }
 
-/// What a peer says of a passport; `None`, said on the output, where there is none.
+/// Output of a peer for a passport. Prints a note and returns `None` if the peer is missing.
 #[expect(clippy::print_stdout, reason = "a skipped test says so")]
 fn peer(arguments: &[&str]) -> Option<String> {
     let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
-        println!("SKIPPED: PACKWATCH_PYTHON names no Python, no peer was asked");
+        println!("SKIPPED: PACKWATCH_PYTHON is not set, no peer was run");
         return None;
     };
     let mut command = std::process::Command::new(python);
@@ -596,17 +598,17 @@ fn peer(arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8(output.stdout).expect("text"))
 }
 
-/// What the published schema says.
+/// Output of the published schema's check.
 #[expect(clippy::print_stdout, reason = "a skipped test says so")]
 fn schema(name: &str, document: &str) -> Option<String> {
     let Some(folder) = std::env::var_os("PACKWATCH_SCHEMAS") else {
-        println!("SKIPPED: PACKWATCH_SCHEMAS names no folder, {name} was not asked");
+        println!("SKIPPED: PACKWATCH_SCHEMAS is not set, {name} was not checked");
         return None;
     };
     peer(&["schema", &Path::new(&folder).join(name).display().to_string(), document])
 }
 
-/// Both passports of a record, in files.
+/// Writes both passports of a record to files.
 fn both(life: &Life, args: &[&str], (part, certified_kwh): (&Value, &str)) -> (String, String) {
     let (condition, pass) = (life.path("condition.json"), life.path("battery_pass.json"));
     let (accidents, path) = (life.path("accidents.json"), life.write("manufacturer.json", part));
@@ -628,7 +630,7 @@ fn assert_valid(condition: &str, pass: &str) {
 }
 
 #[test]
-fn peers_find_no_fault_in_a_passport_and_one_in_a_broken_one() {
+fn peers_accept_valid_and_reject_broken_passport() {
     let life = Life::new();
     let (condition, pass) =
         both(&life, &["-c", &life.path("pack.toml"), &life.path("life.log")], (&manufacturer(), "0.014"));
@@ -643,7 +645,7 @@ fn peers_find_no_fault_in_a_passport_and_one_in_a_broken_one() {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_measured_life_gives_valid_passports_from_a_replay_and_from_its_store() {
+fn measured_life_gives_valid_passports() {
     let log = crate::support::measured::path("nasa_pcoe_aging/B0005.csv.gz");
     let life = Life::configured("");
     let (config, log) = (shipped("config/measured.toml").display().to_string(), log.display().to_string());
@@ -654,7 +656,7 @@ fn a_measured_life_gives_valid_passports_from_a_replay_and_from_its_store() {
     let faults = [peer(&["submodel", &condition]), schema("ProductConditionBattery-schema.json", &condition)];
     assert!(faults.iter().flatten().all(String::is_empty), "{faults:?}");
     let of_replay: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
-    // 168 discharges of 1.86 to 1.29 Ah, as their publishers measured them, and as many charges.
+    // 168 discharges from 1.86 to 1.29 Ah, as their publishers measured them, and as many charges.
     let moved_ah = of_replay["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!((480.0..560.0).contains(&moved_ah), "{moved_ah} Ah");
     assert_eq!(of_replay["NumberOfFullCycles"]["NumberOfFullCyclesValue"], json!((moved_ah / 4.0).floor() as u64));

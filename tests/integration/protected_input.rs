@@ -1,5 +1,5 @@
-//! Bad frames of protected messages, and floods, at the core's interface: each is counted and reported, none moves an estimate,
-//! and other messages are still processed.
+//! Bad frames of protected messages, and floods, at the core's interface: each one is counted and reported, none
+//! changes an estimate, and other messages are still processed.
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
@@ -14,8 +14,8 @@ const CURRENT: CanId = CanId::Standard(0x100);
 const CELL_1: CanId = CanId::Standard(0x110);
 const CELL_2: CanId = CanId::Standard(0x111);
 
-/// Current in a message with profile 1A, each cell's voltage in one of its own: the first with profile 5, the second
-/// not protected.
+/// The current has a message with profile 1A. Each cell's voltage has its own message: the first with profile 5, the
+/// second unprotected.
 const DBC: &str = r#"VERSION ""
 NS_ :
 BS_:
@@ -58,14 +58,14 @@ fn configuration() -> MonitorConfig {
     config_texts::load(PACK, DBC).monitor
 }
 
-/// A bus with three senders, and the core behind it.
+/// A bus with three senders, connected to the core.
 struct Bench {
     monitor: Monitor,
     out: Outputs,
     events: Vec<Event>,
     estimates: Vec<Estimate>,
     now: Timestamp,
-    /// Counters of the two protected messages' senders.
+    /// The counters of the two protected senders.
     counters: [u8; 2],
 }
 
@@ -85,7 +85,7 @@ impl Bench {
         }
     }
 
-    /// Started and following both senders.
+    /// A bench that has already started to follow both senders.
     fn running() -> Self {
         let mut bench = Self::new();
         (0..20).for_each(|_| bench.cycle());
@@ -98,7 +98,7 @@ impl Bench {
         self.estimates.clear();
     }
 
-    /// What came of the inputs so far, without waiting for the rest of a round of voltages.
+    /// Collects the outputs so far, without waiting for the rest of a round of voltages.
     fn take(&mut self) {
         self.monitor.settle(&mut self.out);
         self.events.append(&mut self.out.events);
@@ -111,7 +111,7 @@ impl Bench {
         self.take();
     }
 
-    /// 100 ms, with the driver's ticks.
+    /// Advances by 100 ms, with the driver's ticks.
     fn wait(&mut self) {
         for _ in 0..10 {
             self.now = self.now.plus_nanos(10_000_000);
@@ -120,7 +120,7 @@ impl Bench {
         self.take();
     }
 
-    /// 100 ms, and then every message once, as its sender sends it.
+    /// Advances by 100 ms, then sends every message once.
     fn cycle(&mut self) {
         self.wait();
         let current = self.next_current(1.0);
@@ -146,7 +146,7 @@ impl Bench {
         self.monitor.protected().find(|of| of.id == id).unwrap().counts.get(status)
     }
 
-    /// (id, status, usable, count) of the reports about protected messages.
+    /// Reports about protected messages: (id, status, usable, count).
     fn reported(&self) -> Vec<(CanId, Status, bool, u64)> {
         let reported = self.events.iter().filter_map(|event| match event.kind {
             EventKind::Protection(GuardChange { id, status, usable, count, .. }) => Some((id, status, usable, count)),
@@ -188,7 +188,7 @@ fn cell_2(voltage_v: f64) -> Frame {
     Frame::classic(CELL_2, &payload).unwrap()
 }
 
-/// The frame with one bit of its last byte turned over.
+/// The frame with one bit of its last byte flipped.
 fn damaged(frame: Frame) -> Frame {
     let mut payload = frame.data().to_vec();
     payload[7] ^= 1;
@@ -196,24 +196,24 @@ fn damaged(frame: Frame) -> Frame {
 }
 
 #[test]
-fn a_good_stream_is_ok_after_its_first_frame_and_reports_nothing() {
+fn valid_stream_is_accepted_after_first_frame() {
     let mut bench = Bench::new();
     (0..50).for_each(|_| bench.cycle());
     for id in [CURRENT, CELL_1] {
         assert_eq!((bench.count(id, Status::Initial), bench.count(id, Status::Ok)), (1, 49));
     }
     assert_eq!(bench.reported(), []);
-    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (49, 50), "the first protected frame is not used");
+    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (49, 50), "the first protected frame must not be used");
     assert_eq!(bench.monitor.dropped().count(), 0);
 }
 
 #[test]
-fn a_wrong_crc_is_counted_reported_once_and_moves_nothing() {
+fn wrong_crc_is_reported_once_and_ignored() {
     let (mut bench, mut untouched) = (Bench::running(), Bench::running());
     for _ in 0..3 {
         bench.wait();
         untouched.wait();
-        let frame = bench.next_cell_1(2.7); // 1.2 V lower: it would be seen in the estimate
+        let frame = bench.next_cell_1(2.7); // 1.2 V lower, which would change the estimate
         bench.give(damaged(frame));
         for bench in [&mut bench, &mut untouched] {
             let current = bench.next_current(1.0);
@@ -221,8 +221,8 @@ fn a_wrong_crc_is_counted_reported_once_and_moves_nothing() {
             bench.give(cell_2(3.9));
         }
     }
-    assert_eq!(bench.soc(0), untouched.soc(0), "as if the frame had not come");
-    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 3), "the other cell is still estimated");
+    assert_eq!(bench.soc(0), untouched.soc(0), "the frame must have no effect");
+    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 3), "the other cell must still be estimated");
     assert_eq!(
         (bench.count(CELL_1, Status::WrongCrc), bench.reported()),
         (3, vec![(CELL_1, Status::WrongCrc, false, 1)])
@@ -238,7 +238,7 @@ fn a_wrong_crc_is_counted_reported_once_and_moves_nothing() {
 }
 
 #[test]
-fn a_repeated_counter_is_not_used_again() {
+fn repeated_counter_is_rejected() {
     let mut bench = Bench::running();
     bench.wait();
     let frame = bench.next_cell_1(3.9);
@@ -252,7 +252,7 @@ fn a_repeated_counter_is_not_used_again() {
 }
 
 #[test]
-fn a_counter_skipped_within_the_allowed_step_is_used_and_counted() {
+fn allowed_counter_skip_is_used_and_counted() {
     let mut bench = Bench::running();
     let _lost = bench.next_current(1.0);
     bench.cycle();
@@ -261,7 +261,7 @@ fn a_counter_skipped_within_the_allowed_step_is_used_and_counted() {
 }
 
 #[test]
-fn a_counter_skipped_beyond_the_allowed_step_is_not_used() {
+fn excessive_counter_skip_is_rejected() {
     let mut bench = Bench::running();
     (0..5).for_each(|_| _ = bench.next_cell_1(2.7));
     bench.cycle();
@@ -272,27 +272,27 @@ fn a_counter_skipped_beyond_the_allowed_step_is_not_used() {
     assert_eq!(
         bench.reported()[1..],
         [(CELL_1, Status::Ok, true, 1)],
-        "profile 5 continues from the counter of the sender"
+        "profile 5 must continue from the sender's counter"
     );
 }
 
 #[test]
-fn an_old_frame_replayed_is_refused_and_the_stream_continues() {
+fn replayed_frame_is_rejected_and_stream_continues() {
     let mut bench = Bench::running();
     bench.wait();
-    let old = current(bench.counters[0].wrapping_sub(4), -50.0); // sent and used some time ago
+    let old = current(bench.counters[0].wrapping_sub(4), -50.0); // sent and used earlier
     bench.give(old);
     assert_eq!(bench.count(CURRENT, Status::WrongSequence), 1);
     let current_bad = EventKind::SignalBad { channel: Channel::Current, fault: Fault::EndToEnd };
     assert!(bench.has(&current_bad));
     (0..10).for_each(|_| bench.cycle());
-    assert_eq!(bench.reported().last(), Some(&(CURRENT, Status::Ok, true, 1)), "the next frame of the sender is good");
-    assert!(bench.estimates.iter().all(|estimate| estimate.measured.current_a == 1.0), "-50 A is never used");
+    assert_eq!(bench.reported().last(), Some(&(CURRENT, Status::Ok, true, 1)), "the sender's next frame must be valid");
+    assert!(bench.estimates.iter().all(|estimate| estimate.measured.current_a == 1.0), "-50 A must not be used");
     assert_eq!(bench.estimates_of(0), 10);
 }
 
 #[test]
-fn frames_of_another_message_with_the_right_crc_of_their_own_are_refused() {
+fn frame_of_other_message_is_rejected() {
     let mut bench = Bench::running();
     let mut payload = [0; 8];
     let masquerade = Protection { profile: Profile::P01A, data_id: 0x0124 };
@@ -303,7 +303,7 @@ fn frames_of_another_message_with_the_right_crc_of_their_own_are_refused() {
 }
 
 #[test]
-fn frames_that_do_not_come_are_counted_where_the_period_is_known() {
+fn missing_frames_are_counted_with_known_period() {
     let mut bench = Bench::running();
     for _ in 0..20 {
         bench.wait();
@@ -312,19 +312,19 @@ fn frames_that_do_not_come_are_counted_where_the_period_is_known() {
     assert_eq!(
         bench.count(CURRENT, Status::NoNewData),
         18,
-        "2 s, less the first half period and the last, not looked at yet"
+        "2 s minus the first half period and the last one, which is not checked yet"
     );
-    assert_eq!(bench.count(CELL_1, Status::NoNewData), 0, "no cycle time in the DBC");
-    assert_eq!(bench.reported(), [(CURRENT, Status::NoNewData, false, 2)], "one may be lost");
+    assert_eq!(bench.count(CELL_1, Status::NoNewData), 0, "the DBC has no cycle time");
+    assert_eq!(bench.reported(), [(CURRENT, Status::NoNewData, false, 2)], "one loss is tolerated");
     assert_eq!(bench.estimates_of(1), 20);
 }
 
 #[test]
-fn a_flood_of_one_identifier_is_cut_counted_and_reported_while_the_others_continue() {
+fn flood_of_one_identifier_is_limited() {
     let mut bench = Bench::running();
     let mut sent = 0;
     for _ in 0..20 {
-        // 10,000 a second, five times the limit; of a message without protection.
+        // 10,000 frames a second, five times the limit, of an unprotected message.
         for _ in 0..1000 {
             bench.now = bench.now.plus_nanos(100_000);
             bench.give(cell_2(3.9));
@@ -351,19 +351,19 @@ fn a_flood_of_one_identifier_is_cut_counted_and_reported_while_the_others_contin
 }
 
 #[test]
-fn a_flood_of_a_protected_message_does_not_get_past_either_bound() {
+fn protected_flood_is_limited_before_check() {
     let mut bench = Bench::running();
     bench.wait();
     let soc = bench.soc(0);
     let forged = Frame::classic(CELL_1, &[0; 8]).unwrap();
     (0..5000).for_each(|_| bench.give(forged));
-    assert_eq!(bench.count(CELL_1, Status::WrongCrc), 200, "what was dropped is not even checked");
+    assert_eq!(bench.count(CELL_1, Status::WrongCrc), 200, "dropped frames must not be checked");
     assert_eq!(bench.monitor.dropped().next().unwrap().dropped, 4800);
     assert_eq!((bench.soc(0), bench.estimates_of(0)), (soc, 0));
 }
 
 #[test]
-fn a_restart_keeps_the_counts_and_waits_for_a_first_frame() {
+fn restart_keeps_counts_and_awaits_first_frame() {
     let mut bench = Bench::running();
     let frame = bench.next_cell_1(3.9);
     bench.give(damaged(frame));

@@ -1,10 +1,10 @@
-//! The recharge period made comparable, through the whole core: simulated cells -> sensors -> frames -> Monitor.
+//! Normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor.
 //!
-//! A fleet of cells of 1.4 to 2.6 Ah with as many chargers (0.3 to 1.2 C, constant current, then constant voltage),
-//! temperatures (5 to 40 degrees C) and depths, each with its own current sensor (20 mA noise, 10 mA offset and 0.5 %
-//! gain of either sign; 5 mV): the normalised period must rank the cells by their true capacity, and its stated
-//! interval must hold the truth. One life whose charger gets weaker half way. What the alarm makes of it.
-//! `cargo test --release --test integration recharge_fleet -- --nocapture` prints the tables.
+//! A fleet of cells of 1.4 to 2.6 Ah, each with its own charger (0.3 to 1.2 C, constant current, then constant
+//! voltage), temperature (5 to 40 degrees C), depth and current sensor (20 mA noise, 10 mA offset and 0.5 % gain of
+//! either sign; 5 mV). The normalised period must rank the cells by their true capacity, and its stated interval must
+//! contain the truth. One life has a charger that becomes weaker half-way. Also checks the alarm.
+//! To print the tables: `cargo test --release --test integration recharge_fleet -- --nocapture`.
 
 use std::path::Path;
 
@@ -22,19 +22,19 @@ use rand_chacha::ChaCha8Rng;
 
 const RATED_AH: f64 = 2.6;
 const FLEET: usize = 40;
-/// Depths the chargers are used at: three cover the window of 30 to 90 %, two only a part of it.
+/// SOC ranges of the charges: three cover the window of 30 to 90 %, two cover only a part.
 const DEPTHS: [(f64, f64); 5] = [(0.20, 0.95), (0.25, 0.92), (0.10, 0.98), (0.30, 0.90), (0.40, 0.85)];
-/// Discharges and charges before the fleet is judged.
+/// Number of cycles before the fleet is judged.
 const CYCLES: u32 = 4;
 const REST_S: u32 = 600;
 /// Charging ends when the current at constant voltage has fallen to this, A: C/20.
 const TAPER_END_A: f64 = RATED_AH / 20.0;
 
-/// `PACKWATCH_Health` and its page with the recharge periods, in `config/packwatch.dbc`.
+/// `PACKWATCH_Health` and its page with the recharge periods, as in `config/packwatch.dbc`.
 const HEALTH_ID: CanId = CanId::Standard(1713);
 const RECHARGE_PAGE: u8 = 1;
 
-/// Uniform and normal numbers of one seed.
+/// Seeded uniform and normal numbers.
 struct Dice(ChaCha8Rng);
 
 impl Dice {
@@ -55,7 +55,7 @@ impl Dice {
     }
 }
 
-/// How a cell is used.
+/// Usage of a cell.
 #[derive(Debug, Clone, Copy)]
 struct Usage {
     capacity_ah: f64,
@@ -67,17 +67,18 @@ struct Usage {
     discharge_a: f64,
 }
 
-/// What the Monitor reported about one charge; `None` = nothing.
+/// The Monitor's report on one charge; `None` = not reported.
 #[derive(Debug, Clone, Copy, Default)]
 struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
-    /// For comparison: charge over estimated swing inside the window of this charge alone, at the reference current.
+    /// For comparison, from this charge alone: charge divided by estimated swing inside the window, at the reference
+    /// current.
     own_charge_s: Option<f64>,
 }
 
-/// One simulated cell, its sensors and its Monitor.
+/// A simulated cell with its sensors and its Monitor.
 struct Rig {
     config: MonitorConfig,
     pack: Pack,
@@ -92,7 +93,7 @@ struct Rig {
     reported: ChargeReport,
     alarms: u32,
     health: Option<[u8; 8]>,
-    /// Charge counted (A s) and SOC estimated where this charge entered the window, and now.
+    /// Counted charge (A s) and estimated SOC when this charge entered the window, and now.
     own: Option<[(f64, f64); 2]>,
     counted_as: f64,
 }
@@ -135,7 +136,7 @@ impl Rig {
         }
     }
 
-    /// One second at `current_a`: the sensors' frames, then the truth advances.
+    /// Simulates one second at `current_a`: sends the sensors' frames, then advances the truth.
     fn second(&mut self, current_a: f64) {
         let measured_a = current_a * (1.0 + self.gain) + self.offset_a + 0.020 * self.dice.normal();
         let voltage_v = self.pack.lowest_v(current_a) + 0.005 * self.dice.normal();
@@ -197,7 +198,7 @@ impl Rig {
         self.pack.cells()[0].soc
     }
 
-    /// Discharge, rest, charge, rest; returns the report about the charge.
+    /// Discharge, rest, charge, rest. Returns the report on the charge.
     fn cycle(&mut self, usage: &Usage) -> ChargeReport {
         self.reported = ChargeReport::default();
         let (low_v, high_v) = (self.config.model.voltage_min_v, self.config.model.voltage_max_v);
@@ -217,7 +218,7 @@ impl Rig {
     }
 }
 
-/// The paper's configuration for cells of which only the rated capacity is known.
+/// The paper's configuration for cells with known rated capacity only.
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
@@ -234,7 +235,7 @@ fn true_period_s(capacity_ah: f64) -> f64 {
     3600.0 * 0.6 * capacity_ah / (RATED_AH / 2.0)
 }
 
-/// Rank correlation of the pairs whose second value is known.
+/// Rank correlation, over the pairs whose second value is known.
 fn spearman(pairs: &[(f64, Option<f64>)]) -> f64 {
     let known: Vec<(f64, f64)> = pairs.iter().filter_map(|&(x, y)| Some((x, y?))).collect();
     let ranks = |values: Vec<f64>| -> Vec<f64> {
@@ -252,7 +253,7 @@ fn fleet() -> Vec<(Usage, ChargeReport)> {
         let worn = k as f64 / (FLEET - 1) as f64;
         Usage {
             capacity_ah: 2.6 - 1.2 * worn,
-            // Worn cells have grown in resistance, but not all alike.
+            // The resistance of worn cells has grown, by different amounts.
             resistance_growth: 0.5 * worn + dice.uniform(0.0, 0.2),
             fade_ah: 0.0,
             temperature_c: dice.uniform(5.0, 40.0),
@@ -270,7 +271,7 @@ fn fleet() -> Vec<(Usage, ChargeReport)> {
 }
 
 #[test]
-fn normalised_period_ranks_a_fleet_by_capacity_whatever_charger_temperature_and_depth() {
+fn normalised_period_ranks_fleet_by_capacity() {
     let fleet = fleet();
     println!("true Ah  true s | raw s  normalised s +-  std  error % | own charge % | charger A  temp C  depth");
     let words = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.0}"));
@@ -308,15 +309,18 @@ fn normalised_period_ranks_a_fleet_by_capacity_whatever_charger_temperature_and_
     };
     let coverage = fleet.iter().filter(inside).count() as f64 / fleet.len() as f64;
     println!("95 % interval holds the truth: {:.0} % of the cells", 100.0 * coverage);
-    assert!(fleet.iter().all(|(_, reported)| reported.normalised_s.is_some()), "every charge covers enough");
-    assert!(fleet.iter().any(|(_, reported)| reported.raw_s.is_none()), "some charges do not cover the window");
+    assert!(
+        fleet.iter().all(|(_, reported)| reported.normalised_s.is_some()),
+        "every charge must give a normalised period"
+    );
+    assert!(fleet.iter().any(|(_, reported)| reported.raw_s.is_none()), "some charges must not cover the window");
     assert!(normalised >= 0.98, "rank correlation {normalised}");
-    assert!(raw < 0.7, "the raw period alone ranks them already: {raw}");
+    assert!(raw < 0.7, "the raw period alone already ranks the cells: {raw}");
     assert!((0.90..=1.0).contains(&coverage), "coverage {coverage}");
 }
 
 #[test]
-fn a_charger_that_gets_weaker_moves_the_raw_period_and_not_the_normalised_one() {
+fn weaker_charger_changes_only_raw_period() {
     const LIFE: usize = 24;
     const WEAKER_FROM: usize = 12;
     let config = configuration();
@@ -352,20 +356,20 @@ fn a_charger_that_gets_weaker_moves_the_raw_period_and_not_the_normalised_one() 
     let mean = |from: usize, to: usize, value: fn(&(f64, f64, f64)) -> f64| {
         life[from..to].iter().map(value).sum::<f64>() / (to - from) as f64
     };
-    // Three charges before against three after the change, less what the cell itself lost between.
+    // Compare three charges before the change with three after it, corrected for the cell's own fade.
     let (before, after) = ((WEAKER_FROM - 3, WEAKER_FROM), (WEAKER_FROM, WEAKER_FROM + 3));
     let jump = |value: fn(&(f64, f64, f64)) -> f64| mean(after.0, after.1, value) / mean(before.0, before.1, value);
     let faded = jump(|l| l.2);
     let (raw, normalised) = (jump(|l| l.0) / faded - 1.0, jump(|l| l.1) / faded - 1.0);
     println!("when the charger gets weaker: raw {:+.1} %, normalised {:+.2} %", 100.0 * raw, 100.0 * normalised);
     assert!(raw > 0.9, "the raw period should have doubled: {raw}");
-    assert!(normalised.abs() < 0.01, "the normalised period took the charger for {normalised}");
+    assert!(normalised.abs() < 0.01, "the charger changed the normalised period by {normalised}");
     assert!(life[LIFE - 1].1 < life[2].1, "the normalised period must fall with the capacity");
     let worst = life[2..].iter().map(|l| (l.1 / l.2 - 1.0).abs()).fold(0.0, f64::max);
     assert!(worst < 0.03, "worst error {worst}");
 }
 
-/// Alarms of a few charges with a threshold of 3000 s, by what the rule compares; and the last health frame.
+/// Alarms of a few charges with a threshold of 3000 s, for the given `alarm_on`; and the last health frame.
 fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
     let output = config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml")).ok();
     let mut config = configuration();
@@ -389,7 +393,7 @@ fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
 }
 
 #[test]
-fn alarm_on_the_normalised_period_is_about_the_cell_and_not_the_charger() {
+fn normalised_period_alarm_ignores_charger() {
     let usual = Usage {
         capacity_ah: 2.5,
         resistance_growth: 0.0,
@@ -411,7 +415,7 @@ fn alarm_on_the_normalised_period_is_about_the_cell_and_not_the_charger() {
 }
 
 #[test]
-fn a_charge_over_part_of_the_window_sends_a_normalised_period_and_no_raw_one() {
+fn partial_charge_sends_only_normalised_period() {
     let usage = Usage {
         capacity_ah: 2.0,
         resistance_growth: 0.0,
@@ -422,9 +426,9 @@ fn a_charge_over_part_of_the_window_sends_a_normalised_period_and_no_raw_one() {
         discharge_a: 0.5 * RATED_AH,
     };
     let (_, health) = alarms(&usage, RechargeAlarm::Raw);
-    let payload = u64::from_le_bytes(health.expect("health frames are sent"));
+    let payload = u64::from_le_bytes(health.expect("a health frame must be sent"));
     let (raw, normalised) = ((payload >> 20) & 0xFFFF, (payload >> 36) & 0xFFFF);
     assert_eq!(raw, 0xFFFF, "not available");
     let error = normalised as f64 / true_period_s(usage.capacity_ah) - 1.0;
-    assert!(error.abs() < 0.03, "{normalised} s on the wire");
+    assert!(error.abs() < 0.03, "{normalised} s in the frame");
 }

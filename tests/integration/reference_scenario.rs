@@ -1,11 +1,11 @@
-//! The published 30 Ah example (scenario `reference`) through the whole core: discharge by random pulses, charge at
-//! 15 A, 30 to 90 %, 1 Ah lost per cycle, ten cycles. The example claims a final SOC error below 0.5 %.
+//! The published 30 Ah example (scenario `reference`) through the whole core: discharge by random pulses, charge at 15
+//! A, 30 to 90 %, 1 Ah lost per cycle, ten cycles. The example claims a final SOC error below 0.5 %.
 //!
-//! Its tables are not published; stated here: those of `config/cells/example_nmc_2600.toml` with the 30 Ah of eleven and
-//! a half such cells in parallel (resistances over 30 / 2.6, capacitances times it). Sensors as in the paper's
-//! scenario: voltage 5 mV, current 20 mA noise + 10 mA offset + 0.5 % gain; 1 s. The 0.5 % gain is a floor under the
-//! capacity's error that no estimator gets below.
-//! `cargo test --release --test integration reference_scenario -- --nocapture` prints the table.
+//! The example's tables are not published. This test uses those of `config/cells/example_nmc_2600.toml`, scaled to 30
+//! Ah, that is eleven and a half such cells in parallel (resistances divided by 30 / 2.6, capacitances multiplied by
+//! it). Sensors as in the paper's scenario: voltage 5 mV; current 20 mA noise + 10 mA offset + 0.5 % gain; 1 s. The
+//! gain error of 0.5 % limits the capacity accuracy of any estimator.
+//! To print the table: `cargo test --release --test integration reference_scenario -- --nocapture`.
 
 use std::path::Path;
 
@@ -17,24 +17,24 @@ use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
 
 const CAPACITY_AH: f64 = 30.0;
-/// The simulated cell is the model: what is left is the sensor's noise and the tables' corners. With the default, which
-/// is for measured cells (0.15), the capacity lags behind the loss of 1 Ah: 2.2 % at the end.
+/// The simulated cell matches the model, so only sensor noise and the corners of the tables remain. The default of
+/// 0.15, which is for measured cells, would make the capacity lag behind the loss of 1 Ah: 2.2 % at the end.
 const MODEL_ERROR_V_SQRT_S: f64 = 0.03;
-/// As much as the example's cell loses in a full cycle: 1 Ah in one of 60 %.
+/// Fade of the example's cell per full cycle: 1 Ah in a cycle of 60 %.
 const NOISE_AH_PER_CYCLE: f64 = 1.7;
-/// Claimed by the example for its end.
+/// The example's claim for the end.
 const MAX_FINAL_SOC_ERROR: f64 = 0.005;
-/// At the end, relative.
+/// Largest relative capacity error at the end.
 const MAX_CAPACITY_ERROR: f64 = 0.01;
 
-/// What a cycle came to.
+/// Errors of one cycle.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cycle {
     true_ah: f64,
     estimated_ah: f64,
     std_ah: f64,
     max_soc_error: f64,
-    /// At its last sample.
+    /// SOC error at the cycle's last sample.
     end_soc_error: f64,
 }
 
@@ -57,7 +57,7 @@ fn configuration() -> MonitorConfig {
     config
 }
 
-/// `scale` times as many equal cells in parallel.
+/// Changes the model to `scale` equal cells in parallel.
 fn enlarge(model: &mut CellModel, scale: f64) {
     model.capacity_ah *= scale;
     model.rated_capacity_ah *= scale;
@@ -92,7 +92,7 @@ fn run(seed: u64) -> Vec<Cycle> {
 }
 
 #[test]
-fn reference_example_ends_within_its_claimed_soc_error() {
+fn reference_example_meets_claimed_soc_error() {
     for seed in 1..=3 {
         let cycles = run(seed);
         println!("seed {seed}\ncycle  true Ah  estimated +-  std  error % | SOC error %: at the end  max");

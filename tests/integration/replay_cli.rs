@@ -1,4 +1,4 @@
-//! `packwatch replay` as its user runs it, with the shipped configuration of a measured cell.
+//! Runs `packwatch replay` as a user does, with the shipped configuration of a measured cell.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,11 +13,11 @@ fn config() -> PathBuf {
 }
 
 fn replay(args: &[&str]) -> assert_cmd::assert::Assert {
-    let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+    let mut command = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
     command.arg("replay").arg("-c").arg(config()).args(args).assert()
 }
 
-/// Half an hour of discharge pulses at 1 s.
+/// Half an hour of discharge pulses, one row per second.
 fn log(folder: &Path) -> String {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     for second in 0..1800 {
@@ -31,7 +31,7 @@ fn log(folder: &Path) -> String {
 }
 
 #[test]
-fn replaying_twice_gives_the_same_bytes() {
+fn repeated_replay_gives_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
     let log = log(folder.path());
     let results = ["1", "2"].map(|run| {
@@ -45,16 +45,16 @@ fn replaying_twice_gives_the_same_bytes() {
     assert_eq!(results[0], results[1]);
     let rows = String::from_utf8_lossy(&results[0][0]).lines().count();
     assert!((1700..=1801).contains(&rows), "{rows} estimates");
-    assert!(!results[0][2].is_empty(), "frames are sent");
+    assert!(!results[0][2].is_empty(), "no frames were sent");
 }
 
 #[test]
-fn a_journal_in_segments_gives_the_same_bytes_as_one_file() {
+fn segmented_journal_replays_like_one_file() {
     use std::io::Write as _;
     let folder = tempfile::tempdir().expect("a folder");
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (drive, plain, split) = (path("drive.log"), path("plain.journal"), path("split.journal"));
-    let mut simulate = Command::cargo_bin("packwatch").expect("the binary is built");
+    let mut simulate = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
     let paper = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     simulate.args(["simulate", "paper", "-o", &drive, "--cycles", "2", "-c"]).arg(&paper).assert().success();
     let journal = format!("PACKWATCH-JOURNAL 1\n{}", fs::read_to_string(&drive).expect("a log"));
@@ -68,7 +68,7 @@ fn a_journal_in_segments_gives_the_same_bytes_as_one_file() {
     assert!(segments.len() >= 2, "{segments:?}");
     let results = |logs: &[&str], name: &str| {
         let files = ["estimates", "events", "frames"].map(|kind| path(&format!("{kind}-{name}")));
-        let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+        let mut command = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
         command.args(["replay", "-c"]).arg(&paper).args(logs).args(["--estimates", &files[0], "--events", &files[1]]);
         let said = stdout_of(&command.args(["--frames", &files[2]]).assert().success());
         (files.map(|file| fs::read(file).expect("written")), said)
@@ -82,7 +82,7 @@ fn a_journal_in_segments_gives_the_same_bytes_as_one_file() {
 }
 
 #[test]
-fn the_summary_is_json_on_request() {
+fn summary_is_json_on_request() {
     let folder = tempfile::tempdir().expect("a folder");
     let output = replay(&[&log(folder.path()), "--json"]).success().get_output().stdout.clone();
     let summary: serde_json::Value = serde_json::from_slice(&output).expect("JSON");
@@ -92,7 +92,7 @@ fn the_summary_is_json_on_request() {
 }
 
 #[test]
-fn a_bad_line_is_fatal_only_when_strict() {
+fn malformed_line_is_fatal_only_if_strict() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
     fs::write(&path, "(1.000000) vcan0 123#1\n").expect("written");
@@ -104,14 +104,14 @@ fn a_bad_line_is_fatal_only_when_strict() {
 }
 
 #[test]
-fn a_full_disk_is_an_error() {
+fn full_disk_is_an_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let error = replay(&[&log(folder.path()), "--estimates", "/dev/full"]).code(1).get_output().stderr.clone();
     assert!(String::from_utf8_lossy(&error).contains("/dev/full: cannot be written"));
 }
 
 #[test]
-fn a_snapshot_beyond_the_log_is_an_error_and_leaves_no_file() {
+fn snapshot_beyond_log_fails_without_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let snapshot = folder.path().join("state");
     let snapshot = snapshot.to_str().expect("UTF-8");
@@ -119,7 +119,7 @@ fn a_snapshot_beyond_the_log_is_an_error_and_leaves_no_file() {
     assert!(!Path::new(snapshot).exists());
 }
 
-/// Logs in candump form: a cell's voltage every second, `seconds` long, the second one broken on request.
+/// Candump logs of a cell's voltage, one frame per second, with the given durations.
 fn trips(folder: &Path, seconds: [u32; 3]) -> [String; 3] {
     [0, 1, 2].map(|n| {
         let path = folder.join(format!("trip{n}.csv"));
@@ -137,7 +137,7 @@ fn stdout_of(assert: &assert_cmd::assert::Assert) -> String {
 }
 
 #[test]
-fn each_log_is_replayed_as_if_alone_and_reported_in_the_order_given() {
+fn each_logs_are_independent_and_ordered() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [3000, 5, 200]);
     let out = folder.path().join("out").display().to_string();
@@ -160,7 +160,7 @@ fn each_log_is_replayed_as_if_alone_and_reported_in_the_order_given() {
 }
 
 #[test]
-fn a_log_that_fails_is_reported_by_name_and_the_others_continue() {
+fn failed_log_is_named_and_others_continue() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [50, 50, 50]);
     fs::remove_file(&logs[1]).expect("removed");
@@ -178,7 +178,7 @@ fn a_log_that_fails_is_reported_by_name_and_the_others_continue() {
 }
 
 #[test]
-fn options_that_make_no_sense_for_each_log_are_refused_by_name() {
+fn each_rejects_unsuitable_options_by_name() {
     let folder = tempfile::tempdir().expect("a folder");
     let [log, other, _] = trips(folder.path(), [5, 5, 5]);
     let refused = |args: &[&str], code: i32| {
@@ -201,11 +201,11 @@ fn options_that_make_no_sense_for_each_log_are_refused_by_name() {
     assert!(refused(&[&same_name, "--events", &out], 1).contains("would replace those of"));
     let onto_itself = refused(&["--estimates", &folder.path().display().to_string()], 1);
     assert!(onto_itself.contains("is read, cannot be written too"), "{onto_itself}");
-    assert!(stdout_of(&replay(&[&log, &other, "-j", "2"]).code(2)).is_empty(), "--jobs needs --each");
+    assert!(stdout_of(&replay(&[&log, &other, "-j", "2"]).code(2)).is_empty(), "--jobs requires --each");
 }
 
 #[test]
-fn until_reads_no_further_than_it_says() {
+fn until_stops_reading_at_its_time() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
     let line = |n: u32| format!("({:010}.000000) vcan0 100#{n:016X}\n", 1_700_000_000 + n);
@@ -217,15 +217,15 @@ fn until_reads_no_further_than_it_says() {
 }
 
 #[test]
-fn a_log_read_in_batches_gives_the_same_as_record_by_record() {
+fn batched_replay_equals_record_by_record() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = fs::read_to_string(log(folder.path())).expect("readable");
     let mut rows: Vec<String> = text.lines().map(str::to_owned).collect();
-    // A hole after which the recorder was asleep, a row of before, and one of long before.
+    // A gap during which the recorder was asleep, a slightly older row, and a much older one.
     rows.extend([4000, 4001, 3999, 4002, 4003, 900, 901, 902].map(|second| format!("{second},2.0,3.6,24.5")));
     let path = folder.path().join("holes.csv");
     fs::write(&path, rows.join("\n")).expect("written");
-    // With an end far beyond the log's, each record is looked at before the next is read.
+    // With `--until` far beyond the log's end, replay reads record by record.
     let results = [&[][..], &["--until", "+1000000"][..]].map(|one_by_one| {
         let paths = ["estimates", "events", "frames", "snapshot"].map(|kind| folder.path().join(kind));
         let [estimates, events, frames, snapshot] = paths.each_ref().map(|path| path.to_str().expect("UTF-8"));

@@ -1,4 +1,5 @@
-//! `packwatch report` as its user meets it: pages from a replay and from a store, plots, a real browser when there is one.
+//! Runs `packwatch report` as a user does: pages from a replay and from a store, plots, and a real browser if one is
+//! installed.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -28,7 +29,7 @@ fn config() -> String {
 struct Place(tempfile::TempDir);
 
 impl Place {
-    /// A cell discharged and charged a few times, as CSV.
+    /// Writes a CSV of a cell that is discharged and charged a few times.
     fn new() -> Self {
         let place = Self(tempfile::tempdir().expect("a folder"));
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
@@ -54,7 +55,7 @@ impl Place {
     }
 }
 
-/// Whether the page says "-0", "-0.0", "-0.00" and so on between its tags.
+/// Whether the page's text contains "-0", "-0.0", "-0.00" and so on.
 fn has_minus_zero(page: &str) -> bool {
     let texts = page.split('<').filter_map(|part| part.split_once('>')).map(|(_, text)| text.replace('\u{2212}', "-"));
     let mut words = texts.flat_map(|text| text.split([' ', ',', '(', ')']).map(str::to_owned).collect::<Vec<_>>());
@@ -62,13 +63,13 @@ fn has_minus_zero(page: &str) -> bool {
 }
 
 #[test]
-fn a_minus_in_front_of_nothing_is_seen() {
+fn minus_zero_is_detected() {
     assert!(has_minus_zero("<p>SOC -0.0 %</p>") && has_minus_zero("<text>\u{2212}0</text>"));
     assert!(!has_minus_zero("<path d=\"M-0.0 1\"/><p>-0.01 to -0.5, 10-0</p>"));
 }
 
 #[test]
-fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
+fn replay_report_is_complete_and_reproducible() {
     let place = Place::new();
     let log = place.path("cell.csv");
     let page = place.page("a.html", &["-c", &config(), &log, "--title", "cell <1>"]);
@@ -77,7 +78,11 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
     {
         assert!(page.contains(part), "no {part:?}");
     }
-    assert_eq!(page.matches("Every \u{b1} is one standard deviation.").count(), 1, "one meaning, said once");
+    assert_eq!(
+        page.matches("Every \u{b1} is one standard deviation.").count(),
+        1,
+        "the meaning must be explained exactly once"
+    );
     assert!(!has_minus_zero(&page), "-0 in the page");
     for foreign in ["NaN", "<script", "http:", "https:", "url("] {
         assert!(!page.contains(foreign), "{foreign} in the page");
@@ -87,7 +92,7 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
 }
 
 #[test]
-fn a_store_becomes_a_page_that_says_what_is_unknown() {
+fn store_report_states_unknown_values() {
     let place = Place::new();
     let (log, state) = (place.path("cell.csv"), place.path("state"));
     good(&["replay", "-c", &config(), &log, "--state", &state]);
@@ -101,7 +106,7 @@ fn a_store_becomes_a_page_that_says_what_is_unknown() {
 }
 
 #[test]
-fn plots_are_one_svg_file_per_picture() {
+fn plots_write_one_svg_per_picture() {
     let place = Place::new();
     let (log, plots, out) = (place.path("cell.csv"), place.path("plots"), place.path("a.html"));
     let config = config();
@@ -112,7 +117,7 @@ fn plots_are_one_svg_file_per_picture() {
 }
 
 #[test]
-fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
+fn measured_capacities_are_plotted_and_faults_named() {
     let place = Place::new();
     let (log, table) = (place.path("cell.csv"), place.path("measured.csv"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,1.9\n").expect("written");
@@ -126,7 +131,7 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
 }
 
 #[test]
-fn a_life_is_reported_with_its_truth_and_the_remaining_life_of_the_core() {
+fn life_report_shows_truth_and_forecast() {
     let place = Place::new();
     let [log, truth, events, state] = ["life.log", "truth.csv", "events.jsonl", "state"].map(|name| place.path(name));
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml").display().to_string();
@@ -154,7 +159,7 @@ fn a_life_is_reported_with_its_truth_and_the_remaining_life_of_the_core() {
     );
 }
 
-/// A browser that is installed here.
+/// An installed browser.
 fn browser() -> Option<PathBuf> {
     let folders = std::env::var_os("PATH")?;
     let names = ["chromium", "chromium-browser", "google-chrome"];
@@ -162,9 +167,9 @@ fn browser() -> Option<PathBuf> {
 }
 
 #[test]
-fn a_browser_finds_nothing_to_fetch_nothing_to_complain_of_and_nothing_too_wide() {
+fn browser_renders_report_without_faults() {
     let Some(browser) = browser() else {
-        println!("skipped: no Chromium is installed");
+        println!("skipped: Chromium is not installed");
         return;
     };
     let place = Place::new();

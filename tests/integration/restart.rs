@@ -1,8 +1,8 @@
-//! What a restart costs: a run that is killed, or whose power is cut, against the run that was not.
+//! Cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
 //!
-//! In: days of the simulated electric car, with an awake rest where the bus falls asleep. Every second the state is kept,
-//! as the daemon does; at random moments a second monitor starts from a state of some age, misses what came meanwhile, and
-//! is then fed the same frames. The figures are printed, and have bars.
+//! Input: days of the simulated electric car, with an awake rest after which the bus falls asleep. The state is stored
+//! every second, as the daemon does. At random times a second monitor starts from a state of some age, misses the
+//! frames of the downtime, and then receives the same frames. The test prints the results and checks their limits.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -15,11 +15,11 @@ use packwatch::monitor::{Downtime, EventKind, Monitor, MonitorConfig, Outputs, R
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Mode, SensorIndex, Timestamp};
 use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
-/// Cells looked at: enough for a spread, few enough for many cases.
+/// Number of cells: enough for a spread, few enough for many cases.
 const CELLS: u16 = 8;
 /// Awake rest after each drive, s.
 const REST_S: u32 = 900;
-/// 95 % of a normal distribution.
+/// Half-width of the 95 % interval of a normal distribution, in standard deviations.
 const SIGMAS: f64 = 1.96;
 
 fn configuration() -> MonitorConfig {
@@ -30,7 +30,7 @@ fn configuration() -> MonitorConfig {
     config
 }
 
-/// Pseudo-random numbers, 0 to 1.
+/// Pseudo-random numbers in 0 to 1.
 struct Draw(u64);
 
 impl Draw {
@@ -45,13 +45,13 @@ impl Draw {
         low + (high - low) * self.next()
     }
 
-    /// Normal with unit deviation, near enough.
+    /// Approximately normal with unit deviation.
     fn noise(&mut self) -> f64 {
         (0..12).map(|_| self.next()).sum::<f64>() - 6.0
     }
 }
 
-/// A monitor and what it is given.
+/// A monitor and its outputs.
 struct Live {
     monitor: Monitor,
     out: Outputs,
@@ -82,17 +82,17 @@ impl Live {
         self.monitor.handle(&record, &mut self.out);
     }
 
-    /// SOC and its deviation of a cell, and when.
+    /// Time, SOC and SOC deviation of a cell's last estimate.
     fn soc(&self, cell: usize) -> Option<(Timestamp, f64, f64)> {
         let latest = self.monitor.latest().nth(cell)??;
         Some((latest.time, latest.soc, latest.soc_std))
     }
 }
 
-/// One moment of a day: readings, and what the pack does.
+/// One time step of a day: the readings.
 type Moment = (Timestamp, Vec<(Channel, Option<f64>)>);
 
-/// The day's readings, ten currents and one round of cells a second.
+/// Readings of a day: ten currents and one round of cells per second.
 fn day(config: &MonitorConfig, seed: u64) -> Vec<Moment> {
     let mut settings = Settings {
         seed,
@@ -123,7 +123,7 @@ fn day(config: &MonitorConfig, seed: u64) -> Vec<Moment> {
     moments
 }
 
-/// The car stands, the bus is still awake.
+/// The parked car, with the bus still awake.
 fn rest(pack: &mut Pack, from: Timestamp, noise: &mut Draw, moments: &mut Vec<Moment>) {
     for second in 1..=REST_S {
         pack.step(0.0, 1.0);
@@ -140,7 +140,7 @@ fn rest(pack: &mut Pack, from: Timestamp, noise: &mut Draw, moments: &mut Vec<Mo
     }
 }
 
-/// A state as the daemon keeps it, and what it knows.
+/// A state as the daemon stores it, with the learned values.
 #[derive(Clone)]
 struct State {
     snapshot: Snapshot,
@@ -152,7 +152,7 @@ fn learned(monitor: &Monitor) -> Vec<ScalarGaussian> {
     (0..CELLS).map(|cell| monitor.capacity(CellIndex(cell))).collect()
 }
 
-/// A restarted monitor, and how it compares.
+/// A restarted monitor and its differences from the uninterrupted one.
 struct Case {
     live: Live,
     until: Timestamp,
@@ -160,18 +160,18 @@ struct Case {
     /// Per cell: difference and deviation at the first estimate, and the largest difference until the end.
     first: Vec<Option<(f64, f64)>>,
     largest: Vec<f64>,
-    /// Whether every capacity was, bit for bit, that of the state.
+    /// Whether every capacity was bit-identical to the stored one.
     kept_learned: bool,
 }
 
-/// How moments are chosen.
+/// How the restart times are chosen.
 struct Plan {
     every_s: f64,
     state_age_s: (f64, f64),
     away_s: (f64, f64),
 }
 
-/// Runs a day, with restarts beside it.
+/// Runs a day with restarts.
 fn run(config: &MonitorConfig, seed: u64, plan: &Plan) -> Vec<Case> {
     let encoder = InputEncoder::new(&config.input);
     let (mut whole, mut draw) = (Live::new(config), Draw(0x9E37_79B9 ^ seed));
@@ -218,14 +218,14 @@ fn start_waiting(
     let (up, still): (Vec<_>, Vec<_>) = waiting.drain(..).partition(|(up, ..)| time >= *up);
     *waiting = still;
     for (up, mode, state) in up {
-        // The bus fell asleep meanwhile: another test's business.
+        // The bus fell asleep before the first estimate; another test covers that.
         if time.since(up) > 1.0 {
             continue;
         }
         let mut live = Live::restored(config, state.snapshot);
         live.give(Record::tick(time));
         active.push(Case {
-            // The time away ends a mode, and a half-cycle that was complete may be learned from right then.
+            // The downtime ends a mode, so a complete half-cycle may be learned from at once.
             kept_learned: learned(&live.monitor) == state.learned
                 || live.out.events.iter().any(|event| matches!(event.kind, EventKind::Capacity { .. })),
             live,
@@ -252,7 +252,7 @@ impl Case {
     }
 }
 
-/// Figures of many cases, printed.
+/// Statistics of many cases.
 struct Figures {
     restarts: usize,
     compared: usize,
@@ -292,7 +292,7 @@ impl Figures {
 }
 
 #[test]
-fn a_run_killed_in_the_middle_of_a_drive_is_within_two_tenths_of_a_point() {
+fn kill_during_drive_costs_little_soc_accuracy() {
     let config = configuration();
     let plan = Plan { every_s: 60.0, state_age_s: (0.0, 1.0), away_s: (1.0, 3.0) };
     let cases: Vec<Case> = (1..=2).flat_map(|seed| run(&config, seed, &plan)).collect();
@@ -304,7 +304,7 @@ fn a_run_killed_in_the_middle_of_a_drive_is_within_two_tenths_of_a_point() {
 }
 
 #[test]
-fn the_interval_after_a_power_cut_covers_what_was_lost() {
+fn interval_after_power_cut_covers_loss() {
     let config = configuration();
     let plan = Plan { every_s: 80.0, state_age_s: (0.0, 60.0), away_s: (60.0, 200.0) };
     let cases: Vec<Case> = (1..=2).flat_map(|seed| run(&config, seed, &plan)).collect();
@@ -318,7 +318,8 @@ fn the_interval_after_a_power_cut_covers_what_was_lost() {
     assert!(cases.iter().all(|case| case.kept_learned));
 }
 
-/// A drive, `hours` off in which `used` of the charge went, and rest: error and deviation of each cell after each reading.
+/// A drive, then `hours` of downtime in which `used` of the charge is removed, then a rest. Returns error and deviation
+/// of each cell after each reading.
 fn away(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f64)> {
     let encoder = InputEncoder::new(&config.input);
     let (mut live, mut noise, mut frames) = (Live::new(config), Draw(seed), Vec::new());
@@ -364,7 +365,7 @@ fn away(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f
 }
 
 #[test]
-fn charge_used_while_the_computer_was_off_is_found_at_the_first_rested_voltage() {
+fn charge_used_during_downtime_is_found_at_rest() {
     let config = configuration();
     for (hours, used, bar) in [(8.0, 0.2, 0.02), (8.0, -0.1, 0.05), (1.0, 0.2, 0.03), (1000.0, 0.2, 0.02)] {
         for seed in [3, 4] {
@@ -390,7 +391,7 @@ fn charge_used_while_the_computer_was_off_is_found_at_the_first_rested_voltage()
 }
 
 #[test]
-fn a_longer_time_away_is_never_the_surer_one() {
+fn longer_downtime_never_reduces_deviation() {
     let config = configuration();
     let mut before = 0.0;
     for hours in [0.01, 0.1, 1.0, 8.0, 100.0, 1000.0, 10_000.0] {

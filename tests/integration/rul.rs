@@ -1,5 +1,6 @@
-//! Forecasts of the remaining useful life held to their bars: on measured lives, on fades of many shapes that nothing was tuned
-//! anything to, and on board. `tests/rul.md` has the figures; `cargo test --test integration rul -- --nocapture` prints them.
+//! Checks forecasts of the remaining useful life: on measured lives, on simulated fades of many shapes that no
+//! parameter was tuned for, and on board. `tests/rul.md` has the results; `cargo test --test integration rul --
+//! --nocapture` prints them.
 
 use std::path::{Path, PathBuf};
 
@@ -12,15 +13,15 @@ use packwatch::sim::{Scenario, Settings};
 
 use crate::support::{measured, simulated_cell};
 
-/// Parts of the life at which forecasts are made.
+/// Fractions of the life at which forecasts are made.
 const AT: [f64; 5] = [0.4, 0.5, 0.6, 0.7, 0.8];
 const ALPHA: f64 = 0.2;
-/// What the 90 % interval must cover, over all forecasts.
+/// Allowed coverage of the 90 % interval, over all forecasts.
 const COVERAGE: std::ops::RangeInclusive<f64> = 0.80..=0.98;
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn forecasts_of_measured_lives_cover_the_truth_and_beat_both_baselines() {
+fn measured_life_forecasts_beat_baselines() {
     let mut scored = Vec::new();
     for (folder, ending, thresholds) in [
         ("nasa_pcoe_aging", "_cycles.csv", &[Threshold::AmpereHours(1.4)][..]),
@@ -65,11 +66,11 @@ impl Dice {
     }
 }
 
-/// How a fade goes over the life: what is lost by a part of it, both as parts.
+/// Shape of a fade: the lost fraction as a function of the elapsed fraction of the life.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shape {
     Power(f64),
-    /// The rate changes by the factor at the part of the life.
+    /// The rate changes by the given factor at the given fraction of the life.
     Kink(f64, f64),
 }
 
@@ -85,8 +86,8 @@ impl Shape {
     }
 }
 
-/// A life of a random length and depth with noise, correlated wander, and capacity that comes back after long rests.
-/// On the axis of days the file does not know which days were rest.
+/// A life of random length and depth, with noise, correlated variation, and capacity that recovers after long rests. On
+/// the axis of days the file does not state which days were rest.
 fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (readings, depth) = (dice.between(40.0, 300.0).floor(), dice.between(0.2, 0.4));
     let days_each = if axis == Axis::Cycles { dice.between(0.15, 0.25) } else { dice.between(2.0, 5.0) };
@@ -114,7 +115,7 @@ fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
 }
 
 #[test]
-fn fades_of_many_shapes_lie_in_the_interval_as_often_as_it_says() {
+fn forecast_interval_covers_many_fade_shapes() {
     let shapes = [
         Shape::Power(1.0),
         Shape::Power(0.5),
@@ -154,8 +155,8 @@ fn fades_of_many_shapes_lie_in_the_interval_as_often_as_it_says() {
 }
 
 #[test]
-fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
-    // The paper's life: 2.6 Ah, 0.05 Ah lost per cycle of 60 %; its end here at 1.3 Ah, after 26 cycles.
+fn on_board_life_is_forecast_from_half_cycles() {
+    // The paper's life: 2.6 Ah, fading by 0.05 Ah per cycle of 60 %. Here it ends at 1.3 Ah, after 26 cycles.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     config.health.end_of_life_ah = 1.3;
@@ -168,7 +169,7 @@ fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
             else {
                 continue;
             };
-            // Each cycle moves 0.6 of the capacity of the day, and a full cycle is one of the rated capacity.
+            // Each cycle moves 0.6 of the present capacity; a full cycle moves the rated capacity.
             let capacity_ah = sim.pack().cells()[0].capacity_ah;
             let truth = (0.6 / 0.05 * (capacity_ah * capacity_ah - 1.3 * 1.3) / (2.0 * 2.6)).max(0.0);
             first.get_or_insert(sim.pack().cycles());
@@ -205,7 +206,7 @@ fn print(scored: &[HistoryScore]) {
     }
 }
 
-/// A file of a straight fade, 0.01 Ah a reading, five days between readings.
+/// A file with linear fade, 0.01 Ah per reading, five days between readings.
 fn straight_file(folder: &Path) -> PathBuf {
     let rows = (0..40).map(|n| format!("{},{:.3}\n", 432_000 * n, 2.0 - 0.01 * f64::from(n)));
     let path = folder.join("cell.csv");
@@ -222,12 +223,12 @@ fn json(args: &[&str]) -> serde_json::Value {
 }
 
 #[test]
-fn the_command_forecasts_now_and_says_what_it_cannot_judge() {
+fn command_forecasts_and_reports_unjudged() {
     let folder = tempfile::tempdir().unwrap();
     let file = straight_file(folder.path());
     let file = file.to_str().unwrap();
     let now = json(&[file, "--end-of-life", "1.5,80 %", "--json"]);
-    // 1.61 Ah at the end, 0.002 Ah a day: 55 days to 1.5 Ah.
+    // 1.61 Ah at the end, fading by 0.002 Ah a day: 55 days to 1.5 Ah.
     let median = now["forecasts"][0]["remaining"]["days"]["median"].as_f64().unwrap();
     assert!((median - 55.0).abs() < 10.0, "{now}");
     assert_eq!(now["forecasts"][0]["remaining"]["cycles"], serde_json::Value::Null);
@@ -242,7 +243,7 @@ fn the_command_forecasts_now_and_says_what_it_cannot_judge() {
 }
 
 #[test]
-fn the_command_refuses_what_it_cannot_read_with_its_place() {
+fn command_rejects_unreadable_input_with_place() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bad.csv");
     std::fs::write(&path, "date,capacity_ah\n0,2\n5,much\n").unwrap();

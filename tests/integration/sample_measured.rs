@@ -1,5 +1,5 @@
-//! The sample stage on a measured life (NASA B0005, uneven steps, real glitches): exactly the glitches are
-//! refused, and each cycle's charge is the one the data set's own table gives.
+//! The sample stage on a measured life (NASA B0005, uneven time steps, real glitches): it rejects exactly the glitches,
+//! and each cycle's charge matches the data set's own table.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -27,14 +27,14 @@ fn config() -> SampleConfig {
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn a_measured_life_loses_only_its_glitches_and_no_charge() {
+fn measured_life_loses_only_glitches() {
     let folder = crate::support::measured::path("nasa_pcoe_aging");
     let mut sampler = Sampler::new(config());
     let (mut changes, mut refused) = (Vec::new(), Vec::new());
     let mut charges_ah: BTreeMap<u32, (f64, f64)> = BTreeMap::new();
     let mut now_s = 0.0;
     let mut cycle_start_s = 0.0;
-    let file = std::fs::File::open(folder.join("B0005.csv.gz")).expect("the data set is there");
+    let file = std::fs::File::open(folder.join("B0005.csv.gz")).expect("the data set exists");
     for row in csv::Reader::from_reader(flate2::read::GzDecoder::new(file)).records() {
         let row = row.expect("a row");
         let number = |field: usize| row[field].parse::<f64>().unwrap_or(f64::NAN);
@@ -61,10 +61,10 @@ fn a_measured_life_loses_only_its_glitches_and_no_charge() {
     assert!(compared > 300, "compared only {compared} cycles");
 }
 
-/// Every cycle against the table's own integral; how many were compared.
+/// Compares every cycle with the table's own integral. Returns the number of compared cycles.
 fn compare(folder: &Path, charges_ah: &BTreeMap<u32, (f64, f64)>) -> usize {
     let mut compared = 0;
-    let mut table = csv::Reader::from_path(folder.join("B0005_cycles.csv")).expect("the table is there");
+    let mut table = csv::Reader::from_path(folder.join("B0005_cycles.csv")).expect("the table exists");
     for row in table.records() {
         let row = row.expect("a row");
         let (Ok(cycle), Ok(published_ah)) = (row[0].parse::<u32>(), row[9].parse::<f64>()) else { continue };

@@ -1,4 +1,4 @@
-//! `packwatch score` as its user runs it, on files whose truth is known by arithmetic.
+//! Runs `packwatch score` as a user does, on files with an analytically known truth.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,8 @@ use assert_cmd::Command;
 use assert_cmd::assert::Assert;
 use serde_json::Value;
 
-/// A straight open-circuit voltage, 3 V + 1.2 V x SOC, 2 Ah, and next to no resistance: every estimate can be calculated by hand.
+/// A linear open-circuit voltage, 3 V + 1.2 V x SOC, 2 Ah, and a very small resistance, so every estimate can be
+/// calculated by hand.
 const MODEL: &str = "format = 1
 name = \"straight\"
 rated_capacity_ah = 2.0
@@ -43,7 +44,8 @@ impl Bench {
         fs::write(self.path(name), text).unwrap();
     }
 
-    /// A discharge of `hours` at 1 A from full, a row a second, whose voltages are those of a cell with `offset` more SOC.
+    /// A discharge of `hours` at 1 A from full, one row per second. The voltages are those of a cell with `offset` more
+    /// SOC.
     fn write_discharge(&self, name: &str, hours: f64, offset: f64) {
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c,discharged_ah\n");
         for second in 0..=(hours * 3600.0) as u32 {
@@ -65,7 +67,7 @@ impl Bench {
     }
 }
 
-/// What went to standard error of a run that ended with `code`.
+/// Standard error of a run that ended with `code`.
 fn fault(run: Assert, code: i32) -> String {
     String::from_utf8(run.code(code).get_output().stderr.clone()).unwrap()
 }
@@ -75,7 +77,7 @@ fn number(score: &Value, key: &str) -> f64 {
 }
 
 #[test]
-fn a_perfect_cell_is_found_from_twenty_points_wrong() {
+fn perfect_cell_converges_from_20_points() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let document = bench.json(&["drive.csv", "--told=-20"]);
@@ -88,8 +90,9 @@ fn a_perfect_cell_is_found_from_twenty_points_wrong() {
 }
 
 #[test]
-fn an_error_of_the_cell_is_an_error_of_the_score() {
-    // The voltages claim 8 points more than the counter: an estimator that trusts them is 8 points off, and not within the band.
+fn cell_error_appears_in_score() {
+    // The voltages indicate 8 points more than the counter, so an estimator that trusts them is 8 points off and
+    // outside the interval.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];
@@ -99,8 +102,8 @@ fn an_error_of_the_cell_is_an_error_of_the_score() {
 }
 
 #[test]
-fn the_truth_divides_by_the_capacity_given() {
-    // 1.5 Ah of 2 Ah leave 25 %, of 3 Ah 50 %: the estimate stays 25 points below such a truth at the end.
+fn truth_uses_given_capacity() {
+    // 1.5 Ah leave 25 % of 2 Ah, or 50 % of 3 Ah: with 3 Ah the estimate ends 25 points below the truth.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let score = &bench.json(&["drive.csv", "--told", "0", "--truth-capacity", "3", "--settle", "0"])["scores"][0];
@@ -109,20 +112,20 @@ fn the_truth_divides_by_the_capacity_given() {
 }
 
 #[test]
-fn a_start_in_the_middle_drops_the_rows_before_it() {
+fn start_in_middle_drops_earlier_rows() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let document = bench.json(&["drive.csv", "--start", "full,middle", "--told=-10", "--remove", "0.25"]);
     let rows: Vec<u64> = document["scores"].as_array().unwrap().iter().map(|s| s["rows"].as_u64().unwrap()).collect();
-    // 0.25 of 2 Ah is reached after 1800 s at 1 A.
+    // A SOC of 0.75 is reached after removing 0.25 of 2 Ah, 1800 s at 1 A.
     assert_eq!(rows, [5401, 5401 - 1800]);
     // The initial SOC is 10 points below the true 75 %; the first voltage has already corrected it.
     assert!((-10.1..-0.1).contains(&number(&document["scores"][1], "first_error_points")), "{document}");
 }
 
 #[test]
-fn an_offset_of_the_current_is_added_before_the_core_sees_it() {
-    // 0.1 A of 2 Ah integrate to 7.5 points in 1.5 h.
+fn current_offset_is_added_before_core() {
+    // 0.1 A integrate to 7.5 points of 2 Ah in 1.5 h.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let args = ["drive.csv", "--told", "0", "--current-offset=-0.1,0,0.1"];
@@ -131,7 +134,8 @@ fn an_offset_of_the_current_is_added_before_the_core_sees_it() {
         document["scores"].as_array().unwrap().iter().map(|s| s["current_offset_a"].as_f64().unwrap()).collect();
     assert_eq!(offsets, [-0.1, 0.0, 0.1]);
     let errors: Vec<_> = (0..3).map(|i| number(&document["scores"][i], "mean_error_points")).collect();
-    // More charge seems to leave than does: below the truth; the voltage holds it far from the integral's 7.5 points.
+    // More charge seems to leave than really does, so the estimate falls below the truth. The voltage keeps the error
+    // far below the integral's 7.5 points.
     assert!(errors[0] > errors[1] + 0.02 && errors[2] < errors[1] - 0.02, "{errors:?}");
     assert!(errors.iter().all(|error| error.abs() < 1.5), "{errors:?}");
     let table = String::from_utf8(bench.score(&args).success().get_output().stdout.clone()).unwrap();
@@ -139,7 +143,7 @@ fn an_offset_of_the_current_is_added_before_the_core_sees_it() {
 }
 
 #[test]
-fn every_case_is_run_on_every_file_in_order() {
+fn cases_run_on_all_files_in_order() {
     let bench = Bench::new();
     bench.write_discharge("a.csv", 1.0, 0.0);
     bench.write_discharge("b.csv", 0.8, 0.0);
@@ -157,7 +161,7 @@ fn every_case_is_run_on_every_file_in_order() {
 }
 
 #[test]
-fn the_table_has_a_line_per_case_and_says_what_was_left_out() {
+fn table_has_line_per_case_and_omissions() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 0.5, 0.0);
     let text = fs::read_to_string(bench.path("drive.csv")).unwrap();
@@ -175,8 +179,8 @@ fn the_table_has_a_line_per_case_and_says_what_was_left_out() {
 }
 
 #[test]
-fn a_life_is_held_against_its_table() {
-    // Four discharges from 4.2 V to 3 V of a 2 Ah cell, with charges between; the load's cut-off is 3 V.
+fn life_is_scored_against_its_table() {
+    // Four discharges from 4.2 V to 3 V of a 2 Ah cell, with charges between them; the load's cut-off is 3 V.
     let bench = Bench::new();
     let mut text = String::from("cycle,type,time_s,current_a,voltage_v,temperature_c\n");
     let mut table = String::from("cycle,type,start,capacity_ah_source\n");
@@ -214,7 +218,7 @@ fn a_life_is_held_against_its_table() {
 }
 
 #[test]
-fn bad_input_is_reported_with_place_found_and_allowed() {
+fn bad_input_error_names_place_and_range() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 0.5, 0.0);
     bench.write("no_counter.csv", "time_s,current_a,voltage_v\n0,1,4\n1,1,4\n");

@@ -1,4 +1,4 @@
-//! `packwatch simulate` and `packwatch demo` as their users run them.
+//! Runs `packwatch simulate` and `packwatch demo` as a user does.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -12,10 +12,10 @@ fn config(name: &str) -> String {
 
 fn packwatch(args: &[&str]) -> Output {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_packwatch"));
-    command.args(args).output().expect("the binary runs")
+    command.args(args).output().expect("the binary starts")
 }
 
-/// Simulates half a minute of the 96-cell day into `folder`; gives log and truth.
+/// Simulates half a minute of the 96-cell day into `folder`. Returns log and truth.
 fn simulate_day(folder: &Path, name: &str, seed: &str) -> (PathBuf, PathBuf) {
     let (log, truth) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.csv")));
     let (log_text, truth_text) = (log.display().to_string(), truth.display().to_string());
@@ -39,12 +39,12 @@ fn simulate_day(folder: &Path, name: &str, seed: &str) -> (PathBuf, PathBuf) {
 }
 
 fn bytes(path: &Path) -> Vec<u8> {
-    std::fs::read(path).expect("the file was written")
+    std::fs::read(path).expect("the file exists")
 }
 
 #[test]
-fn a_seed_gives_the_same_bytes_and_another_seed_others() {
-    let folder = tempfile::tempdir().expect("a folder for the test");
+fn seed_determines_output_bytes() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let first = simulate_day(folder.path(), "first", "3");
     let again = simulate_day(folder.path(), "again", "3");
     let other = simulate_day(folder.path(), "other", "4");
@@ -53,7 +53,7 @@ fn a_seed_gives_the_same_bytes_and_another_seed_others() {
 }
 
 #[test]
-fn two_cycles_of_the_day_are_two() {
+fn two_day_cycles_are_two_days() {
     let truth = |cycles: &str| {
         let example = config("example.toml");
         let cells = ["--cells", "1", "--period", "1000", "--cell-period", "1000"];
@@ -69,8 +69,8 @@ fn two_cycles_of_the_day_are_two() {
 }
 
 #[test]
-fn log_is_candump_in_order_of_time_with_current_every_10_ms() {
-    let folder = tempfile::tempdir().expect("a folder for the test");
+fn log_is_ordered_candump_with_10_ms_current() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (log, _) = simulate_day(folder.path(), "day", "1");
     let log = bytes(&log);
     let (mut last_ns, mut currents) = (0, 0);
@@ -89,8 +89,8 @@ fn log_is_candump_in_order_of_time_with_current_every_10_ms() {
 }
 
 #[test]
-fn truth_has_a_row_per_cell_and_second_and_its_charge_balances() {
-    let folder = tempfile::tempdir().expect("a folder for the test");
+fn truth_rows_are_complete_and_charge_balances() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (log, truth) = (folder.path().join("p.log.gz"), folder.path().join("p.csv.gz"));
     let (log_text, truth_text) = (log.display().to_string(), truth.display().to_string());
     let example = config("example.toml");
@@ -112,7 +112,7 @@ fn truth_has_a_row_per_cell_and_second_and_its_charge_balances() {
     ]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let mut text = String::new();
-    flate2::read::GzDecoder::new(bytes(&truth).as_slice()).read_to_string(&mut text).expect("gzip of text");
+    flate2::read::GzDecoder::new(bytes(&truth).as_slice()).read_to_string(&mut text).expect("compressed text");
     let mut rows = csv::Reader::from_reader(text.as_bytes());
     let head = "time_s,cell,soc,u1_v,capacity_ah,resistance_ratio,current_a,voltage_v,temperature_c";
     assert_eq!(rows.headers().expect("a head").iter().collect::<Vec<_>>().join(","), head);
@@ -122,12 +122,12 @@ fn truth_has_a_row_per_cell_and_second_and_its_charge_balances() {
     let charge_ah = first[6] * (last[0] - first[0]) / 3600.0;
     assert!((first[2] - last[2] - charge_ah / first[4]).abs() < 1e-8);
     let mut log_text = String::new();
-    flate2::read::GzDecoder::new(bytes(&log).as_slice()).read_to_string(&mut log_text).expect("gzip of text");
+    flate2::read::GzDecoder::new(bytes(&log).as_slice()).read_to_string(&mut log_text).expect("compressed text");
     assert!(log_text.starts_with("(1700000000.000000000) can0 100#"), "{:?}", log_text.lines().next());
 }
 
 #[test]
-fn settings_out_of_range_are_refused_with_the_allowed_range() {
+fn out_of_range_settings_name_allowed_range() {
     let example = config("example.toml");
     for (args, code, says) in [
         (vec!["--initial-soc", "2"], 2, "must be 0 to 1"),
@@ -146,7 +146,7 @@ fn settings_out_of_range_are_refused_with_the_allowed_range() {
 }
 
 #[test]
-fn a_missing_configuration_and_a_log_that_cannot_be_written_are_reported() {
+fn missing_configuration_and_unwritable_log_are_reported() {
     let missing = packwatch(&["simulate", "paper", "-c", "/nowhere/pack.toml", "-o", "/dev/null"]);
     assert_eq!(missing.status.code(), Some(78));
     let example = config("example.toml");
@@ -156,7 +156,7 @@ fn a_missing_configuration_and_a_log_that_cannot_be_written_are_reported() {
 }
 
 #[test]
-fn demo_ends_with_both_alarms_as_decoded_frames() {
+fn demo_ends_with_both_decoded_alarms() {
     for seed in ["1", "2", "3"] {
         let output = packwatch(&["demo", "--seed", seed]);
         let text = String::from_utf8_lossy(&output.stdout).into_owned();

@@ -1,4 +1,4 @@
-//! State and history as their user meets them: `replay --state`, `history`, `reset`.
+//! State and history from a user's view: `replay --state`, `history`, `reset`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,9 +8,9 @@ use assert_cmd::Command;
 use serde_json::Value;
 
 fn packwatch(args: &[&str]) -> Output {
-    let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
-    // Whatever runs on this machine is not asked.
-    command.env("RUNTIME_DIRECTORY", "/nonexistent").args(args).output().expect("it runs")
+    let mut command = Command::cargo_bin("packwatch").expect("Cargo builds the binary");
+    // Do not contact a daemon that runs on this machine.
+    command.env("RUNTIME_DIRECTORY", "/nonexistent").args(args).output().expect("the binary starts")
 }
 
 fn good(args: &[&str]) -> String {
@@ -25,7 +25,7 @@ fn bad(args: &[&str]) -> String {
     String::from_utf8(output.stderr).expect("text")
 }
 
-/// A cell discharged and charged a few times, as CSV.
+/// Writes a CSV of a cell that is discharged and charged a few times.
 fn log(folder: &Path) -> String {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     let mut soc: f64 = 0.9;
@@ -45,7 +45,7 @@ struct Place {
 }
 
 impl Place {
-    /// A state folder filled by a replay.
+    /// Creates a state folder filled by a replay.
     fn filled() -> Self {
         let place = Self { folder: tempfile::tempdir().expect("a folder") };
         let log = log(place.folder.path());
@@ -77,7 +77,7 @@ impl Place {
 }
 
 #[test]
-fn learned_values_of_a_replay_are_in_the_history() {
+fn replay_stores_learned_values_in_history() {
     let place = Place::filled();
     let state = place.state();
     let capacities = place.rows(&["--kind", "capacity"]);
@@ -96,7 +96,7 @@ fn learned_values_of_a_replay_are_in_the_history() {
 }
 
 #[test]
-fn the_vehicle_is_in_events_history_report_and_export() {
+fn vehicle_appears_in_all_outputs() {
     let place = Place { folder: tempfile::tempdir().expect("a folder") };
     let log = log(place.folder.path());
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -138,13 +138,13 @@ fn in_report_and_export(place: &Place, config: &str, log: &str) {
 fn in_report_and_export(_: &Place, _: &str, _: &str) {}
 
 #[test]
-fn verify_names_the_first_rows_that_were_changed() {
+fn verify_names_first_changed_rows() {
     let place = Place::filled();
     let before = fs::read(place.database()).expect("read");
-    // A capacity's bytes, found in the file and changed by a bit.
+    // Find a capacity's bytes in the file and flip a bit.
     let rows = place.rows(&["--kind", "capacity"]);
     let wanted = rows[2]["capacity_ah"].as_f64().expect("a number").to_be_bytes();
-    let at = before.windows(8).position(|window| window == wanted).expect("in the file");
+    let at = before.windows(8).position(|window| window == wanted).expect("the capacity is in the file");
     let mut after = before.clone();
     after[at + 7] ^= 1;
     fs::write(place.database(), after).expect("written");
@@ -153,7 +153,7 @@ fn verify_names_the_first_rows_that_were_changed() {
 }
 
 #[test]
-fn a_replay_never_gets_into_a_history_that_exists() {
+fn replay_rejects_existing_history() {
     let place = Place::filled();
     let log = place.path("cell.csv");
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml").display().to_string();
@@ -164,7 +164,7 @@ fn a_replay_never_gets_into_a_history_that_exists() {
 }
 
 #[test]
-fn another_pack_without_a_daemon_begins_a_new_history() {
+fn pack_change_without_daemon_starts_history() {
     let place = Place::filled();
     let (state, socket) = (place.state(), place.path("none.sock"));
     let reset = ["reset", "--pack-replaced", "--state", &state, "--control", &socket];
@@ -183,7 +183,7 @@ fn another_pack_without_a_daemon_begins_a_new_history() {
 }
 
 #[test]
-fn a_history_of_another_format_or_none_at_all_is_reported() {
+fn missing_or_foreign_history_is_reported() {
     let place = Place::filled();
     let printed = bad(&["history", "--state", &place.path("nowhere")]);
     assert!(printed.contains("no history there"), "{printed}");

@@ -1,11 +1,11 @@
-//! `packwatch mqtt`, `kuksa` and `vss` become the program `packwatch-uplink`, where it is installed.
+//! `packwatch mqtt`, `kuksa` and `vss` run the program `packwatch-uplink` if it is installed.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// The program in a folder of its own, beside which nothing lies.
+/// A copy of the program in an otherwise empty folder.
 fn alone(folder: &Path) -> PathBuf {
     let (built, own) = (Path::new(env!("CARGO_BIN_EXE_packwatch")), folder.join("packwatch"));
     if fs::hard_link(built, &own).is_err() {
@@ -18,7 +18,7 @@ fn run(program: &Path, arguments: &[&str], path: &Path) -> Output {
     Command::new(program).args(arguments).env("PATH", path).output().unwrap()
 }
 
-/// A program that prints its arguments, a line each.
+/// Writes a program that prints its arguments, one per line.
 fn put_uplink(folder: &Path, word: &str) {
     let uplink = folder.join("packwatch-uplink");
     fs::write(&uplink, format!("#!/bin/sh\necho {word}\nprintf '%s\\n' \"$@\"\nexit 7\n")).unwrap();
@@ -26,7 +26,7 @@ fn put_uplink(folder: &Path, word: &str) {
 }
 
 #[test]
-fn without_the_uplink_its_commands_name_the_package() {
+fn commands_without_uplink_name_package() {
     let folder = tempfile::tempdir().unwrap();
     let program = alone(folder.path());
     for command in ["mqtt", "kuksa", "vss"] {
@@ -38,7 +38,7 @@ fn without_the_uplink_its_commands_name_the_package() {
 }
 
 #[test]
-fn the_uplink_gets_every_argument_and_gives_its_exit_code() {
+fn uplink_gets_arguments_and_returns_exit_code() {
     let (folder, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let program = alone(folder.path());
     let arguments = ["mqtt", "-c", "a b.toml", "--help", "--log=debug"];
@@ -46,7 +46,7 @@ fn the_uplink_gets_every_argument_and_gives_its_exit_code() {
     let output = run(&program, &arguments, elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "of-path\nmqtt\n-c\na b.toml\n--help\n--log=debug\n");
     assert_eq!(output.status.code(), Some(7));
-    // That beside the program comes first: both are of one version.
+    // The uplink in the program's own folder takes precedence, because both have the same version.
     put_uplink(folder.path(), "beside");
     let output = run(&program, &["vss"], elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "beside\nvss\n");

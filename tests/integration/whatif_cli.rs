@@ -1,11 +1,12 @@
-//! `packwatch whatif` as its user runs it: one replay for all alarm settings, and the alarms each would have raised.
+//! Runs `packwatch whatif` as a user does: one replay for all alarm settings, and the alarms that each would have
+//! raised.
 
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use serde_json::Value;
 
-/// Capacity 2.6 Ah falls by 0.05 Ah per cycle; below 80 % (2.08 Ah) after eleven cycles.
+/// A capacity of 2.6 Ah that fades by 0.05 Ah per cycle falls below 80 % (2.08 Ah) after eleven cycles.
 const CYCLES: &str = "12";
 
 struct Bench {
@@ -46,12 +47,12 @@ fn row(document: &Value, log: usize, setting: usize) -> &Value {
 }
 
 #[test]
-fn one_replay_of_a_grid_equals_a_replay_of_each_setting() {
+fn grid_replay_equals_single_replays() {
     let bench = Bench::new();
     let choices = ["--set", "capacity_low.threshold=2.35,2.2", "--set", "capacity_low.probability=0.5,0.9", "--set"];
     let sweep = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--end-of-life", "80 %", "a.log.gz"]].concat());
     assert_eq!((sweep["replays_per_log"].as_u64(), sweep["settings"].as_array().unwrap().len()), (Some(1), 5));
-    // A key outside the alarms makes each of them a replay of its own; at its default it changes nothing.
+    // A key outside the alarms forces a separate replay for each setting. At its default value it changes nothing.
     let alone = ["estimator.voltage_noise_v=0.005", "--end-of-life", "80 %", "a.log.gz"];
     let alone = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--set"], &alone].concat());
     assert_eq!(alone["replays_per_log"], 2);
@@ -65,7 +66,7 @@ fn one_replay_of_a_grid_equals_a_replay_of_each_setting() {
 }
 
 #[test]
-fn leads_are_those_of_the_truth_beside_the_log() {
+fn lead_times_follow_truth_file() {
     let bench = Bench::new();
     let set = ["--set", "capacity_low.warning=2.35,2.2", "--end-of-life", "2.08", "a.log.gz", "b.log.gz"];
     let document = bench.whatif(&set);
@@ -77,11 +78,11 @@ fn leads_are_those_of_the_truth_beside_the_log() {
         let raised = found["first"]["days"].as_f64().unwrap();
         assert!((found["lead_days"].as_f64().unwrap() - (end - raised)).abs() < 1e-9);
         assert_eq!((&found["missed"], &found["false_alarms"]), (&Value::Bool(false), &Value::from(0)));
-        // A lower threshold never comes earlier.
+        // A lower threshold is never reached earlier.
         let later = row(&document, log, 2)["first"]["days"].as_f64();
         assert!(later.is_none_or(|later| later >= raised), "{later:?} before {raised}");
     }
-    // No end of life: the same raises are false, or open within a horizon longer than the log.
+    // Without an end of life the same raises are false, or undecided if the horizon is longer than the log.
     let healthy = [&set[..3], &["1.0", "a.log.gz"]].concat();
     let document = bench.whatif(&healthy);
     assert_eq!(row(&document, 0, 1)["false_alarms"], row(&document, 0, 1)["raises"]);
@@ -90,7 +91,7 @@ fn leads_are_those_of_the_truth_beside_the_log() {
 }
 
 #[test]
-fn without_a_truth_the_learned_capacity_judges_and_the_table_says_so() {
+fn missing_truth_falls_back_to_learned_capacity() {
     let bench = Bench::new();
     std::fs::remove_file(bench.path("a.truth.csv")).unwrap();
     let more = ["--set", "capacity_low.threshold=2.3", "--end-of-life", "85 %", "a.log.gz"];
@@ -102,7 +103,7 @@ fn without_a_truth_the_learned_capacity_judges_and_the_table_says_so() {
 }
 
 #[test]
-fn the_csv_has_a_row_per_log_setting_and_alarm() {
+fn csv_has_row_per_log_setting_and_alarm() {
     let bench = Bench::new();
     let more = ["--set", "capacity_low.warning=2.3,2.2", "--csv", "rows.csv", "a.log.gz", "b.log.gz"];
     bench.run(&["whatif"], &more).success();
@@ -114,13 +115,13 @@ fn the_csv_has_a_row_per_log_setting_and_alarm() {
 }
 
 #[test]
-fn a_log_that_fails_is_reported_and_the_others_continue() {
+fn failed_log_is_reported_and_others_continue() {
     let bench = Bench::new();
     let printed = bench.run(&["whatif"], &["--set", "capacity_low.warning=2.3", "a.log.gz", "none.log"]).code(1);
     let output = printed.get_output();
     assert!(String::from_utf8_lossy(&output.stderr).contains("none.log: cannot be read"), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
-    // Settings that need a replay each: the next log's are its own.
+    // Settings that need a separate replay must not affect the next log.
     let noises = ["--set", "estimator.voltage_noise_v=0.005,0.01", "none.log", "a.log.gz"];
     let printed = bench.run(&["whatif"], &noises).code(1);
     let output = printed.get_output();
@@ -129,7 +130,7 @@ fn a_log_that_fails_is_reported_and_the_others_continue() {
     std::fs::write(bench.path("other.log"), "(1700000000.000000) can9 123#00\n").unwrap();
     let printed = bench.run(&["whatif"], &["other.log"]).code(1);
     let output = printed.get_output();
-    assert!(output.stdout.is_empty(), "no table of nothing: {output:?}");
+    assert!(output.stdout.is_empty(), "no table without results: {output:?}");
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(stderr.contains("holds no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
     let printed = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);

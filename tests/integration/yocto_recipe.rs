@@ -11,7 +11,7 @@ fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The file name and the text of the one recipe.
+/// File name and text of the only recipe.
 fn recipe() -> (String, String) {
     let folder = repository().join(LAYER).join("recipes-core/packwatch");
     let recipes: Vec<PathBuf> = fs::read_dir(folder)
@@ -19,11 +19,11 @@ fn recipe() -> (String, String) {
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|extension| extension == "bb"))
         .collect();
-    let [path] = recipes.as_slice() else { panic!("{recipes:?}, must be one recipe") };
+    let [path] = recipes.as_slice() else { panic!("found recipes {recipes:?}, must be one") };
     (path.file_name().unwrap().to_str().unwrap().to_owned(), fs::read_to_string(path).unwrap())
 }
 
-/// The words of the value of a variable, without the quotes.
+/// Words of a variable's value, without the quotes.
 fn words<'a>(text: &'a str, variable: &str) -> Vec<&'a str> {
     let (_, rest) =
         text.split_once(&format!("\n{variable} = \"")).unwrap_or_else(|| panic!("the recipe has no {variable}"));
@@ -31,12 +31,12 @@ fn words<'a>(text: &'a str, variable: &str) -> Vec<&'a str> {
 }
 
 #[test]
-fn the_recipes_version_is_the_packages() {
+fn recipe_version_matches_package() {
     assert_eq!(recipe().0, format!("packwatch_{}.bb", env!("CARGO_PKG_VERSION")));
 }
 
 #[test]
-fn every_file_that_the_recipe_installs_exists() {
+fn recipe_installs_existing_files() {
     let (_, text) = recipe();
     let sources: Vec<&str> = text.split_whitespace().filter_map(|word| word.strip_prefix("${S}/")).collect();
     assert!(sources.len() >= 8, "{sources:?}");
@@ -47,7 +47,7 @@ fn every_file_that_the_recipe_installs_exists() {
 }
 
 #[test]
-fn every_unit_of_the_package_is_installed_and_known_to_systemd() {
+fn recipe_installs_every_unit() {
     let (_, text) = recipe();
     let mut units: Vec<String> = fs::read_dir(repository().join("systemd"))
         .unwrap()
@@ -64,14 +64,14 @@ fn every_unit_of_the_package_is_installed_and_known_to_systemd() {
     }
 }
 
-/// Whether a unit runs the program of another package.
+/// Whether a unit runs the uplink's program, which another package provides.
 fn is_of_the_uplink(unit: &str) -> bool {
     let text = fs::read_to_string(repository().join("systemd").join(unit)).unwrap();
     text.contains("ExecStart=/usr/bin/packwatch-uplink ")
 }
 
 #[test]
-fn the_licence_texts_have_the_sums_of_the_recipe() {
+fn licence_checksums_match_recipe() {
     let (_, text) = recipe();
     let texts = words(&text, "LIC_FILES_CHKSUM");
     assert_eq!(texts.len(), 2, "{texts:?}");
@@ -83,7 +83,7 @@ fn the_licence_texts_have_the_sums_of_the_recipe() {
 }
 
 #[test]
-fn the_recipe_builds_what_the_debian_package_builds() {
+fn recipe_builds_same_features_as_debian_package() {
     let (_, text) = recipe();
     let script = fs::read_to_string(repository().join("packaging/program")).unwrap();
     assert_eq!(words(&text, "CARGO_PROFILE"), ["vehicle"]);

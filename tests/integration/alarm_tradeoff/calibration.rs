@@ -1,15 +1,15 @@
-//! Whether what the Monitor says of its own uncertainty is so: stated probabilities against frequencies, errors against
-//! standard deviations.
+//! Checks the uncertainty that the Monitor states: stated probabilities against observed frequencies, capacity errors
+//! against stated standard deviations.
 
 use super::Fleet;
 use super::life::{Life, Look, RATED_AH, THRESHOLD};
 
-/// Edges of the stated probability.
+/// Bin edges of the stated probability.
 pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
-/// Half-cycles at the start of a life that are left out: what was assumed of the capacity is still in them.
+/// Half-cycles skipped at the start of a life, because the assumed initial capacity still affects the estimate.
 const SETTLING: usize = 10;
 
-/// The probability that the truth is below the threshold, as the rule computes it.
+/// Probability that the true capacity is below the threshold, computed as the rule does.
 pub(crate) fn stated(look: &Look) -> f64 {
     0.5 * libm::erfc((look.mean_ah - THRESHOLD * RATED_AH) / (look.std_ah * std::f64::consts::SQRT_2))
 }
@@ -22,7 +22,7 @@ fn looks(lives: &[Life]) -> impl Iterator<Item = &Look> {
     lives.iter().flat_map(|life| life.looks.iter().skip(SETTLING)).filter(|look| look.is_measured)
 }
 
-/// Number of looks, mean stated probability and share truly below the threshold, by stated probability.
+/// For each bin of the stated probability: number of looks, mean stated probability, share truly below the threshold.
 pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     let bin = |edges: &[f64]| {
         let inside = |p: f64| p >= edges[0] && (p < edges[1] || edges[1] == 1.0);
@@ -35,15 +35,16 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     EDGES.windows(2).map(bin).collect()
 }
 
-/// How the capacity's error compares with its stated standard deviation, over the looks at ageing cells.
+/// Capacity errors and their stated standard deviation, over all looks at ageing cells.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
-    /// Percent of rated: mean error, standard deviation of the lives' mean errors, scatter within a life, stated.
+    /// In percent of rated: mean error, standard deviation of each life's mean error, scatter within a life, stated
+    /// deviation.
     pub(crate) mean: f64,
     pub(crate) between_lives: f64,
     pub(crate) within_life: f64,
     pub(crate) stated: f64,
-    /// Shares of looks inside the stated 68 and 95 % intervals.
+    /// Shares of looks within the stated 68 and 95 % intervals.
     pub(crate) inside_68: f64,
     pub(crate) inside_95: f64,
 }
@@ -52,7 +53,7 @@ fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count() as f64
 }
 
-/// Errors of a fleet's ageing lives.
+/// Capacity errors of a fleet's ageing lives.
 pub(crate) fn errors(fleet: &Fleet) -> Errors {
     let percent = |look: &Look| 100.0 * (look.mean_ah - look.true_ah) / RATED_AH;
     let sigmas = |look: &Look| (look.mean_ah - look.true_ah).abs() / look.std_ah;

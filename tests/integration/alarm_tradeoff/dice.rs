@@ -1,13 +1,13 @@
-//! Seeded numbers of a life: uniform, normal, log-normal.
+//! Seeded random numbers for a life: uniform, normal, log-normal.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// One stream of random numbers.
+/// A stream of random numbers.
 pub(crate) struct Dice(ChaCha8Rng);
 
 impl Dice {
-    /// The numbers of one stream of a seed.
+    /// Creates the numbered stream of a seed.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(stream);

@@ -1,14 +1,15 @@
-//! A life judged by one rule: when it was raised, how long before the end, whether the truth was beyond then.
+//! Judges a life by one rule: when the alarm was raised, how long before the end of life, and whether the truth was
+//! then below the threshold.
 
 use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
 
 use super::life::{Life, Look, RATED_AH, THRESHOLD};
 
-/// Cleared this much above the threshold, as by default.
+/// The alarm clears this far above the threshold (the default hysteresis).
 const HYSTERESIS: f64 = 0.02;
 
-/// One of the rules compared.
+/// A rule to compare.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Candidate {
     pub(crate) name: &'static str,
@@ -20,7 +21,7 @@ const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -
     Candidate { name, when, debounce_events }
 }
 
-/// The rules compared. `MONITORED` are also run by the Monitor itself, by severity.
+/// The rules to compare. The Monitor itself also runs those in `MONITORED`, each as one severity.
 pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.05", Comparison::Probability(0.05), 1),
     candidate("p = 0.2", Comparison::Probability(0.2), 1),
@@ -32,37 +33,37 @@ pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.99", Comparison::Probability(0.99), 1),
 ];
 
-/// Candidates that the study's configuration gives to the Monitor as info, warning and severe.
+/// The candidates that the study's configuration gives to the Monitor as info, warning and severe.
 pub(crate) const MONITORED: [usize; 3] = [0, 3, 6];
 pub(crate) const HALF: usize = 2;
 pub(crate) const MEAN: usize = 3;
 pub(crate) const P95: usize = 6;
 
-/// What a rule made of a life.
+/// Outcome of one rule for one life.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Judged {
-    /// The look at which it was raised first.
+    /// The look at which the alarm was first raised.
     pub(crate) first: Option<Look>,
-    /// Raises at which the truth was above the threshold, by any amount, and by more than 1 % of rated.
+    /// Raises while the truth was above the threshold: by any amount, and by more than 1 % of rated.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
-    /// Times it was cleared again before the end of life.
+    /// Times the alarm cleared before the end of life.
     pub(crate) flickers: u32,
 }
 
 impl Judged {
-    /// Whether the first raise came while the truth was still above the threshold by more than `margin` of rated.
+    /// Whether the truth was above the threshold by more than `margin` of rated at the first raise.
     pub(crate) fn is_false(&self, margin: f64) -> bool {
         self.first.is_some_and(|look| look.true_ah > (THRESHOLD + margin) * RATED_AH)
     }
 
-    /// The first raise before the end of life.
+    /// The first raise, if it came before the end of life.
     pub(crate) fn in_time(&self, life: &Life) -> Option<Look> {
         self.first.filter(|look| life.end.is_none_or(|end| look.cycle < end.cycle))
     }
 }
 
-/// What the rule's alarm did at each look of a life.
+/// Alarm change of the rule at each look of a life.
 pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
     let threshold = THRESHOLD * RATED_AH;
     let config = RuleConfig {

@@ -1,8 +1,8 @@
-//! One simulated life: a cell that ages, its usage, its sensors, a model that is somewhat wrong, and its Monitor.
+//! Simulates one life: an ageing cell, its usage, its sensors, a slightly wrong model, and a Monitor.
 //!
-//! Out: what the Monitor said of the capacity after each half-cycle, beside the truth, and which of its own alarms it
-//! raised there. The same life (cell, usage, errors of the model) is lived with every sensor set; only what is drawn for
-//! the sensors differs, and that by its size alone.
+//! Records the Monitor's capacity estimate and the true capacity after each half-cycle, and the Monitor's own alarms.
+//! The same life (cell, usage, model errors) is simulated with every sensor set. Only the sensor errors differ, and
+//! only in size.
 
 use std::path::Path;
 
@@ -18,21 +18,21 @@ use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
 use super::dice::Dice;
 
 pub(crate) const RATED_AH: f64 = 2.6;
-/// Parts of the rated capacity: the alarm's threshold, and the end of life.
+/// As parts of the rated capacity: the alarm threshold and the end of life.
 pub(crate) const THRESHOLD: f64 = 0.80;
 pub(crate) const END_OF_LIFE: f64 = 0.70;
 
-/// Between two readings, s.
+/// Interval between two readings, s.
 const SAMPLE_S: f64 = 10.0;
-/// The load is switched this long after the last reading before, s: no reading stands for two loads.
+/// The load changes this long after the previous reading, s, so each reading covers a single load.
 const SWITCH_S: f64 = 0.1;
-/// Ticks per reading: without any for 5 s the Monitor takes the computer to have been asleep.
+/// Ticks per reading. After 5 s without a tick the Monitor assumes that the computer was suspended.
 const TICKS: u32 = 4;
-/// An ageing cell is followed for this many half-cycles beyond its end; a healthy one would come near the threshold.
+/// An ageing cell is simulated for this many half-cycles after its end of life.
 const AFTERLIFE: u32 = 4;
-/// A charge at constant voltage ends at this current, A.
+/// A constant-voltage charge ends at this current, A.
 const TAPER_END_A: f64 = RATED_AH / 10.0;
-/// Charge moved in one cycle on average, relative to the rated capacity: what turns cycles into ampere-hours.
+/// Average charge moved per cycle, relative to the rated capacity. Converts cycles into ampere-hours.
 const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;
 
 /// Streams of a life's random numbers.
@@ -40,8 +40,8 @@ const CELL: u64 = 0;
 const USAGE: u64 = 1;
 const SENSORS: u64 = 2;
 
-/// What is known of a sensor set. Offsets and gains are standard deviations over the lives: each life's sensors have
-/// their own, for good. Noise is white, per reading.
+/// Accuracy of a sensor set. Offsets and gains are standard deviations over the lives; each life keeps its own offset
+/// and gain. Noise is white, per reading.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SensorSet {
     pub(crate) name: &'static str,
@@ -91,40 +91,40 @@ pub(crate) const SENSOR_SETS: [SensorSet; 3] = [
     },
 ];
 
-/// Which lives.
+/// Kind of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// Fades through the threshold to its end.
+    /// Fades below the threshold until the end of life.
     Ageing,
     /// Stays above the threshold.
     Healthy,
 }
 
-/// What the Monitor said after one half-cycle, and what was true.
+/// The Monitor's estimate and the truth after one half-cycle.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Look {
     pub(crate) time: Timestamp,
-    /// Cycles so far: half-cycles over two.
+    /// Cycles so far (two half-cycles make a cycle).
     pub(crate) cycle: f64,
-    /// Equivalent full cycles so far: charge moved over twice the rated capacity.
+    /// Equivalent full cycles so far: charge moved divided by twice the rated capacity.
     pub(crate) full_cycles: f64,
     pub(crate) true_ah: f64,
     pub(crate) mean_ah: f64,
     pub(crate) std_ah: f64,
-    /// Whether the half-cycle carried information: else no rule is asked.
+    /// Whether the half-cycle carried information. If not, no rule is evaluated.
     pub(crate) is_measured: bool,
-    /// What the Monitor's own alarms of severity info, warning and severe did here.
+    /// Changes of the Monitor's own alarms of severity info, warning and severe.
     pub(crate) reported: [Option<Change>; 3],
 }
 
-/// Where in a life something happened.
+/// Time within a life.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Place {
     pub(crate) cycle: f64,
     pub(crate) full_cycles: f64,
 }
 
-/// A life as it was lived.
+/// The recorded course of a life.
 #[derive(Debug, Clone)]
 pub(crate) struct Life {
     pub(crate) looks: Vec<Look>,
@@ -133,7 +133,7 @@ pub(crate) struct Life {
     pub(crate) resets: u32,
 }
 
-/// How the capacity falls: from `start` by `loss * x^curvature`, x = charge moved over `span_ah`.
+/// Capacity fade: from `start`, by `loss * x^curvature`, where x = charge moved / `span_ah`.
 #[derive(Debug, Clone, Copy)]
 struct Fade {
     start: f64,
@@ -164,7 +164,7 @@ impl Fade {
         RATED_AH * (self.start - self.loss * libm::pow(moved_ah / self.span_ah, self.curvature))
     }
 
-    /// What a charge of `ah` takes from here on, per Ah.
+    /// Fade and resistance growth per Ah for the next `ah` of charge.
     fn ageing(&self, moved_ah: f64, ah: f64) -> Ageing {
         Ageing {
             capacity_loss_ah_per_ah: (self.capacity_ah(moved_ah) - self.capacity_ah(moved_ah + ah)) / ah,
@@ -174,7 +174,7 @@ impl Fade {
     }
 }
 
-/// The Monitor's configuration for a sensor set whose data sheet is known.
+/// The Monitor's configuration, assuming the sensor set's data sheet.
 pub(crate) fn configuration(set: &SensorSet) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let numbers = [
@@ -192,7 +192,7 @@ pub(crate) fn configuration(set: &SensorSet) -> MonitorConfig {
     config.monitor
 }
 
-/// The cell as it really is, seen from the model the estimator has: a few mV and a few percent beside it.
+/// The true cell: the estimator's model changed by a few mV and a few percent.
 fn true_model(model: &CellModel, dice: &mut Dice) -> CellModel {
     let mut truth = model.clone();
     let common_v = dice.normal(0.002);
@@ -212,7 +212,7 @@ fn true_model(model: &CellModel, dice: &mut Dice) -> CellModel {
     truth
 }
 
-/// One life being lived.
+/// A simulation in progress.
 struct Rig {
     fade: Fade,
     pack: Pack,
@@ -227,7 +227,7 @@ struct Rig {
     life: Life,
 }
 
-/// A life's sensors: what was drawn for good, and the dice for the noise.
+/// A life's sensors: fixed errors drawn once, and the random numbers for the noise.
 struct Sensors {
     set: SensorSet,
     gain: f64,
@@ -263,7 +263,7 @@ impl Sensors {
     }
 }
 
-/// Lives one life to its end.
+/// Simulates one life to its end.
 pub(crate) fn live(config: &MonitorConfig, set: &SensorSet, kind: Kind, seed: u64) -> Life {
     let mut rig = Rig::new(config, set, kind, seed);
     let mut after = 0;
@@ -319,7 +319,7 @@ impl Rig {
         Place { cycle: f64::from(self.half_cycles) / 2.0, full_cycles: self.truth().throughput_ah / (2.0 * RATED_AH) }
     }
 
-    /// Discharge, pause, charge, pause: a partial swing of 30 to 80 % at currents and a temperature of its own.
+    /// One cycle: discharge, pause, charge, pause; a swing of 30 to 80 % with random currents and a random temperature.
     fn cycle(&mut self) {
         let usage = &mut self.usage;
         let (low, high) = (usage.uniform(0.12, 0.38), usage.uniform(0.68, 0.92));
@@ -347,7 +347,7 @@ impl Rig {
         self.pause(current_a, pauses_s[1]);
     }
 
-    /// The fade of the next half-cycle, as steep as its curve is here.
+    /// Applies the fade curve's current slope to the next half-cycle.
     fn age(&mut self) {
         let moved_ah = self.truth().throughput_ah;
         self.pack.set_ageing(self.fade.ageing(moved_ah, 0.5 * MOVED_PER_CYCLE * RATED_AH));
@@ -361,7 +361,7 @@ impl Rig {
         self.step(0.0, SWITCH_S);
     }
 
-    /// One reading at `current_a`, which flows for `dt_s` from there.
+    /// One reading at `current_a`, which then flows for `dt_s`.
     fn step(&mut self, current_a: f64, dt_s: f64) {
         let (voltage_v, temperature_c) = (self.pack.lowest_v(current_a), self.truth().temperature_c);
         let readings = self.sensors.read(current_a, voltage_v, temperature_c);
@@ -380,7 +380,7 @@ impl Rig {
         self.pack.step(current_a, dt_s);
         self.time = time.plus_secs(dt_s);
         let (mut place, health) = (self.place(), self.truth().capacity_ah / RATED_AH);
-        place.cycle += 0.5; // dated to the end of the half-cycle it falls in: the first moment anybody could know
+        place.cycle += 0.5; // dated to the end of the half-cycle, when the crossing could first be known
         let (life, beyond) = (&mut self.life, |limit: f64| (health < limit).then_some(place));
         life.crossing = life.crossing.or(beyond(THRESHOLD));
         life.end = life.end.or(beyond(END_OF_LIFE));

@@ -1,9 +1,9 @@
-//! Lead time against false alarms: `when = "mean"` beside `when = { probability = p }`, on simulated lives.
+//! Lead time against false alarms on simulated lives, for `when = "mean"` and `when = { probability = p }`.
 //!
-//! Each life goes through the whole core in this process: a cell that fades its own way, sensors with errors of their
-//! own, frames, Monitor. What the Monitor said of the capacity is then judged by every rule; three of the rules run in
-//! the Monitor itself and must do the same there. A few lives are judged on every run; the whole study (200 lives and
-//! 100 that stay healthy, by three sensor sets) writes `tests/alarm_tradeoff.md`, in some minutes:
+//! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
+//! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself runs three of the rules and
+//! must agree. Each test run judges a few lives. The whole study (200 ageing and 100 healthy lives, each with three
+//! sensor sets) writes `tests/alarm_tradeoff.md` and takes some minutes:
 //! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --release --test integration alarm_tradeoff -- --nocapture`
 
 mod calibration;
@@ -19,19 +19,19 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use judged::{CANDIDATES, HALF, MEAN, MONITORED, P95, judge};
 use life::{Kind, Life, SENSOR_SETS, SensorSet};
 
-/// Lives of the whole study, per sensor set.
+/// Ageing lives of the whole study, per sensor set.
 const LIVES: usize = 200;
-/// Lives that stay healthy beside them.
+/// Healthy lives of the whole study, per sensor set.
 const HEALTHY: usize = 100;
 /// Seeds: the n-th ageing life has `AGEING_SEED + n`, the n-th healthy one `HEALTHY_SEED + n`.
 const AGEING_SEED: u64 = 1_000;
 const HEALTHY_SEED: u64 = 5_000;
-/// Lives of each kind that every run judges.
+/// Ageing and healthy lives that every test run judges.
 const QUICK: (usize, usize) = (6, 3);
 
 const WRITE: &str = "PACKWATCH_WRITE_TRADEOFF";
 
-/// All lives seen by one sensor set.
+/// All lives simulated with one sensor set.
 struct Fleet {
     set: &'static SensorSet,
     ageing: Vec<Life>,
@@ -53,10 +53,13 @@ impl Fleet {
         self.ageing.iter().chain(&self.healthy)
     }
 
-    /// What must hold whatever the sensors.
+    /// Checks what must hold for every sensor set.
     fn check(&self) {
-        assert!(self.ageing.iter().all(|life| life.crossing.is_some() && life.end.is_some()), "every life ends");
-        assert!(self.healthy.iter().all(|life| life.crossing.is_none()), "healthy cells stay above");
+        assert!(
+            self.ageing.iter().all(|life| life.crossing.is_some() && life.end.is_some()),
+            "every ageing cell crosses the threshold and reaches its end"
+        );
+        assert!(self.healthy.iter().all(|life| life.crossing.is_none()), "a healthy cell crossed the threshold");
         for life in self.all() {
             for (severity, rule) in MONITORED.into_iter().enumerate() {
                 let reported: Vec<_> = life.looks.iter().map(|look| look.reported[severity]).collect();
@@ -68,15 +71,15 @@ impl Fleet {
                 );
             }
             let firsts = CANDIDATES.map(|rule| judge(&rule, life).first.map_or(f64::INFINITY, |look| look.cycle));
-            assert_eq!(firsts[HALF], firsts[MEAN], "one half is the mean");
+            assert_eq!(firsts[HALF], firsts[MEAN], "p = 0.5 must equal the mean rule");
             let by_level: Vec<f64> =
                 firsts.iter().zip(&CANDIDATES).filter(|(_, rule)| rule.debounce_events == 1).map(|(f, _)| *f).collect();
-            assert!(by_level.is_sorted(), "a higher probability is never reached earlier: {by_level:?}");
+            assert!(by_level.is_sorted(), "a higher probability was reached earlier: {by_level:?}");
         }
     }
 }
 
-/// `work(0..count)` on every processor, results in order.
+/// Runs `work(0..count)` on all processors. Results are in order.
 fn in_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
     let (next, done) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(count)));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
@@ -89,18 +92,18 @@ fn in_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T
                         break;
                     }
                     let result = work(n);
-                    done.lock().expect("no thread panics while it holds this").push((n, result));
+                    done.lock().expect("no thread panics while it holds this lock").push((n, result));
                 }
             });
         }
     });
-    let mut done = done.into_inner().expect("no thread panics while it holds this");
+    let mut done = done.into_inner().expect("no thread panics while it holds this lock");
     done.sort_by_key(|(n, _)| *n);
     done.into_iter().map(|(_, result)| result).collect()
 }
 
 #[test]
-fn a_higher_probability_is_reached_later_and_with_fewer_false_alarms() {
+fn higher_probability_raises_later_with_fewer_false_alarms() {
     let fleet = Fleet::live(&SENSOR_SETS[1], QUICK.0, QUICK.1);
     fleet.check();
     let early = |rule: usize| fleet.ageing.iter().filter(|life| judge(&CANDIDATES[rule], life).is_false(0.0)).count();
@@ -116,7 +119,7 @@ fn a_higher_probability_is_reached_later_and_with_fewer_false_alarms() {
 }
 
 #[test]
-fn the_whole_study_is_written_when_asked_for() {
+fn whole_study_is_written_on_request() {
     if std::env::var_os(WRITE).is_none() {
         println!("skipped: {WRITE} is not set");
         return;

@@ -1,4 +1,4 @@
-//! What the study found, as the tables of `tests/alarm_tradeoff.md`.
+//! Prints the results of the study as the tables of `tests/alarm_tradeoff.md`.
 
 use std::fmt::Write as _;
 
@@ -7,7 +7,7 @@ use super::calibration::{EDGES, bins, errors};
 use super::judged::{CANDIDATES, Candidate, Judged, judge};
 use super::life::Life;
 
-/// 5 %, half and 95 % of the values.
+/// The 5 %, 50 % and 95 % quantiles of the values.
 fn range(mut values: Vec<f64>, digits: usize) -> String {
     values.sort_by(f64::total_cmp);
     let Some(last) = values.len().checked_sub(1) else { return "-".to_owned() };
@@ -48,7 +48,7 @@ fn row(fleet: &Fleet, rule: &Candidate) -> String {
     )
 }
 
-/// One line per rule.
+/// Table with one line per rule.
 pub(crate) fn rules_table(fleet: &Fleet) -> String {
     let mut text = "| rule | lead, cycles | lead, equivalent full cycles | delay, cycles | first raise true | false \
                     raises | by > 1 % | healthy cells raised | by > 1 % | flickers per life | missed |\n\
@@ -63,7 +63,7 @@ pub(crate) fn document(fleets: &[Fleet]) -> String {
     let mut text = include_str!("head.md").to_owned();
     for fleet in fleets {
         let set = fleet.set;
-        write!(text, "\n### {} sensors\n\n{}", set.name, rules_table(fleet)).expect("a String takes all");
+        write!(text, "\n### {} sensors\n\n{}", set.name, rules_table(fleet)).expect("writing to a String cannot fail");
     }
     text += include_str!("calibration.md");
     text += "\n| sensors | mean error | error that stays for a life (standard deviation) | scatter within a life | stated standard deviation | inside 68 % | inside 95 % |\n| --- | --- | --- | --- | --- | --- | --- |\n";
@@ -80,7 +80,7 @@ pub(crate) fn document(fleets: &[Fleet]) -> String {
             100.0 * e.inside_68,
             100.0 * e.inside_95
         )
-        .expect("a String takes all");
+        .expect("writing to a String cannot fail");
     }
     text += "\n| stated probability | ";
     fleets.iter().for_each(|fleet| text += &format!("{}: looks | said | true | ", fleet.set.name));
@@ -88,10 +88,11 @@ pub(crate) fn document(fleets: &[Fleet]) -> String {
     fleets.iter().for_each(|_| text += " --- | --- | --- |");
     let columns: Vec<_> = fleets.iter().map(bins).collect();
     for (index, edges) in EDGES.windows(2).enumerate() {
-        write!(text, "\n| {} to {} |", edges[0], edges[1]).expect("a String takes all");
+        write!(text, "\n| {} to {} |", edges[0], edges[1]).expect("writing to a String cannot fail");
         for column in &columns {
             let (count, said, found) = column[index];
-            write!(text, " {count} | {:.1} % | {:.1} % |", 100.0 * said, 100.0 * found).expect("a String takes all");
+            write!(text, " {count} | {:.1} % | {:.1} % |", 100.0 * said, 100.0 * found)
+                .expect("writing to a String cannot fail");
         }
     }
     text + "\n"

@@ -1,4 +1,4 @@
-//! A sender of authenticated commands as the manual describes it, an attacker's material, and a bus between them and the core.
+//! A sender of authenticated commands built from the manual's description, and a bus that connects it to the core.
 
 use std::cell::RefCell;
 
@@ -19,14 +19,14 @@ pub(crate) const REPLY: u32 = 0x6B5;
 const COMMAND_ID: u16 = 0x0321;
 const FRESHNESS_ID: u16 = 0x0322;
 const BUS: BusIndex = BusIndex(0);
-/// A wall clock of 2027.
+/// Wall-clock time at the start, in 2027.
 const START_MS: i64 = 1_800_000_000_000;
 
 pub(crate) fn key(byte: u8) -> CanKey {
     CanKey::parse(&[byte, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]).unwrap()
 }
 
-/// Commands with a profile, in place of the unauthenticated ones.
+/// A configuration with the authentication profile instead of unauthenticated commands.
 pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     let secoc = format!("secoc = \"{profile}\"\n");
     let fd = if profile == "fd" { "fd = true\n" } else { "" };
@@ -36,7 +36,7 @@ pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     config_texts::load(&format!("{pack}{tables}{more}"), DBC).monitor
 }
 
-/// The sender. It keeps nothing over a restart: [`Ecu::new`] again.
+/// The sender. It keeps no state across a restart: create a new one with [`Ecu::new`].
 pub(crate) struct Ecu {
     key: CanKey,
     pub(crate) authentication: Authentication,
@@ -51,7 +51,7 @@ impl Ecu {
         Self { key, authentication, next: None, announced: 0 }
     }
 
-    /// Takes an announcement: only a right one, and only a higher one.
+    /// Handles an announcement: ignores it if its authenticator is wrong or its freshness is not higher.
     pub(crate) fn hear(&mut self, frame: &Frame) {
         if frame.id() != CanId::standard(FRESHNESS).unwrap() {
             return;
@@ -69,14 +69,14 @@ impl Ecu {
         }
     }
 
-    /// A command; `None` = the announced values are used up.
+    /// Makes a command; `None` if the announced values are used up.
     pub(crate) fn command(&mut self, command: u8, cell: u16) -> Option<Frame> {
         let freshness = self.next.filter(|next| *next < self.announced + 16)?;
         self.next = Some(freshness + 1);
         Some(self.made(command, cell, freshness))
     }
 
-    /// A command with any freshness.
+    /// Makes a command with the given freshness.
     pub(crate) fn made(&self, command: u8, cell: u16, freshness: u64) -> Frame {
         let codes = u32::from(command) | 31 << 4 | u32::from(cell) << 11;
         let mut payload = codes.to_le_bytes().to_vec();
@@ -93,21 +93,21 @@ pub(crate) fn frame_of(payload: &[u8]) -> Frame {
     if payload.len() <= 8 { Frame::classic(id, payload) } else { Frame::fd(id, false, false, payload) }.unwrap()
 }
 
-/// A tick, or a frame and the freshness of its right authenticator.
+/// A tick (`None`), or a frame with the freshness if its authenticator is right.
 pub(crate) type JournalLine = Option<(Frame, Option<u64>)>;
 
-/// The daemon on a bus, driven by hand.
+/// The daemon on a simulated bus, with manual time.
 pub(crate) struct Daemon {
     pub(crate) config: MonitorConfig,
     pub(crate) monitor: Monitor,
     key: CanKey,
     out: Outputs,
     pub(crate) ms: i64,
-    /// Frames it sent with the last input, with their authenticators.
+    /// Frames sent in response to the last input, with their authenticators.
     pub(crate) sent: Vec<Frame>,
-    /// Commands executed, ever.
+    /// Commands executed since the start.
     pub(crate) executed: u64,
-    /// Inputs as a journal has them, when wanted.
+    /// Inputs as a journal stores them; `None` = not recorded.
     pub(crate) journal: Option<Vec<(i64, JournalLine)>>,
     pub(crate) macs: RefCell<u64>,
 }
@@ -133,7 +133,7 @@ impl Daemon {
         Timestamp::from_nanos(self.ms * 1_000_000)
     }
 
-    /// Lets time pass, with a tick every 10 ms.
+    /// Advances the time, with a tick every 10 ms.
     pub(crate) fn pass(&mut self, ms: i64) {
         self.sent.clear();
         for _ in 0..ms / 10 {
@@ -146,7 +146,7 @@ impl Daemon {
         }
     }
 
-    /// Gives it a command frame; whether it was executed.
+    /// Delivers a command frame. Returns whether it was executed.
     pub(crate) fn receive(&mut self, frame: &Frame) -> bool {
         self.sent.clear();
         let before = self.executed;
@@ -179,7 +179,7 @@ impl Daemon {
         self.monitor.authenticated_commands().unwrap().2
     }
 
-    /// Kills it and starts it again from a stored state, `away_ms` later.
+    /// Kills the daemon and restarts it from a stored state after `away_ms`.
     pub(crate) fn restart(&mut self, stored: Snapshot, downtime: Downtime, away_ms: i64) {
         self.ms += away_ms;
         self.monitor = Monitor::new(self.config.clone());

@@ -20,7 +20,7 @@ pub(crate) struct Swing {
     pub(crate) y_variance: f64,
 }
 
-/// How the sums become a capacity.
+/// Estimation method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Method {
     Wls,
@@ -32,7 +32,7 @@ pub(crate) enum Method {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer {
     pub(crate) method: Method,
-    /// Fading memory, 1 = none fades.
+    /// Fading memory factor; 1 = no fading.
     pub(crate) gamma: f64,
     c: [f64; 6],
     x_information: f64,
@@ -40,8 +40,8 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
-    /// Starts from a capacity believed, as Plett does: by a whole swing (x = 1) of that charge, the deviation shared
-    /// between both sides.
+    /// Starts from a prior capacity as Plett does: one full swing (x = 1) with that charge. The prior's deviation is
+    /// split between both sides.
     pub(crate) fn new(method: Method, gamma: f64, start: ScalarGaussian) -> Self {
         let mut peer = Self { method, gamma, c: [0.0; 6], x_information: 0.0, y_information: 0.0 };
         let y_variance = 0.5 * start.variance;
@@ -52,7 +52,7 @@ impl Peer {
 
     pub(crate) fn take(&mut self, swing: &Swing) {
         let Swing { x, x_variance, y_ah: y, y_variance } = *swing;
-        // With errors in y alone, those of x count as y's: by the capacity known so far.
+        // WLS has errors in y only, so convert the errors in x to y with the current capacity estimate.
         let y_variance = match self.method {
             Method::Wls => {
                 let q = if self.c[0] > 0.0 { self.c[1] / self.c[0] } else { y / x };
@@ -82,7 +82,7 @@ impl Peer {
         }
     }
 
-    /// K: ratio of the swings' deviations of x and y, by their information where it differs from swing to swing.
+    /// K: ratio of the deviations of x and y; if the ratio varies between swings, the information-weighted one.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }
@@ -94,12 +94,13 @@ impl Peer {
     }
 }
 
-/// Minimum of (c3 - 2 c2 Q + c1 Q^2) / (1 + k^2 Q^2): errors of both sides in the fixed ratio k = sx/sy.
+/// Minimum of (c3 - 2 c2 Q + c1 Q^2) / (1 + k^2 Q^2): errors in both variables with the fixed ratio k = sx/sy.
 fn tls([c1, c2, c3]: [f64; 3], k: f64) -> ScalarGaussian {
     let k2 = k * k;
     let half = c1 - k2 * c3;
     let q = (-half + (half * half + 4.0 * k2 * c2 * c2).sqrt()) / (2.0 * k2 * c2);
-    // At the minimum the slope's numerator N = k2 c2 Q^2 + half Q - c2 vanishes: the curvature is 2 N' / (1 + k2 Q^2)^2.
+    // At the minimum the numerator of the slope, N = k2 c2 Q^2 + half Q - c2, vanishes, so the curvature is 2 N' / (1 +
+    // k2 Q^2)^2.
     let spread = 1.0 + k2 * q * q;
     let curvature = 2.0 * (2.0 * k2 * c2 * q + half) / (spread * spread);
     ScalarGaussian { mean: q, variance: 2.0 / curvature }
@@ -110,8 +111,9 @@ fn awtls_cost([c1, c2, c3, c4, c5, c6]: &[f64; 6], q: f64) -> f64 {
     ((((c4 * q - 2.0 * c5) * q + (c1 + c6)) * q - 2.0 * c2) * q + c3) / (q * q + 1.0).powi(2)
 }
 
-/// The least of that cost over its stationary points: the cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with the quartic
-/// P = c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2, and its second 2 P' / (Q^2 + 1)^3 there.
+/// Minimum of that cost over its stationary points. The cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with the quartic P =
+/// c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2; at a root its second derivative is 2 P' /
+/// (Q^2 + 1)^3.
 fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     let [c1, c2, c3, c4, c5, c6] = *c;
     let p = [c5, 2.0 * c4 - c1 - c6, 3.0 * (c2 - c5), c1 - 2.0 * c3 + c6, -c2];
@@ -124,7 +126,7 @@ fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     ScalarGaussian { mean: q, variance: (q * q + 1.0).powi(3) / slope(q) }
 }
 
-/// Where a polynomial crosses zero upwards over (0, inf): sought in Q = tan(angle), the whole half-line in equal steps.
+/// Upward zero crossings of a polynomial over (0, inf). Searches in equal steps of angle, with Q = tan(angle).
 fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec<f64> {
     const STEPS: u32 = 2000;
     let at = |k: u32| (f64::from(k) / f64::from(STEPS) * std::f64::consts::FRAC_PI_2).tan();
@@ -156,7 +158,7 @@ fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec
 mod tests {
     use super::*;
 
-    /// Uniform numbers in [0, 1): splitmix64; twelve of them less six are normal enough.
+    /// Uniform numbers in [0, 1) by splitmix64. Twelve of them minus six approximate a normal number.
     struct Random(u64);
 
     impl Random {
@@ -173,7 +175,7 @@ mod tests {
         }
     }
 
-    /// Swings of a 10 Ah cell with stated deviations, and what errors of them really came.
+    /// Swings of a 10 Ah cell with the stated deviations and errors drawn from them.
     fn swings(random: &mut Random, count: usize, even: bool) -> Vec<Swing> {
         let one = |random: &mut Random| {
             let wide = if even { 1.0 } else { 0.5 + random.uniform() };
@@ -191,20 +193,20 @@ mod tests {
         peer
     }
 
-    /// Smallest of `f` over [low, high]: the finest of three nested grids.
+    /// Minimum of `f` over [low, high] by three nested grids.
     fn brute_force(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> f64 {
         let mut best = low;
         for _ in 0..4 {
             let step = (high - low) / 2000.0;
             let points = (0..=2000).map(|k| low + f64::from(k) * step);
-            best = points.min_by(|a, b| f(*a).total_cmp(&f(*b))).expect("there are points");
+            best = points.min_by(|a, b| f(*a).total_cmp(&f(*b))).expect("a grid has points");
             (low, high) = (best - step, best + step);
         }
         best
     }
 
     #[test]
-    fn awtls_is_the_brute_force_minimum_of_its_cost_over_the_swings_themselves() {
+    fn awtls_matches_brute_force_minimum() {
         for (seed, gamma) in [(1, 1.0), (2, 0.95), (3, 0.8)] {
             let (start, list) = (ScalarGaussian::from_std(8.0, 1.0), swings(&mut Random(seed), 40, false));
             let peer = run(Method::Awtls, gamma, start, &list);
@@ -228,16 +230,16 @@ mod tests {
     }
 
     #[test]
-    fn awtls_is_tls_where_all_deviations_have_one_ratio() {
+    fn awtls_equals_tls_for_constant_ratio() {
         let list = swings(&mut Random(7), 30, true);
-        // A start whose deviations have the swings' ratio too: 10 Ah.
+        // A prior with the same ratio of deviations as the swings: 10 Ah.
         let [a, b] =
             [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
         assert!((a.mean - b.mean).abs() < 1e-9 && (a.variance / b.variance - 1.0).abs() < 1e-9, "{a:?} {b:?}");
     }
 
     #[test]
-    fn both_total_least_squares_are_unbiased_and_their_intervals_hold_on_swings_as_they_assume() {
+    fn total_least_squares_is_unbiased_with_valid_intervals() {
         let mut random = Random(11);
         let mut mean = [0.0; 3];
         let mut covered = [0.0; 3];
@@ -252,7 +254,7 @@ mod tests {
         println!("mean of 200 runs (true 10 Ah): WLS, TLS, AWTLS {mean:.4?}, covered {covered:.3?}");
         assert!((mean[1] - 10.0).abs() < 0.005 && (mean[2] - 10.0).abs() < 0.005, "{mean:?}");
         assert!(covered[1] > 0.9 && covered[2] > 0.9, "{covered:?}");
-        // Noise in x pulls the slope down by sx^2 / <x^2>, here 3.5 parts in 10^4.
+        // Noise in x reduces the slope by sx^2 / <x^2>, here 3.5 parts in 10^4.
         assert!(mean[0] < mean[2], "{mean:?}");
     }
 }

@@ -1,6 +1,7 @@
-//! Whole measured lives (NASA PCoE B0005, B0006), whole and in windows, against their published capacities.
+//! Whole measured lives (NASA PCoE B0005, B0006), complete and in windows, against their published capacities.
 //!
-//! Discharges count from 1, scores from number 11; published values first fall below 1.4 Ah at 125 and 109.
+//! Discharges are numbered from 1; scores start at number 11. The published capacity first falls below 1.4 Ah at
+//! discharge 125 (B0005) and 109 (B0006).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -25,7 +26,7 @@ fn discharges(folder: &Path, cell: &str) -> Vec<(f64, f64)> {
     rows.map(|row| (seconds(&row[2]), row[4].parse().unwrap())).collect()
 }
 
-/// `2008-04-02T15:25:41.593` as UTC; all of the record is in April and May 2008.
+/// Parses `2008-04-02T15:25:41.593` as UTC. The whole record lies in April and May 2008.
 fn seconds(stamp: &str) -> f64 {
     let number = |from: usize, to: usize| stamp[from..to].parse::<f64>().unwrap();
     let days = number(8, 10) - 1.0 + if number(5, 7) == 5.0 { 30.0 } else { 0.0 };
@@ -36,7 +37,7 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// The shipped configuration of `cell`, started at this part of its capacity.
+/// The shipped configuration of `cell`, with this fraction of its capacity as the initial value.
 fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -47,7 +48,7 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let new_ah = if cell == "B0005" { 1.9216 } else { 2.1059 };
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
     if held {
-        // No nominal measurement moves it either.
+        // Nominal measurements must not change the capacity either.
         let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
         text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
     }
@@ -73,7 +74,7 @@ struct Life {
     filter: Vec<(f64, Source)>,
     outer: Vec<(f64, Source)>,
     loaded: Vec<(f64, Source)>,
-    /// The ends of `loaded` with the filter's SOC.
+    /// The filter's SOC at the ends of `loaded`.
     filter_at_ends: Vec<(f64, Source)>,
 }
 
@@ -155,7 +156,7 @@ impl Life {
         let number = |key: &str| event[key].as_f64().unwrap();
         let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
-        // The initial SOC that makes the monitor report it again.
+        // Find the initial SOC for which the monitor reports the same value again.
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
@@ -170,7 +171,8 @@ impl Life {
         self.config.health.usable.as_ref().unwrap()
     }
 
-    /// What a capacity makes usable, the resistance's doubt included (its correlation with a peer's capacity is not known).
+    /// Usable capacity for a given capacity. Includes the uncertainty of the resistance; its correlation with a peer's
+    /// capacity is unknown.
     fn made_usable(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
@@ -213,7 +215,7 @@ fn print(life: &str, name: &str, source: &str, (score, below): (Score, Option<us
     );
 }
 
-/// Prints ours; its score.
+/// Prints the product's row and returns its score.
 fn print_ours(name: &str, life: &Life) -> Score {
     assert!(life.reported.len() > 145, "{name}: {} discharges", life.reported.len());
     let ours = life.ours();
@@ -221,7 +223,7 @@ fn print_ours(name: &str, life: &Life) -> Score {
     ours.0
 }
 
-/// Prints the peers on one source of swings; each one's score.
+/// Prints the peers' rows for one source of swings and returns their scores.
 fn print_peers(name: &str, source: &str, life: &Life, swings: &[(f64, Source)]) -> Vec<Score> {
     let score = |&(peer, method, gamma): &(&str, Method, f64)| {
         let scored = life.scored(&life.peer((method, gamma), swings));
@@ -240,16 +242,17 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// What the best peer on the filter's own SOC, which has been counted with the capacity learned here, may be ahead by, Ah.
+/// Margin by which the best peer may lead on the filter's own SOC, Ah. That SOC was counted with the capacity learned
+/// here.
 const NEAR_AH: f64 = 0.006;
 
-/// What the best peer on the voltages, its memory chosen by the result, may be ahead by, Ah: an eighth of a percent of the
-/// capacity.
+/// Margin by which the best peer may lead on the voltages, Ah. Its memory is chosen afterwards by the result. Equals an
+/// eighth of a percent of the capacity.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn usable_capacity_of_whole_lives_is_no_worse_than_by_any_least_squares_on_their_swings() {
+fn usable_capacity_of_whole_lives_matches_best_peer() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     heading();
@@ -267,13 +270,14 @@ fn usable_capacity_of_whole_lives_is_no_worse_than_by_any_least_squares_on_their
     }
 }
 
-/// What the best of the peers, its memory chosen by the result, may be ahead by over all windows: here they are level.
+/// Factor by which the best peer, its memory chosen afterwards by the result, may lead over all windows.
 const LEVEL: f64 = 1.1;
 
-/// The filter's swings are those at the same ends here: behind a gap, swing and charge of a `half_cycle` can disagree.
+/// Here the filter's swings use the same ends as the voltage swings: after a gap, swing and charge of a `half_cycle`
+/// can disagree.
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
-fn usable_capacity_from_windows_is_level_with_the_best_least_squares_on_them() {
+fn usable_capacity_from_windows_matches_best_peer() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
     let rows = folder.path().join("windows.csv");
@@ -296,7 +300,8 @@ fn usable_capacity_from_windows_is_level_with_the_best_least_squares_on_them() {
         best_ah = best_ah.min(score.mean_absolute);
     }
     assert!(ours.mean_absolute <= LEVEL * best_ah, "{ours:?}, the best peer {best_ah}");
-    // More than any peer's, and too little: faults of the curve that differ between the ends are not in the interval.
+    // Coverage exceeds every peer's but is still too low: the interval does not include curve errors that differ
+    // between the ends.
     assert!(ours.covered > 0.5, "{ours:?}");
 }
 

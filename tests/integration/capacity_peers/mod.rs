@@ -1,11 +1,12 @@
-//! The capacity of `packwatch` beside recursive total least squares (Plett 2011) on the same swings.
+//! Compares packwatch's capacity with recursive total least squares (Plett 2011) on the same swings.
 //!
-//! Sources of swings for the peers: `filter`, the filter's own SOC at both ends (event `half_cycle`, with its deviation; in
-//! windows the same ends as below); `voltage`, both ends by inversion of the open-circuit curve (`swings`); `filter, capacity
-//! held`, the filter's SOC counted throughout with the wrong capacity it was started with. The second leans on the
-//! capacity in use only for the curve's change of shape.
-//! Measured lives publish what 2 A delivers, not the capacity between open-circuit voltages, so each peer's capacity goes
-//! through the product's own usable capacity (same resistance, same full SOC): only the capacities differ.
+//! The peers get swings from three sources. `filter`: the filter's own SOC at both ends (event `half_cycle`, with its
+//! deviation; in windows the same ends as `voltage`). `voltage`: both ends by inversion of the open-circuit curve
+//! (`swings`), which uses the current capacity only for the curve's change of shape. `filter, capacity held`: the
+//! filter's SOC, always counted with the wrong initial capacity.
+//! Measured lives publish the capacity delivered at 2 A, not the capacity between open-circuit voltages. Each peer's
+//! capacity is therefore converted by the product's own usable capacity (same resistance, same full SOC), so that only
+//! the capacities differ.
 //! `cargo test --release --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
 
 mod least_squares;
@@ -19,7 +20,7 @@ use packwatch::health::CapacityConfig;
 use least_squares::{Method, Peer, Swing};
 use swings::Weighed;
 
-/// Peers by name: none of these memories is the best on every life, so several of each are shown.
+/// The peers by name. None of these memory factors is best for every life, so several of each method are listed.
 const PEERS: [(&str, Method, f64); 11] = [
     ("WLS   gamma 0.95", Method::Wls, 0.95),
     ("WLS   gamma 0.50", Method::Wls, 0.5),
@@ -34,14 +35,14 @@ const PEERS: [(&str, Method, f64); 11] = [
     ("AWTLS gamma 0.20", Method::Awtls, 0.2),
 ];
 
-/// A swing of either source, and when it began.
+/// A swing of one source, and its start time.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Filter(Swing),
     Voltage(Weighed),
 }
 
-/// Each peer's capacity at each time asked for, from the swings begun before it.
+/// Each peer's capacity at each requested time, from the swings that began before that time.
 fn follow(
     model: &CellModel,
     config: &CapacityConfig,
@@ -59,7 +60,7 @@ fn follow(
                 Source::Filter(swing) => *swing,
                 Source::Voltage(weighed) => weighed.swing(model, config, peer.capacity().mean),
             };
-            // A swing against its charge is what a flat or wrong curve makes of one end; no method can use it.
+            // Skip swings with the wrong sign, which a flat or wrong curve produces; no method can use them.
             if swing.x > 0.0 {
                 peer.take(&swing);
             }
@@ -76,7 +77,7 @@ struct Score {
     covered: f64,
 }
 
-/// Of (estimate, truth).
+/// Scores pairs of estimate and truth.
 fn score(pairs: impl Iterator<Item = (ScalarGaussian, f64)>) -> Score {
     let (mut count, mut sum, mut covered) = (0.0, 0.0, 0.0);
     for (belief, truth) in pairs {

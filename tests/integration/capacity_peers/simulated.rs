@@ -1,8 +1,8 @@
-//! Simulated lives, where the true capacity is known: the paper's, one that ages a tenth as fast, and one that does
-//! not age (what total least squares assume), with the sensors of the paper's scenario (5 mV; 20 mA + 10 mA offset +
-//! 0.5 % gain), 1 s, SOC 30 to 90 %, started 20 % wrong.
+//! Simulated lives with known true capacity: the paper's life, one that ages a tenth as fast, and one without ageing
+//! (as total least squares assumes). Sensors as in the paper's scenario (5 mV; 20 mA + 10 mA offset + 0.5 % gain), 1 s,
+//! SOC 30 to 90 %, initial capacity 20 % wrong.
 //!
-//! Third source of swings here: the filter's SOC with its capacity held at the wrong start.
+//! The third source of swings is the filter's SOC with its capacity held at the wrong initial value.
 
 use std::path::Path;
 
@@ -19,12 +19,12 @@ use super::{PEERS, Score, Source, follow, score};
 use crate::support::simulated_cell;
 
 const NEW_AH: f64 = 2.6;
-/// Standard deviation of the initial capacity, as a part of it: the start is that much wrong.
+/// Relative standard deviation of the initial capacity, and also its relative error.
 const START_STD: f64 = 0.2;
-/// Half-cycles left out of the scores: two full cycles, as for every method the start still weighs in them.
+/// Half-cycles excluded from the scores (two full cycles), because the initial value still affects every method.
 const SETTLING: usize = 4;
 
-/// A half-cycle's end.
+/// Report at the end of a half-cycle.
 struct CapacityReport {
     time_s: f64,
     true_ah: f64,
@@ -53,7 +53,7 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
 
 fn live(config: &MonitorConfig, settings: Settings) -> Life {
     let mut life = Life { reported: Vec::new(), filter: Vec::new(), readings: Vec::new() };
-    // The truth of a minute ago: a half-cycle is reported after its end, when the loss has come.
+    // True capacity a minute ago: a half-cycle is reported after its end, when further fade has been applied.
     let mut past_ah = std::collections::VecDeque::from(vec![settings.pack.capacity_ah; 60]);
     simulated_cell::live(config.clone(), settings, |time, sim, monitor, events| {
         past_ah.push_back(sim.pack().cells()[0].capacity_ah);
@@ -94,7 +94,7 @@ impl Life {
         }
     }
 
-    /// Of each peer in turn on these swings.
+    /// Score of each peer on these swings.
     fn peers(&self, config: &MonitorConfig, swings: &[(f64, Source)]) -> Vec<(Score, f64)> {
         let start =
             ScalarGaussian::from_std(config.estimator.initial.capacity_ah, config.estimator.initial.capacity_std_ah);
@@ -108,7 +108,7 @@ impl Life {
             .collect()
     }
 
-    /// Errors relative to the truth, and the last.
+    /// Score of the errors relative to the truth, and the last error.
     fn scored(&self, capacities: &[ScalarGaussian]) -> (Score, f64) {
         let relative = |(belief, reported): (&ScalarGaussian, &CapacityReport)| {
             (ScalarGaussian::from_std(belief.mean / reported.true_ah, belief.std() / reported.true_ah), 1.0)
@@ -131,17 +131,17 @@ fn print(life: &str, start: f64, name: &str, source: &str, (score, last): (Score
     );
 }
 
-/// The lives: name and capacity lost per cycle, Ah.
+/// The lives: name and capacity fade per cycle, Ah.
 const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), ("0.05 Ah per cycle", 0.05)];
-/// As many as the paper's life has.
+/// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;
 
-/// What a peer that is fed the filter's own SOC may be ahead by, relative: a tenth of a per cent. That SOC has been counted
-/// with the capacity learned here, and the current's gain error of half a per cent is in all of them.
+/// Relative margin by which a peer on the filter's own SOC may lead: 0.1 %. That SOC was counted with the capacity
+/// learned here, and all methods share the current sensor's gain error of 0.5 %.
 const NEAR: f64 = 0.001;
 
 #[test]
-fn simulated_capacity_is_no_worse_than_that_of_any_least_squares_on_its_swings() {
+fn simulated_capacity_matches_best_peer() {
     println!("| loss | started at | method | swings | mean abs error % | in 95 % interval | last error % |");
     println!("| --- | --- | --- | --- | --- | --- | --- |");
     for (name, loss_ah) in LIVES {
@@ -154,7 +154,8 @@ fn simulated_capacity_is_no_worse_than_that_of_any_least_squares_on_its_swings()
     }
 }
 
-/// Prints all rows of a life; fails when ours is worse, or when what is fed back passes for knowledge.
+/// Prints all rows of a life. Fails if packwatch is worse, or if swings counted with the wrong capacity give a good
+/// result.
 fn compare(name: &str, start: f64, settings: Settings) {
     let config = configuration(start, false);
     let (life, held) = (live(&config, settings), live(&configuration(start, true), settings));
@@ -181,6 +182,9 @@ fn compare(name: &str, start: f64, settings: Settings) {
     let error = ours.mean_absolute;
     assert!(error <= by_voltage, "{name} from {start}: {error}, the best by voltage {by_voltage}");
     assert!(error <= by_filter + NEAR, "{name} from {start}: {error}, the best on the filter's SOC {by_filter}");
-    assert!(fed_back > 0.1, "{name} from {start}: swings counted with a wrong capacity gave {fed_back}");
+    assert!(
+        fed_back > 0.1,
+        "{name} from {start}: swings counted with a wrong capacity gave an error of only {fed_back}"
+    );
     assert!(ours.covered > 0.9, "{name} from {start}: {ours:?}");
 }

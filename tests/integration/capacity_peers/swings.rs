@@ -1,9 +1,9 @@
-//! Swings from the voltage alone: SOC at both ends by inversion of the open-circuit curve.
+//! Swings from the voltage alone: the SOC at both ends comes from the inverted open-circuit curve.
 //!
-//! V + I R0 rho + sum U is taken as the open-circuit voltage, with the branches' voltages stepped open loop from rest
-//! (from 180 s on where a record begins under load) and the resistance ratio rho that the filter has; all readings of
-//! the first and of the last 60 s count, each with the charge that had flowed by then, so nothing is assumed of the
-//! capacity but the curve's change of shape with it. The deviation of an end is the product's own (`[capacity]`).
+//! The open-circuit voltage is V + I R0 rho + sum U. The branch voltages are stepped in open loop from rest (from 180 s
+//! on if the record begins under load); rho is the filter's resistance ratio. All readings of the first and the last 60
+//! s count, each with the charge that had flowed by then. The capacity is assumed only for the curve's change of shape.
+//! The deviation of an end is the product's own (`[capacity]`).
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -12,22 +12,22 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// A longer step is a gap: what flowed in it is unknown.
+/// A longer step is a gap, in which the charge is unknown.
 const GAP_S: f64 = 60.0;
-/// Below it the cell rests, A.
+/// Below this current the cell rests, A.
 const REST_A: f64 = 0.05;
-/// Three time constants of the models' slowest branch, after which its unknown start is forgotten.
+/// Three time constants of the models' slowest branch, after which its unknown initial voltage has decayed.
 const SETTLING_S: f64 = 180.0;
-/// Length of an end, s.
+/// Length of each end of a swing, s.
 const END_S: f64 = 60.0;
-/// The charge that must flow back before a swing is over, part of the model's capacity.
+/// A swing ends when this part of the model's capacity has flowed back.
 const REVERSAL: f64 = 0.02;
-/// The least swing used, part of the model's capacity.
+/// Smallest swing used, as a part of the model's capacity.
 const MIN_SWING: f64 = 0.05;
 /// White noise of a voltage reading, V.
 const VOLTAGE_NOISE_V: f64 = 0.005;
 
-/// One reading and the resistance ratio of the moment.
+/// One reading, with the resistance ratio at that time.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Reading {
     pub(crate) time_s: f64,
@@ -40,15 +40,15 @@ pub(crate) struct Reading {
     pub(crate) soc_variance: f64,
 }
 
-/// What one reading says, or the mean of several.
+/// SOC, charge and variance of one reading, or the mean of several.
 #[derive(Debug, Clone, Copy, Default)]
 struct Point {
     time_s: f64,
     /// From the open-circuit curve of the new cell.
     new_soc: f64,
-    /// Variance of that.
+    /// Variance of `new_soc`.
     variance: f64,
-    /// Charge taken out so far, Ah.
+    /// Charge removed so far, Ah.
     charge_ah: f64,
     /// The filter's SOC and its variance.
     soc: f64,
@@ -56,7 +56,7 @@ struct Point {
     known: bool,
 }
 
-/// A swing between two ends.
+/// A swing with the data to weigh it.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Weighed {
     pub(crate) start_s: f64,
@@ -65,7 +65,7 @@ pub(crate) struct Weighed {
 }
 
 impl Weighed {
-    /// For the least squares of a cell believed to have `capacity_ah` (the curve's shape follows it).
+    /// Swing for a cell of assumed capacity `capacity_ah`, which determines the curve's shape.
     pub(crate) fn swing(&self, model: &CellModel, config: &CapacityConfig, capacity_ah: f64) -> Swing {
         let lost = 1.0 - capacity_ah / model.capacity_ah;
         let [(a, a_variance), (b, b_variance)] = self.ends.map(|end| {
@@ -76,7 +76,7 @@ impl Weighed {
         self.between(config, a - b, a_variance + b_variance)
     }
 
-    /// With the filter's own SOC at the same ends.
+    /// Swing with the filter's own SOC at the same ends.
     pub(crate) fn filter_swing(&self, config: &CapacityConfig) -> Swing {
         let [a, b] = &self.ends;
         self.between(config, a.soc - b.soc, a.soc_variance + b.soc_variance)
@@ -89,11 +89,11 @@ impl Weighed {
     }
 }
 
-/// Variance of a charge by the sensor's gain and offset, Ah^2.
+/// Variance of a charge from the sensor's gain and offset, Ah^2.
 pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_s: f64) -> f64 {
     let gain_ah = config.current_gain_std * charge_ah;
     let offset_ah = config.current_offset_std_a * duration_s / 3600.0;
-    // The floor is for a configuration which knows of neither: a thousandth of the charge.
+    // Lower bound for a configuration with neither gain nor offset: a thousandth of the charge.
     (gain_ah * gain_ah + offset_ah * offset_ah).max(1e-6 * charge_ah * charge_ah)
 }
 
@@ -104,12 +104,12 @@ fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
     model.soc_of_aged_ocv(&model.temperature_position(ANY_C), capacity_ah, voltage_v)
 }
 
-/// Which readings make the ends.
+/// Readings that form the ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ends {
-    /// The first and last there are, at rest where the cell rests.
+    /// The first and last readings, at rest if the cell rests.
     Outer,
-    /// Those with current only.
+    /// Only readings with current.
     Loaded,
 }
 
@@ -137,10 +137,10 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, read
     swings
 }
 
-/// Where the charge turned, when enough has flowed back by the last point.
+/// Index of the charge reversal, once enough charge has flowed back.
 fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
-    // Looked for at every 32nd point only: a turn lies in the past by far more when it counts.
+    // Check every 32nd point only: a reversal that counts lies much further back.
     if !points.len().is_multiple_of(32) {
         return None;
     }
@@ -164,7 +164,7 @@ fn between_ends(model: &CellModel, points: &[Point]) -> Option<Weighed> {
     (moved_ah > MIN_SWING * model.capacity_ah).then_some(Weighed { start_s, end_s, ends })
 }
 
-/// Mean of points; the errors of the curve repeat, so their variance does not fall with the count.
+/// Mean of points. The curve's errors are common to all points, so the variance does not fall with their number.
 fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
     let n = points.clone().count() as f64;
     let of = |value: fn(&Point) -> f64| points.clone().map(value).sum::<f64>() / n;
@@ -179,7 +179,7 @@ fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
     }
 }
 
-/// The branches, open loop.
+/// State of the RC branches, in open loop.
 #[derive(Debug, Default)]
 struct Circuit {
     last: Option<Reading>,
@@ -199,7 +199,7 @@ impl Circuit {
     fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
         let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
         let mut load_v = self.branch_v.iter().sum::<f64>();
-        // Resistances are those at the SOC of the voltage; two passes settle it.
+        // The resistances depend on the SOC, which depends on the voltage; two passes converge.
         let mut soc = 0.5;
         for _ in 0..3 {
             let r0_ohm = model.r0_ohm(&model.grid_position(soc, temperature_c)) * resistance_ratio;

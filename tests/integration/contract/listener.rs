@@ -1,4 +1,4 @@
-//! A listener as another ECU has it: made from the DBC and the contract page, without the encoder's code.
+//! A listener as another ECU would implement it: built from the DBC and the contract page, without the encoder's code.
 
 use std::collections::BTreeMap;
 
@@ -6,10 +6,10 @@ use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::signal::SignalPlan;
 use packwatch::can::{CanId, Frame};
 
-/// Rule, severity and cell as the frames carry them → state and whether it is acknowledged.
+/// Maps rule, severity and cell, as the frames carry them, to state and acknowledgement.
 pub(crate) type AlarmTable = BTreeMap<(u64, u64, u64), (u64, bool)>;
 
-/// Passes in a cycle, and passes without a frame after which an alarm is over.
+/// Passes per cycle, and passes without a frame after which an alarm is removed.
 const CYCLE_PASSES: i64 = 4;
 const TIMEOUT_PASSES: i64 = 7;
 
@@ -30,7 +30,7 @@ impl Reader {
         self.signals[name].0.raw(frame.data()).unwrap()
     }
 
-    /// Whether the signal is on the page of a frame.
+    /// Whether the frame's page contains the signal.
     fn has(&self, frame: &Frame, name: &str) -> bool {
         let page = self.raw(frame, "Page");
         self.signals.get(name).is_some_and(|(_, signal)| {
@@ -38,7 +38,7 @@ impl Reader {
         })
     }
 
-    /// Code of a word of the signal's value table.
+    /// Code of an entry in the signal's value table.
     fn code(&self, name: &str, word: &str) -> u64 {
         let table = &self.signals[name].1.values;
         u64::try_from(table.iter().find(|(_, other)| other == word).unwrap().0).unwrap()
@@ -118,14 +118,14 @@ impl Listener {
         &self.rules
     }
 
-    /// The table as this listener has it.
+    /// The listener's alarm table.
     pub(crate) fn table(&mut self, now_ms: i64) -> AlarmTable {
         let timeout_ms = TIMEOUT_PASSES * self.pass_ms;
         self.entries.retain(|_, entry| now_ms - entry.received_ms <= timeout_ms);
         self.entries.iter().map(|(key, entry)| (*key, (entry.state, entry.is_acknowledged))).collect()
     }
 
-    /// Whether the last digest agrees with the table.
+    /// Whether the last digest matches the table.
     pub(crate) fn is_confirmed(&mut self, now_ms: i64) -> bool {
         let table = self.table(now_ms);
         let sum = table.iter().fold(0_u16, |sum, (key, entry)| sum.wrapping_add(crc(*key, *entry)));
@@ -134,7 +134,7 @@ impl Listener {
     }
 }
 
-/// CRC-16 of an entry, bit by bit as the DBC's comment says.
+/// CRC-16 of an entry, bit by bit as the DBC comment specifies.
 fn crc((rule, severity, cell): (u64, u64, u64), (state, is_acknowledged): (u64, bool)) -> u16 {
     let bytes = [rule, severity, cell & 0xFF, cell >> 8, state + 8 * u64::from(is_acknowledged)];
     bytes.into_iter().fold(0xFFFF_u16, |start, byte| {

@@ -1,4 +1,4 @@
-//! Replies to commands, the digest's pages, and counters over a kill of the daemon, on hand-made frames.
+//! Replies to commands, the digest's pages, and counters across a kill of the daemon, tested with hand-made frames.
 
 use packwatch::alarm::Rule;
 use packwatch::can::e2e::{Profile, Protection};
@@ -22,7 +22,7 @@ impl Rig {
         self.frames.iter().filter(|frame| frame.id() == CanId::standard(id).unwrap()).copied().collect()
     }
 
-    /// Result, reason, command, expected counter, changed and refused of the last reply.
+    /// Fields of the last reply: result, reason, command, expected counter, changed, refused.
     fn last_reply(&self) -> [u64; 6] {
         let frame = *self.frames_with(REPLY).last().unwrap();
         [(16, 3), (19, 4), (23, 4), (45, 9), (54, 6), (60, 4)].map(|(start, length)| field(&frame, start, length))
@@ -40,7 +40,7 @@ impl Rig {
         })
     }
 
-    /// A field of the last frame of a digest's page.
+    /// A field of the last frame of a digest page.
     fn digest(&self, page: u64, start: u32, length: u32) -> u64 {
         let frames = self.frames_with(DIGEST);
         field(frames.iter().rev().find(|frame| field(frame, 16, 4) == page).unwrap(), start, length)
@@ -52,12 +52,12 @@ fn field(frame: &Frame, start: u32, length: u32) -> u64 {
 }
 
 #[test]
-fn every_command_frame_has_a_reply_with_its_reason_and_the_counter_expected() {
+fn every_command_reply_states_reason_and_counter() {
     const NONE: u64 = 63;
     let mut rig = learned();
     rig.command(1, 31, 2047);
     assert_eq!(rig.last_reply(), [2, 1, 1, 1, NONE, 15], "the first frame only shows the counter");
-    assert_eq!(rig.last_refusal(), Some((true, Some(CommandRefusal::FirstFrame))), "it is intact");
+    assert_eq!(rig.last_refusal(), Some((true, Some(CommandRefusal::FirstFrame))), "the first frame is intact");
     rig.command(1, 1, 0);
     assert_eq!(rig.last_reply(), [1, 0, 1, 2, 1, 0]);
     rig.seconds(2);
@@ -66,10 +66,10 @@ fn every_command_frame_has_a_reply_with_its_reason_and_the_counter_expected() {
     let mut harmed: [u8; 8] = command_frame(2, 31, 2047, 2).data().try_into().unwrap();
     harmed[4] ^= 1;
     rig.send_raw(&Frame::classic(CanId::Standard(1715), &harmed).unwrap());
-    assert_eq!(rig.last_reply(), [2, 2, 15, 2, NONE, 15], "what cannot be trusted is not repeated");
+    assert_eq!(rig.last_reply(), [2, 2, 15, 2, NONE, 15], "the reply does not repeat untrusted content");
     rig.seconds(2);
     rig.send_raw(&command_frame(1, 1, 0, 9));
-    assert_eq!(rig.last_reply(), [2, 4, 1, 2, NONE, 15], "skipped too far");
+    assert_eq!(rig.last_reply(), [2, 4, 1, 2, NONE, 15], "the counter skips too far");
     rig.send_raw(&command_frame(9, 31, 2047, 2));
     assert_eq!(rig.last_reply(), [2, 5, 15, 3, NONE, 15], "no meaning");
     rig.seconds(2);
@@ -80,7 +80,7 @@ fn every_command_frame_has_a_reply_with_its_reason_and_the_counter_expected() {
 }
 
 #[test]
-fn the_reply_to_an_acknowledge_command_follows_the_alarm_frames_that_it_caused() {
+fn acknowledge_reply_follows_changed_alarm_frames() {
     let mut rig = learned();
     rig.command(1, 31, 2047);
     rig.seconds(2);
@@ -92,13 +92,13 @@ fn the_reply_to_an_acknowledge_command_follows_the_alarm_frames_that_it_caused()
     assert!(last_alarm < reply, "{:?}", rig.frames);
     let acknowledged: Vec<_> = rig.wire().iter().filter(|wire| wire.acknowledged).map(|wire| wire.cell).collect();
     assert_eq!(acknowledged, [0, 1], "one frame of each alarm that the command changed");
-    assert_eq!(rig.last_reply(), [1, 0, 1, 2, 2, 0], "two alarms changed");
+    assert_eq!(rig.last_reply(), [1, 0, 1, 2, 2, 0], "two alarms must change");
 }
 
 #[test]
-fn the_first_tick_after_a_second_or_more_away_sends_all_cyclic_frames_and_each_period_after_it_one_more() {
+fn long_downtime_restarts_all_cyclic_frames() {
     for away in [Downtime::Seconds(1.0), Downtime::Seconds(2.3), Downtime::Seconds(60.0), Downtime::Unknown] {
-        // At other moments of the periods than their ends.
+        // Also stop at times other than the end of a period.
         for more_deci in [0, 1, 6] {
             let mut rig = Rig::new("");
             rig.seconds(3);
@@ -119,7 +119,7 @@ fn the_first_tick_after_a_second_or_more_away_sends_all_cyclic_frames_and_each_p
 }
 
 #[test]
-fn less_than_a_second_after_the_stop_the_cyclic_frames_keep_their_periods() {
+fn short_downtime_keeps_cyclic_periods() {
     for more_deci in [0, 3, 6] {
         let mut rig = Rig::new("");
         rig.seconds(3);
@@ -137,7 +137,7 @@ fn less_than_a_second_after_the_stop_the_cyclic_frames_keep_their_periods() {
                 *deci = if rig.frames_with(*id).is_empty() { 0 } else { rig.deci };
             }
         }
-        // Their periods began with the first tick.
+        // The periods start with the first tick.
         let due = stopped / 10 * 10 + if stopped % 10 < 1 { 1 } else { 11 };
         let wanted = due.max(restarted + 1);
         assert_eq!(firsts.map(|(_, deci)| deci), [wanted; 2], "{more_deci}: not all at the first tick");
@@ -145,7 +145,7 @@ fn less_than_a_second_after_the_stop_the_cyclic_frames_keep_their_periods() {
 }
 
 #[test]
-fn a_cleared_alarm_is_sent_four_times() {
+fn cleared_alarm_is_sent_four_times() {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 6);
     rig.frames.clear();
@@ -155,19 +155,19 @@ fn a_cleared_alarm_is_sent_four_times() {
 }
 
 #[test]
-fn the_digest_never_shows_as_none_what_cannot_be_judged() {
+fn digest_shows_unjudged_rule_as_unknown() {
     let rule = |rig: &Rig, number: u32| rig.digest(1, 20 + 3 * (number - 1), 3);
     let soc = "[[alarm]]\nrule = \"soc_low\"\nwarning = \"5 %\"\n";
     let mut rig = Rig::new(&format!("{HOT}{soc}"));
     rig.heat(60.0, 6);
-    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 0, 5], "a warning, judged, not watched");
+    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 0, 5], "warning, judged without alarm, not watched");
     rig.restart(Downtime::Seconds(60.0));
     rig.frames.clear();
     rig.tick();
-    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 4, 5], "nothing is read yet");
+    assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 4, 5], "no input received yet");
     rig.seconds(3);
     assert_eq!([9, 8].map(|number| rule(&rig, number)), [2, 0]);
-    // One of two sensors.
+    // One of two sensors has a reading.
     let mut rig = Rig::new(HOT);
     rig.temperatures_c = [Some(25.0), None];
     rig.seconds(12);
@@ -175,7 +175,7 @@ fn the_digest_never_shows_as_none_what_cannot_be_judged() {
 }
 
 #[test]
-fn a_flood_of_commands_has_few_replies() {
+fn command_flood_gets_few_replies() {
     let mut rig = learned();
     for _ in 0..30 {
         rig.command(1, 31, 2047);
@@ -183,11 +183,11 @@ fn a_flood_of_commands_has_few_replies() {
     assert_eq!(rig.frames_with(REPLY).len(), 5);
     rig.seconds(3);
     rig.command(1, 31, 2047);
-    assert_eq!(rig.frames_with(REPLY).len(), 6, "and again after a pause");
+    assert_eq!(rig.frames_with(REPLY).len(), 6, "replies resume after a pause");
 }
 
 #[test]
-fn the_digest_shows_raised_and_unknown_rules_and_exact_thresholds() {
+fn digest_shows_rule_states_and_thresholds() {
     let mut rig = Rig::new(&format!("{HOT}[[alarm]]\nrule = \"store_failed\"\nsevere = 1\n"));
     rig.seconds(3);
     let rule = |rig: &Rig, number: u32| rig.digest(1, 20 + 3 * (number - 1), 3);
@@ -206,7 +206,7 @@ fn the_digest_shows_raised_and_unknown_rules_and_exact_thresholds() {
 }
 
 #[test]
-fn leaving_unknown_is_announced_four_times_and_once_more_after_a_kill() {
+fn end_of_unknown_is_announced_across_kill() {
     for is_killed in [false, true] {
         let mut rig = Rig::new(HOT);
         rig.temperatures_c = [None; 2];
@@ -222,7 +222,7 @@ fn leaving_unknown_is_announced_four_times_and_once_more_after_a_kill() {
     }
 }
 
-/// A protected message of the test of counters: identifier, data id, frames in each period, period in tenths of a second.
+/// A protected message of the counter test: identifier, data id, frames per period, period in tenths of a second.
 const COUNTED: [(u32, u16, i64, i64); 4] =
     [(STATUS, 1, 1, 1), (HEALTH, 2, 5, 10), (ALARM, 3, 1, 5), (DIGEST, 4, 4, 10)];
 
@@ -236,20 +236,20 @@ fn protected_rig(profile: Profile) -> Rig {
     Rig::with(config_texts::load(&format!("{pack}{}{HOT}", more.concat()), DBC).monitor)
 }
 
-/// Counters of the frames with an identifier, all of them intact.
+/// Counters of the frames with an identifier. All frames must be intact.
 fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
     let counter = |frame: &Frame| protection.verified_counter(frame.data()).unwrap().into();
     rig.frames_with(id).iter().map(counter).collect()
 }
 
-/// Tenths of a second between the stored state and the kill, and until the first tick of the next run.
+/// Tenths of a second from the stored state to the kill, and from the kill to the first tick of the next run.
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
-/// Kills a daemon with one raised alarm. Returns, for each message of [`COUNTED`], the steps of its counter from the last frame
-/// before the kill to the first one after it, and the steps of a daemon that never stopped: the least and the most.
+/// Kills a daemon with one raised alarm. Returns for each message of [`COUNTED`] the counter steps from the last frame
+/// before the kill to the first one after it, and the least and most steps for a daemon that never stopped.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
-    // Raised and repeated: from here on the alarm is sent in turn only.
+    // Raise the alarm and send its repetitions. From here on it is sent only in its cycle.
     rig.heat(60.0, 6);
     let stored = rig.monitor.snapshot();
     (0..unstored_deci).for_each(|_| rig.tick_with_frames());
@@ -262,13 +262,13 @@ fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(
     rig.frames.clear();
     rig.tick();
     assert_eq!(rig.frames_with(STATUS).len(), 1, "{profile:?} {unstored_deci} {away_deci}: at the first tick");
-    // Each of the others comes within its period.
+    // Each of the other messages follows within its period.
     (0..9).for_each(|_| rig.tick());
     let turn = i64::from(profile.max_counter()) + 1;
     std::array::from_fn(|n| {
         let (id, data_id, frames, period_deci) = COUNTED[n];
         let first = counters(&rig, id, of(data_id))[0];
-        // Whole periods lie between the last frame before and the first one after.
+        // Whole periods between the last frame before the kill and the first one after it.
         let lost = away_deci / period_deci;
         let allowed = [lost, lost + 1].map(|periods| (periods * frames + 1).rem_euclid(turn));
         ((first - before[n]).rem_euclid(turn), allowed)
@@ -276,7 +276,7 @@ fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(
 }
 
 #[test]
-fn counters_after_a_kill_are_those_of_a_daemon_that_never_stopped() {
+fn counters_after_kill_match_uninterrupted_daemon() {
     for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
         for (unstored_deci, away_deci) in KILLS {
             let steps = steps_over_a_kill(profile, unstored_deci, away_deci);
@@ -291,7 +291,7 @@ fn counters_after_a_kill_are_those_of_a_daemon_that_never_stopped() {
 }
 
 #[test]
-fn the_alarm_frame_s_counter_after_a_kill_is_that_of_a_daemon_that_never_stopped() {
+fn alarm_counter_after_kill_matches_uninterrupted_daemon() {
     for (unstored_deci, away_deci) in KILLS {
         let (steps, allowed) = steps_over_a_kill(Profile::P05, unstored_deci, away_deci)[2];
         assert!(allowed.contains(&steps), "{unstored_deci} {away_deci}: {steps} steps, must be one of {allowed:?}");
@@ -299,7 +299,7 @@ fn the_alarm_frame_s_counter_after_a_kill_is_that_of_a_daemon_that_never_stopped
 }
 
 #[test]
-fn the_counter_of_a_reply_does_not_come_again_after_a_kill() {
+fn reply_counter_is_not_reused_after_kill() {
     let mut rig = Rig::new("[output.reply]\ne2e = \"1C\"\ndata_id = 5\n");
     rig.seconds(2);
     rig.command(1, 31, 2047);
@@ -313,7 +313,7 @@ fn the_counter_of_a_reply_does_not_come_again_after_a_kill() {
 }
 
 #[test]
-fn counters_after_an_unknown_time_continue_where_the_stored_state_ends_and_without_a_state_at_zero() {
+fn counters_continue_from_state_after_unknown_downtime() {
     for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
         let mut rig = protected_rig(profile);
         rig.heat(60.0, 6);

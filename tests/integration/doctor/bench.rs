@@ -1,4 +1,4 @@
-//! Healthy packs on the bench: configurations, DBC files and simulated logs, to be broken.
+//! Healthy packs for the doctor's tests: configurations, DBC files and simulated logs, into which faults are then put.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,17 +14,17 @@ use packwatch::wiring_check::{self, Interrupt};
 pub(crate) enum Bench {
     /// 12 cells, drive at 100 Hz and 10 Hz.
     Pack12,
-    /// 96 cells as shipped.
+    /// 96 cells, the shipped example.
     Pack96,
     /// One cell, protected end to end.
     Protected,
-    /// Only the total voltage of 96 cells, and a sensor.
+    /// Total voltage of 96 cells only, and a temperature sensor.
     Total,
-    /// One cell in random pulses, voltages as rough as 32 mV.
+    /// One cell with random pulses and a voltage resolution of 32 mV.
     Pulses,
-    /// One cell discharged steadily.
+    /// One cell, discharged steadily.
     Steady,
-    /// One cell charged steadily.
+    /// One cell, charged steadily.
     Charge,
     /// Random five-minute loads.
     Walk,
@@ -32,7 +32,7 @@ pub(crate) enum Bench {
     Day,
 }
 
-/// A cell of 8 bytes behind a header for profile 1A.
+/// One cell in 8 bytes behind a profile 1A header.
 const PROTECTED_DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 MeasuredCell: 8 BMS
@@ -48,7 +48,7 @@ fn shipped(name: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name)).unwrap()
 }
 
-/// `example.toml` with fewer cells and the sensors they have.
+/// `example.toml` with fewer cells and their temperature sensors.
 fn fewer_cells(cells: usize) -> String {
     let text = shipped("example.toml");
     let (head, rest) = text.split_once("[[input.temperature]]").unwrap();
@@ -67,7 +67,7 @@ fn total() -> String {
     let (_, tail) = rest.split_once("# A message that its sender").unwrap();
     let inputs = "[input.pack_voltage]\nsignal = \"PackStatus.PackVoltage\"\n\n[[input.temperature]]\nsignal = \"Temperatures.Temperature1\"\n";
     let head = head.replace("[input.cell_voltage]", "");
-    // What needs cells of their own.
+    // Remove the parts that need individual cell voltages.
     let (before, rest) = tail.split_once("[[alarm]]\nrule = \"cell_imbalance\"").unwrap();
     let (_, after) = rest.split_once("\n[[alarm]]").unwrap();
     format!("{head}{inputs}\n# A message that its sender{before}[[alarm]]{after}")
@@ -102,7 +102,7 @@ impl Bench {
     pub(crate) fn dbc(self) -> String {
         match self {
             Self::Protected => PROTECTED_DBC.to_owned(),
-            // As slow as it is simulated.
+            // Match the simulated period.
             Self::Day => shipped("pack96.dbc").replace("BO_ 256 10;", "BO_ 256 100;"),
             _ => shipped(self.dbc_name()),
         }
@@ -135,7 +135,7 @@ impl Bench {
 
 static LOGS: LazyLock<Mutex<BTreeMap<(Bench, u64), String>>> = LazyLock::new(Mutex::default);
 
-/// The healthy log: simulated once.
+/// The healthy log, simulated once per bench and seed.
 fn log(bench: Bench, seed: u64) -> String {
     let mut logs = LOGS.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     let made = logs.entry((bench, seed)).or_insert_with(|| {
@@ -154,14 +154,14 @@ fn log(bench: Bench, seed: u64) -> String {
     made.clone()
 }
 
-/// A pack, broken or not yet.
+/// A pack to put a fault into.
 #[derive(Debug, Clone)]
 pub(crate) struct Broken {
     pub(crate) bench: Bench,
     pub(crate) config: String,
     pub(crate) dbc: String,
     pub(crate) log: String,
-    /// Further files beside the configuration.
+    /// Further files in the configuration's folder.
     pub(crate) extra: Vec<(&'static str, String)>,
 }
 
@@ -170,9 +170,9 @@ impl Broken {
         Self { bench, config: bench.config(), dbc: bench.dbc(), log: log(bench, seed), extra: Vec::new() }
     }
 
-    /// Replaces in the configuration; the text must be there.
+    /// Replaces a text in the configuration; it must exist.
     pub(crate) fn config(&mut self, from: &str, to: &str) {
-        assert!(self.config.contains(from), "{:?} has no {from}", self.bench);
+        assert!(self.config.contains(from), "{:?} does not contain {from}", self.bench);
         self.config = self.config.replace(from, to);
     }
 
@@ -182,11 +182,11 @@ impl Broken {
     }
 
     pub(crate) fn dbc(&mut self, from: &str, to: &str) {
-        assert!(self.dbc.contains(from), "{:?} has no {from}", self.bench);
+        assert!(self.dbc.contains(from), "{:?} does not contain {from}", self.bench);
         self.dbc = self.dbc.replace(from, to);
     }
 
-    /// Changes every frame: `(stamp, interface, identifier, data)`; `None` leaves it out.
+    /// Changes every frame: `(stamp, interface, identifier, data)`; `None` removes the frame.
     pub(crate) fn frames(&mut self, mut change: impl FnMut(&str, &str, &str, &str) -> Option<String>) {
         let line = |line: &str| {
             let mut words = line.split(' ');
@@ -212,7 +212,7 @@ impl Broken {
         });
     }
 
-    /// Writes everything; the configuration's path.
+    /// Writes all files. Returns the configuration's path.
     pub(crate) fn write(&self, folder: &Path) -> PathBuf {
         std::fs::create_dir_all(folder.join("cells")).unwrap();
         for cell in ["example_nmc_2600", "nasa_b0005"] {
@@ -229,13 +229,13 @@ impl Broken {
         path
     }
 
-    /// One that has heard nothing yet.
+    /// A doctor that has not received any frame yet.
     pub(crate) fn doctor(&self) -> WiringObserver {
         let folder = tempfile::tempdir().unwrap();
         WiringObserver::new(wiring_check::survey(&self.write(folder.path())).unwrap().plan)
     }
 
-    /// What the doctor says.
+    /// The doctor's report.
     pub(crate) fn report(&self) -> WiringReport {
         let folder = tempfile::tempdir().unwrap();
         let path = self.write(folder.path());

@@ -1,4 +1,4 @@
-//! The command as its user runs it.
+//! Runs `packwatch doctor` as a user does.
 
 use assert_cmd::Command;
 
@@ -15,7 +15,7 @@ fn doctor(broken: &Broken, args: &[&str]) -> (i32, String, String) {
 }
 
 #[test]
-fn a_healthy_pack_gives_status_0_and_says_what_is_fine() {
+fn healthy_pack_exits_0_and_lists_checks() {
     let (status, page, _) = doctor(&Broken::of(Bench::Pack12, 1), &[]);
     assert_eq!(status, 0, "{page}");
     for words in [
@@ -29,7 +29,7 @@ fn a_healthy_pack_gives_status_0_and_says_what_is_fine() {
 }
 
 #[test]
-fn a_finding_gives_status_1_with_the_line_as_it_is_and_as_it_should_be() {
+fn finding_exits_1_and_shows_both_lines() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.config("positive = \"charge\"", "positive = \"discharge\"");
     let (status, page, _) = doctor(&broken, &[]);
@@ -51,7 +51,7 @@ fn a_finding_gives_status_1_with_the_line_as_it_is_and_as_it_should_be() {
 }
 
 #[test]
-fn a_name_that_is_not_in_the_dbc_is_reported_and_the_rest_is_diagnosed() {
+fn unknown_signal_is_reported_and_others_diagnosed() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.config("PackStatus.Current\"", "PackStatus.Curent\"");
     broken.table("[input.cell_voltage]", "scale = 1000.0");
@@ -63,7 +63,7 @@ fn a_name_that_is_not_in_the_dbc_is_reported_and_the_rest_is_diagnosed() {
 }
 
 #[test]
-fn a_configuration_that_says_nothing_of_a_bus_is_refused() {
+fn configuration_without_cell_model_is_rejected() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.config = "[pack]\ncells = 3\n".to_owned();
     let (status, page, faults) = doctor(&broken, &[]);
@@ -72,7 +72,7 @@ fn a_configuration_that_says_nothing_of_a_bus_is_refused() {
 }
 
 #[test]
-fn a_part_of_a_log_is_judged_and_another_interface_named() {
+fn partial_log_is_judged_and_other_interface_named() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.frames(|stamp, _, id, data| Some(format!("{stamp} can9 {id}#{data}")));
     let (status, page, _) = doctor(&broken, &["-i", "can9", "--for", "20"]);
@@ -81,7 +81,7 @@ fn a_part_of_a_log_is_judged_and_another_interface_named() {
 }
 
 #[test]
-fn a_wrong_byte_order_comes_first_and_the_rest_is_below_it() {
+fn wrong_byte_order_is_first_finding() {
     let mut broken = Broken::of(Bench::Pack96, 1);
     broken.dbc("|16@1", "|16@0");
     let (status, page, _) = doctor(&broken, &[]);

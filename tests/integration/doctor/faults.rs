@@ -1,17 +1,17 @@
-//! The faults, one a row.
+//! The table of faults, one per row.
 
 use packwatch::wiring::Topic;
 
 use super::bench::Bench::{self, Charge, Day, Pack12, Pack96, Protected, Pulses, Steady, Total, Walk};
 use super::bench::Broken;
 
-/// One way to be wrong.
+/// A fault to put into a pack.
 pub(crate) struct Fault {
     pub(crate) name: &'static str,
     pub(crate) breaks: fn(&mut Broken),
-    /// One of these must come first.
+    /// One of these topics must be the first finding.
     pub(crate) expected: &'static [Topic],
-    /// Must be among the lines proposed; empty = none is asked for.
+    /// Text that the proposed lines must contain; empty = no proposal required.
     pub(crate) proposed: &'static str,
     pub(crate) benches: &'static [Bench],
     pub(crate) seeds: u64,
@@ -48,7 +48,7 @@ fn temperatures(broken: &mut Broken, keys: &str) {
     broken.table("[[input.temperature]]", keys);
 }
 
-/// Exchanges two signals' names in the configuration.
+/// Swaps two signals' names in the configuration.
 fn exchange(broken: &mut Broken, a: &str, b: &str) {
     broken.config(&format!("\"{a}\""), "\"@\"");
     broken.config(&format!("\"{b}\""), &format!("\"{a}\""));
@@ -61,7 +61,7 @@ fn without_units(broken: &mut Broken) {
     }
 }
 
-/// The example's cell with every number of some tables changed, as another model beside it.
+/// A second cell model: the example's with every number of some tables changed.
 fn other_cell(broken: &mut Broken, tables: &[&str], change: impl Fn(f64) -> f64) {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells");
     let mut model: toml::Table =
@@ -97,7 +97,7 @@ fn change_numbers(value: &mut toml::Value, change: &impl Fn(f64) -> f64) {
     }
 }
 
-/// Every configured row; the first finding must be the one that is named.
+/// All faults; the doctor's first finding must be the expected one.
 pub(crate) const FAULTS: &[Fault] = &[
     fault(
         "inverted sign",
@@ -174,7 +174,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        // Of a pack at about 10 degrees C: nothing about the figure itself is odd.
+        // The pack is at about 10 degrees C, so the number itself looks plausible.
         "Fahrenheit in the DBC, not converted",
         |b| b.dbc("(0.1,0) [-40|125] \"degC\"", "(0.18,5) [-40|300] \"degF\""),
         &[Topic::Unit],
@@ -240,7 +240,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "a silent bus beside a busy one",
+        "a silent bus and a busy one",
         |b| b.frames(|t, _, _, data| Some(format!("{t} can5 7FF#{data}"))),
         &[Topic::Interface],
         "name",
@@ -313,7 +313,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         4,
     ),
     fault(
-        // A smaller pack, or a dead module.
+        // Either a smaller pack or a dead module.
         "last cells without values",
         |b| {
             b.data("110", |d| {
@@ -350,7 +350,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         1,
     ),
     fault(
-        "wrong number of cells behind the total",
+        "wrong number of cells in the total voltage",
         |b| b.config("cells = 96 ", "cells = 60 "),
         &[Topic::CellCount],
         "cells",
@@ -389,7 +389,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         3,
     ),
     fault(
-        "total voltage and current exchanged, no units",
+        "total voltage and current swapped, no units",
         |b| {
             exchange(b, "PackStatus.Current", "PackStatus.PackVoltage");
             without_units(b)
@@ -408,7 +408,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "voltage and temperature exchanged",
+        "voltage and temperature swapped",
         |b| exchange(b, "MeasuredCell.Voltage", "MeasuredCell.Temperature"),
         &[Topic::Swapped],
         "signal",
@@ -416,7 +416,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "voltage and temperature exchanged, no units",
+        "voltage and temperature swapped, no units",
         |b| {
             exchange(b, "MeasuredCell.Voltage", "MeasuredCell.Temperature");
             without_units(b)
@@ -427,7 +427,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "voltage and current exchanged",
+        "voltage and current swapped",
         |b| exchange(b, "MeasuredCell.Voltage", "MeasuredCell.Current"),
         &[Topic::Swapped],
         "signal",
@@ -435,7 +435,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "voltage and current exchanged, no units",
+        "voltage and current swapped, no units",
         |b| {
             exchange(b, "MeasuredCell.Voltage", "MeasuredCell.Current");
             without_units(b)
@@ -446,7 +446,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "temperature and current exchanged, no units",
+        "temperature and current swapped, no units",
         |b| {
             exchange(b, "MeasuredCell.Temperature", "MeasuredCell.Current");
             without_units(b)
@@ -457,7 +457,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         3,
     ),
     fault(
-        "a cell's voltage stands still",
+        "a cell's voltage is frozen",
         |b| {
             b.data("110", |d| {
                 if d[0] == 1 {
@@ -471,7 +471,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "the current stands still",
+        "the current is frozen",
         |b| b.data("100", |d| d[..2].copy_from_slice(&[20, 0])),
         &[Topic::Frozen],
         "signal",
@@ -479,7 +479,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "a cell unlike the others",
+        "a cell that differs from the others",
         |b| {
             b.data("110", |d| {
                 if d[0] == 1 {
@@ -494,7 +494,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "a cell turned round",
+        "a cell with reversed sign",
         |b| {
             b.data("110", |d| {
                 if d[0] == 1 {
@@ -525,7 +525,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "one lost frame makes them stale",
+        "stale after one lost frame",
         |b| b.config("max_age_s = 2.0", "max_age_s = 0.15"),
         &[Topic::Period],
         "max_age_s",
@@ -555,7 +555,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "model of iron phosphate",
+        "cell model of iron phosphate",
         |b| other_cell(b, &["ocv_v", "voltage_min_v", "voltage_max_v"], |v| 0.85 * v),
         &[Topic::CellModel],
         "cell_model",
@@ -563,7 +563,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        "model of a much larger cell",
+        "cell model of a much larger cell",
         |b| other_cell(b, &["r0_ohm", "r_ohm"], |ohm| 0.25 * ohm),
         &[Topic::CellModel, Topic::Unit],
         "",
@@ -588,7 +588,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         3,
     ),
     fault(
-        "somebody else is sending our frames",
+        "another node sends our frames",
         |b| {
             b.log.push_str(
                 "(1700000060.000000) can0 6B0#0011223344556677\n(1700000060.100000) can0 6B0#0011223344556677\n",

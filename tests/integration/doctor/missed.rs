@@ -1,4 +1,4 @@
-//! Faults that were once called healthy, in rows of the same form.
+//! Faults that the doctor once missed, in the same table form.
 
 use packwatch::wiring::Topic;
 
@@ -6,14 +6,14 @@ use super::bench::Bench::{Pack12, Pack96, Pulses, Steady, Total, Walk};
 use super::bench::Broken;
 use super::faults::{Fault, fault};
 
-/// Leaves the start bits of the cells as they were, which one who exchanges `@1` and `@0` does.
+/// Swaps `@1` and `@0` but leaves the start bits of the cells unchanged, as a careless author would.
 fn byte_order_alone(broken: &mut Broken) {
     for start in [16, 32, 48] {
         broken.dbc(&format!("{start}|16@1+ (0.0001"), &format!("{start}|16@0+ (0.0001"));
     }
 }
 
-/// Loses one frame in `of` of an identifier.
+/// Drops one of every `of` frames with an identifier.
 fn lose(broken: &mut Broken, wanted: &str, of: u32) {
     let mut n = 0;
     broken.frames(|stamp, interface, id, data| {
@@ -29,8 +29,8 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
-/// A second bus on which identifier 100 is another sender's: its current runs against the first one's, delayed. The
-/// configured current is `on`.
+/// Adds a second bus on which another sender uses identifier 100; its current is the first one's, inverted and delayed.
+/// The configured current is on interface `on`.
 fn second_bus(broken: &mut Broken, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
     broken.table("[input.cell_voltage]", "interface = \"can0\"");
@@ -48,7 +48,7 @@ fn second_bus(broken: &mut Broken, on: &str) {
     });
 }
 
-/// Fills in the pack's own voltage, `by` times the sum of the cells as the first of them is in the mean.
+/// Adds the pack's own voltage: `by` times the number of cells times the first cell's mean.
 fn pack_voltage(broken: &mut Broken, by: f64) {
     let cells = if broken.bench == Pack96 { 96.0 } else { 12.0 };
     let (mut sum, mut n) = (0.0, 0.0);
@@ -61,7 +61,7 @@ fn pack_voltage(broken: &mut Broken, by: f64) {
     broken.data("100", |data| data[2..4].copy_from_slice(&code.to_le_bytes()));
 }
 
-/// Two states of charge: the pack's own of 80 %, and the dash's.
+/// Adds two states of charge: the pack's own of 80 %, and the dashboard's.
 pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
     broken.dbc(
         "CM_ \"Example",
@@ -82,14 +82,14 @@ pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
     });
 }
 
-/// A change of a healthy pack, with its name.
+/// A name and the change of a healthy pack.
 type Change = (&'static str, fn(&mut Broken));
 
-/// As the healthy ones, with what the doctor looks at in addition.
+/// Further healthy packs, with the additional inputs that the doctor checks.
 pub(crate) const HEALTHY: &[Change] = &[
     ("two buses with one identifier", |b| second_bus(b, "can0")),
     ("the pack's voltage is the sum of its cells", |b| pack_voltage(b, 1.005)),
-    ("the dash agrees", |b| two_socs(b, 82)),
+    ("the dashboard agrees", |b| two_socs(b, 82)),
     ("one frame in a hundred lost", |b| lose(b, "100", 100)),
 ];
 
@@ -194,9 +194,16 @@ pub(crate) const MISSED: &[Fault] = &[
         &[Pack12, Pack96],
         2,
     ),
-    fault("one current in seven lost", |b| lose(b, "100", 7), &[Topic::Period], "", &[Pack12, Total, Steady, Walk], 2),
     fault(
-        "one current in seven lost, uneven sender",
+        "one current frame in seven lost",
+        |b| lose(b, "100", 7),
+        &[Topic::Period],
+        "",
+        &[Pack12, Total, Steady, Walk],
+        2,
+    ),
+    fault(
+        "one current frame in seven lost, uneven sender",
         |b| {
             lose(b, "100", 7);
             let mut n = 0_u32;
@@ -214,8 +221,8 @@ pub(crate) const MISSED: &[Fault] = &[
         &[Pack12],
         2,
     ),
-    fault("one page in seven lost", |b| lose(b, "110", 7), &[Topic::Period], "", &[Pack12, Pack96], 2),
-    fault("one temperature in seven lost", |b| lose(b, "120", 7), &[Topic::Period], "", &[Pack12], 2),
+    fault("one cell page in seven lost", |b| lose(b, "110", 7), &[Topic::Period], "", &[Pack12, Pack96], 2),
+    fault("one temperature frame in seven lost", |b| lose(b, "120", 7), &[Topic::Period], "", &[Pack12], 2),
     fault(
         "three times the strings",
         |b| b.config("strings = 1\n", "strings = 3\n"),
@@ -226,7 +233,7 @@ pub(crate) const MISSED: &[Fault] = &[
     ),
     fault(
         "a third of the strings",
-        // Three packs beside each other: a third of the resistance.
+        // Three packs in parallel: a third of the resistance.
         |b| {
             b.data("100", |d| {
                 let code = i16::from_le_bytes([d[0], d[1]]);
@@ -276,5 +283,5 @@ pub(crate) const MISSED: &[Fault] = &[
         &[Pack12, Pack96],
         2,
     ),
-    fault("the dash shows another SOC", |b| two_socs(b, 60), &[Topic::ReportedSoc], "", &[Pack12], 2),
+    fault("the dashboard shows another SOC", |b| two_socs(b, 60), &[Topic::ReportedSoc], "", &[Pack12], 2),
 ];

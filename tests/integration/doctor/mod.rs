@@ -1,8 +1,8 @@
-//! `packwatch doctor` against faults made on purpose: healthy packs of several configurations, scenarios and seeds are
-//! simulated, then the configuration, the DBC or the log is broken in one way, and the finding that comes first must be
-//! the right one. On the healthy ones nothing at all may be found.
+//! Tests `packwatch doctor` against injected faults. Healthy packs are simulated with several configurations, scenarios
+//! and seeds; then the configuration, the DBC or the log is broken in one way. The first finding must be the right one.
+//! On healthy packs the doctor must find nothing.
 //!
-//! `faults` is the whole table: name, how it is broken, what must come first, the line proposed.
+//! `faults` is the table: name, how to break the pack, expected first finding, proposed line.
 
 mod bench;
 mod cli;
@@ -14,12 +14,12 @@ use faults::{FAULTS, Fault};
 use missed::MISSED;
 use packwatch::wiring::{Severity, Topic, WiringReport};
 
-/// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
+/// First seed. Set `PACKWATCH_FIRST_SEED` for packs that no earlier run used.
 fn first_seed() -> u64 {
     std::env::var("PACKWATCH_FIRST_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1)
 }
 
-/// Healthy packs, and how many of each.
+/// Healthy packs, and the number of seeds of each.
 const HEALTHY: &[(Bench, u64)] = &[
     (Bench::Pack12, 6),
     (Bench::Pack96, 2),
@@ -40,7 +40,7 @@ fn findings(report: &WiringReport) -> Vec<String> {
 }
 
 #[test]
-fn nothing_is_found_on_healthy_packs() {
+fn healthy_packs_have_no_finding() {
     let (mut logs, mut wrong) = (0, Vec::new());
     for (bench, seeds) in HEALTHY {
         for seed in first_seed()..first_seed() + seeds {
@@ -68,7 +68,7 @@ fn nothing_is_found_on_healthy_packs() {
 }
 
 #[test]
-fn a_dead_last_module_is_not_reported_as_a_smaller_pack_for_certain() {
+fn dead_last_module_is_only_a_warning() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.data("110", |data| {
         if data[0] > 2 {
@@ -82,7 +82,7 @@ fn a_dead_last_module_is_not_reported_as_a_smaller_pack_for_certain() {
 }
 
 #[test]
-fn a_silent_interface_is_reported_with_the_listening_time() {
+fn silent_interface_reports_listening_time() {
     let mut doctor = Broken::of(Bench::Pack12, 1).doctor();
     doctor.handle_listened(60.0);
     let report = doctor.finish();
@@ -91,7 +91,7 @@ fn a_silent_interface_is_reported_with_the_listening_time() {
     assert_eq!(report.seconds, 60.0);
 }
 
-/// Found first, found but not first, not found.
+/// Faults found first, found later, and missed.
 #[derive(Default)]
 struct Tally {
     first: usize,
@@ -126,7 +126,7 @@ fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
 }
 
 #[test]
-fn each_fault_made_on_purpose_is_found_first() {
+fn injected_fault_is_first_finding() {
     let mut tally = Tally::default();
     for fault in FAULTS.iter().chain(MISSED) {
         for bench in fault.benches {
@@ -137,7 +137,7 @@ fn each_fault_made_on_purpose_is_found_first() {
     }
     let all = tally.first + tally.later + tally.missed;
     eprintln!(
-        "{all} broken cases of {} faults: {} named first, {} named after another, {} missed",
+        "{all} broken cases of {} faults: {} found first, {} found after another, {} missed",
         FAULTS.len() + MISSED.len(),
         tally.first,
         tally.later,
@@ -148,7 +148,7 @@ fn each_fault_made_on_purpose_is_found_first() {
 }
 
 #[test]
-fn answers_that_never_come_are_found() {
+fn missing_answers_are_found() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.config("\"CellVoltages.CellVoltage{n}\"", "\"Car.Cell{n}\"");
     broken.config.push_str(

@@ -1,10 +1,10 @@
-//! Random configurations: each that `check` accepts runs without a panic and accepts its own stored state.
+//! Random configurations: each one that `check` accepts must run without a panic and accept its own stored state.
 
 use super::*;
 
 const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
-/// Tables whose numbers are drawn.
+/// Tables with random numbers.
 const TABLES: [&str; 9] = [
     "pack",
     "estimator",
@@ -17,12 +17,12 @@ const TABLES: [&str; 9] = [
     "limits.temperature",
 ];
 
-/// Rounds of readings after which most configurations have shown what they do, and those of one in [`LONG_ONE_IN`].
+/// Rounds of readings, enough for most configurations, and for one configuration in [`LONG_ONE_IN`].
 const ROUNDS: usize = 16;
 const LONG_ROUNDS: usize = 80;
 const LONG_ONE_IN: usize = 8;
 
-/// A key with a number, and its range.
+/// A numeric key and its range.
 struct NumberKey {
     table: &'static str,
     name: &'static str,
@@ -31,7 +31,7 @@ struct NumberKey {
     is_low_open: bool,
 }
 
-/// The keys of the reference page.
+/// All numeric keys of the reference page.
 fn keys() -> Vec<NumberKey> {
     let (mut keys, mut table) = (Vec::new(), "");
     for line in REFERENCE.lines() {
@@ -41,7 +41,7 @@ fn keys() -> Vec<NumberKey> {
         let mut parts = line.split('|').map(str::trim);
         let (Some(""), Some(name), Some(value)) = (parts.next(), parts.next(), parts.next()) else { continue };
         let Some(range) = value.strip_prefix("a number, ").filter(|_| !table.is_empty()) else { continue };
-        let number = |text: &str| text.trim().parse::<f64>().expect("a number of the reference");
+        let number = |text: &str| text.trim().parse::<f64>().expect("a number in the reference");
         let (low, high, is_low_open) = match range.strip_prefix("above ") {
             Some(open) => {
                 let (low, high) = open.split_once(" and at most ").expect("two ends");
@@ -54,12 +54,12 @@ fn keys() -> Vec<NumberKey> {
         };
         keys.push(NumberKey { table, name: name.trim_matches('`'), low, high, is_low_open });
     }
-    assert!(keys.len() > 60, "the reference page is read: {} keys", keys.len());
+    assert!(keys.len() > 60, "too few keys read from the reference page: {}", keys.len());
     keys
 }
 
 impl NumberKey {
-    /// A value of the range: an end, any, or of any order of magnitude.
+    /// Draws a value of the range: an end, a uniform number, or a random order of magnitude.
     fn draw(&self, dice: &mut Dice) -> f64 {
         let least = if self.is_low_open { self.low + 1e-9 * (self.high - self.low).min(1.0) } else { self.low };
         match dice.below(6) {
@@ -75,12 +75,12 @@ impl NumberKey {
     }
 }
 
-/// Any order of magnitude.
+/// Draws a number of random order of magnitude.
 fn magnitude(dice: &mut Dice, low: f64, high: f64) -> f64 {
     dice.between(low.ln(), high.ln()).exp()
 }
 
-/// A cell model between coin cell and bar of copper.
+/// A random cell model, from plausible to absurd.
 fn cell_model(dice: &mut Dice, capacity_ah: f64, is_usual: bool) -> String {
     let (low_ohm, high_ohm) = if is_usual { (1e-4, 0.2) } else { (1e-9, 1e3) };
     let (low_f, high_f) = if is_usual { (1e2, 1e5) } else { (1e-6, 1e12) };
@@ -110,12 +110,12 @@ fn cell_model(dice: &mut Dice, capacity_ah: f64, is_usual: bool) -> String {
     text
 }
 
-/// A configuration with a few, or many, of its numbers drawn.
+/// A configuration with a few or many random numbers.
 fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     let is_usual = !dice.one_in(4);
     let capacity_ah = if is_usual { magnitude(dice, 1.0, 100.0) } else { magnitude(dice, 1.1e-3, 0.9e5) };
     let share = [2, 5, 20][dice.below(3)];
-    // Fewer than three cells are not compared with each other.
+    // packwatch compares cells with each other only if there are at least three.
     let base = PACK.replace("cells/example_nmc_2600.toml", "cell.toml").replace("cells = 2\n", "cells = 3\n");
     let mut tables: Vec<(&str, String)> = Vec::new();
     for key in keys.iter().filter(|key| key.table != "usable") {
@@ -127,7 +127,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
                 "max_v" => dice.between(4.3, 1000.0),
                 "min_c" => dice.between(-100.0, -10.0),
                 "max_c" | "to_soc" => dice.between(0.5, 1.0) * key.high,
-                // Of a cell without a model file.
+                // Only for a cell without a model file.
                 "voltage_min_v" | "voltage_max_v" => continue,
                 _ => key.draw(dice),
             };
@@ -154,7 +154,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     let mut text = base;
     for (table, lines) in tables {
         let header = format!("[{table}]\n");
-        // Keys of a table that is there already go into it.
+        // Insert keys into an existing table.
         text = match text.find(&header) {
             Some(place) => {
                 let (before, after) = text.split_at(place + header.len());
@@ -172,7 +172,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     (text, cell_model(dice, capacity_ah, is_usual))
 }
 
-/// Random readings through an accepted configuration; then its own state.
+/// Feeds random readings to an accepted configuration, then restores its own state.
 fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
     let (mut monitor, mut out, encoder) =
         (Monitor::new(config.clone()), Outputs::default(), InputEncoder::new(&config.input));
@@ -212,7 +212,7 @@ fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
 }
 
 #[test]
-fn every_accepted_configuration_runs_and_accepts_its_own_state() {
+fn accepted_configuration_runs_and_restores_state() {
     let wanted: u64 = std::env::var("PACKWATCH_CONFIGS").map_or(2000, |count| count.parse().expect("a number"));
     let first: u64 = std::env::var("PACKWATCH_FIRST").map_or(1, |seed| seed.parse().expect("a number"));
     let keys = keys();
@@ -239,11 +239,11 @@ fn every_accepted_configuration_runs_and_accepts_its_own_state() {
     }
     eprintln!("{accepted} of {wanted} configurations accepted, {} refuse their own state", refused_states.len());
     assert!(refused_states.is_empty(), "{}", refused_states.join("\n---\n"));
-    assert!(accepted > wanted / 10, "enough configurations are accepted: {accepted} of {wanted}");
+    assert!(accepted > wanted / 10, "too few configurations are accepted: {accepted} of {wanted}");
 }
 
 #[test]
-fn a_far_initial_capacity_and_a_short_information_time_are_refused() {
+fn extreme_initial_capacity_is_rejected() {
     for (key, table) in [("initial_capacity_ah = 1e-12", "[pack]"), ("initial_capacity_ah = 500", "[pack]")] {
         let text = PACK.replace(table, &format!("{table}\n{key}"));
         let read = |path: &Path| match path.to_str() {

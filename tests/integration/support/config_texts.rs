@@ -1,10 +1,10 @@
-//! A configuration from texts: `pack.toml` and `pack.dbc` as given, what else they name (cell models) as shipped.
+//! A configuration from texts: `pack.toml` and `pack.dbc` as given, other files (cell models) as shipped.
 
 use std::path::Path;
 
 use packwatch::config::{self, Config, ConfigFiles};
 
-/// The configuration; a faulty one ends the test with all its faults.
+/// Loads the configuration. If it is faulty, panics with all its faults.
 pub(crate) fn load(pack: &str, dbc: &str) -> Config {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let read = |path: &Path| match path.to_str() {

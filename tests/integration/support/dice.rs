@@ -1,10 +1,10 @@
-//! Seeded numbers for tests that draw their inputs.
+//! Seeded random numbers for tests.
 
-/// One stream of random numbers (xorshift64*).
+/// A stream of random numbers (xorshift64*).
 pub(crate) struct Dice(u64);
 
 impl Dice {
-    /// The numbers of a seed.
+    /// Creates the stream of a seed.
     pub(crate) fn new(seed: u64) -> Self {
         Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
     }
@@ -21,12 +21,12 @@ impl Dice {
         usize::try_from(self.next() % limit as u64).expect("below limit")
     }
 
-    /// Whether one chance in `count` comes up.
+    /// Returns true with probability 1 in `count`.
     pub(crate) fn one_in(&mut self, count: usize) -> bool {
         self.below(count) == 0
     }
 
-    /// Uniform.
+    /// Uniform between `low` and `high`.
     pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.next() as f64 / (1_u64 << 53) as f64
     }

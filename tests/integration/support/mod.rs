@@ -1,4 +1,4 @@
-//! Helpers that several subjects share.
+//! Helpers shared by several test modules.
 
 pub(crate) mod config_texts;
 pub(crate) mod dice;

@@ -1,4 +1,4 @@
-//! `cantools`, asked live through `tests/tools/dbc_oracle.py`.
+//! Runs `cantools` through `tests/tools/dbc_oracle.py`.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -6,23 +6,23 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// The interpreter; `None`, and said so, when none is named.
+/// The interpreter. Prints a note and returns `None` if none is set.
 pub(crate) fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
-        eprintln!("SKIPPED: PACKWATCH_PYTHON names no Python with cantools, nothing was compared");
+        eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with cantools");
     }
     python
 }
 
-/// What the oracle answers, line by line.
+/// Lines that the oracle answers.
 pub(crate) fn ask(python: &OsString, dbc: &Path, arguments: &[&str], lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/dbc_oracle.py");
     let mut command = Command::new(python);
     command.arg(script).arg(dbc).args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
     let mut child = command.spawn().unwrap();
     let (mut stdin, text) = (child.stdin.take().unwrap(), lines.join("\n"));
-    // A question that is not read (the oracle failed) shows in its exit status.
+    // Ignore write errors: if the oracle fails, its exit status shows that.
     let writer = std::thread::spawn(move || stdin.write_all(text.as_bytes()));
     let output = child.wait_with_output().unwrap();
     let _ = writer.join().unwrap();
@@ -30,7 +30,7 @@ pub(crate) fn ask(python: &OsString, dbc: &Path, arguments: &[&str], lines: &[St
     String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect()
 }
 
-/// Signal values of one answer; panics, with the reason, when cantools refused the payload.
+/// Signal values of one answer. Panics with the reason if cantools rejected the payload.
 pub(crate) fn values(question: &str, answer: &str) -> HashMap<String, f64> {
     assert!(!answer.starts_with('!'), "cantools refused {question}: {answer}");
     let pair = |pair: &str| pair.split_once('=').map(|(name, value)| (name.to_owned(), value.parse().unwrap()));

@@ -1,4 +1,4 @@
-//! A pack of two cells on hand-made frames: what the tests of alarms and of restarts share.
+//! A two-cell pack with hand-made frames, shared by the tests of alarms and restarts.
 #![allow(dead_code, reason = "some helpers serve only one set of features")]
 
 use std::collections::BTreeSet;
@@ -68,7 +68,7 @@ pub(crate) fn load(alarms: &str) -> Config {
     config_texts::load(&format!("{PACK}{alarms}"), DBC)
 }
 
-/// An alarm frame, taken apart by hand as the shipped DBC lays it out.
+/// An alarm frame, decoded by hand according to the shipped DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Wire {
     pub(crate) rule: u8,
@@ -79,7 +79,7 @@ pub(crate) struct Wire {
     pub(crate) acknowledged: bool,
 }
 
-/// "Not available" of the value of an alarm frame, and of its cell.
+/// "Not available" for the value of an alarm frame, and for its cell.
 pub(crate) const NO_VALUE: u16 = 0x1FFF;
 pub(crate) const WHOLE_PACK: u16 = 0x7FF;
 
@@ -90,11 +90,11 @@ pub(crate) struct Rig {
     pub(crate) out: Outputs,
     pub(crate) events: Vec<Event>,
     pub(crate) frames: Vec<Frame>,
-    /// Identifiers sent, and whether their frames announce something.
+    /// Identifiers sent, and whether the frames announce a change.
     pub(crate) sent: BTreeSet<(CanId, bool)>,
     pub(crate) deci: i64,
     pub(crate) commands_sent: u8,
-    /// What the next second's frames carry; `None` = nothing.
+    /// Content of the next frames; `None` = no frame.
     pub(crate) current_a: Option<f64>,
     pub(crate) voltages_v: [Option<f64>; 2],
     pub(crate) temperatures_c: [Option<f64>; 2],
@@ -137,7 +137,7 @@ impl Rig {
         self.collect();
     }
 
-    /// Only time passes, a tenth of a second.
+    /// Advances by 0.1 s without frames.
     pub(crate) fn tick(&mut self) {
         self.deci += 1;
         let time = self.now();
@@ -150,18 +150,18 @@ impl Rig {
         self.frames.extend(self.out.frames.drain(..).map(|sent| sent.frame));
     }
 
-    /// Both sensors show `temperature_c` from now on, and `seconds` pass.
+    /// Sets both sensors to `temperature_c` and advances by `seconds`.
     pub(crate) fn heat(&mut self, temperature_c: f64, seconds: i64) {
         self.temperatures_c = [Some(temperature_c); 2];
         self.seconds(seconds);
     }
 
-    /// Frames ten times a second, ticks as often.
+    /// Advances with frames and ticks, ten of each per second.
     pub(crate) fn seconds(&mut self, seconds: i64) {
         (0..10 * seconds).for_each(|_| self.tick_with_frames());
     }
 
-    /// A tenth of a second.
+    /// Advances by 0.1 s with frames.
     pub(crate) fn tick_with_frames(&mut self) {
         {
             self.deci += 1;
@@ -185,7 +185,7 @@ impl Rig {
         }
     }
 
-    /// Another configuration, while it runs.
+    /// Reloads an edited configuration while the monitor runs.
     pub(crate) fn reload(&mut self, edit: impl FnOnce(&mut MonitorConfig)) -> Result<Reconfigured, ReconfigureError> {
         let (mut config, now) = (self.config.clone(), self.now());
         edit(&mut config);
@@ -197,7 +197,7 @@ impl Rig {
         result
     }
 
-    /// The process ended `away` ago and starts again; the clock advances by that, if it is known.
+    /// Ends the process and restarts it after `away`. Advances the clock by that time if it is known.
     pub(crate) fn restart(&mut self, away: Downtime) {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
         let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
@@ -208,7 +208,7 @@ impl Rig {
         }
     }
 
-    /// A discharge deep enough for every cell's capacity to be learned.
+    /// A discharge deep enough to learn every cell's capacity.
     pub(crate) fn discharge(&mut self) {
         self.seconds(20);
         self.current_a = Some(5.0);
@@ -271,7 +271,7 @@ pub(crate) fn command_frame(code: u64, rule: u64, cell: u64, counter: u8) -> Fra
     Frame::classic(CanId::Standard(1715), &payload).unwrap()
 }
 
-/// A rig whose pack was discharged enough for every cell's capacity to be learned and be below the threshold.
+/// A rig whose pack was discharged deeply enough that every cell's capacity is learned and below the threshold.
 pub(crate) fn learned() -> Rig {
     let mut rig = Rig::new("[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n[estimator]\ngate_sigma = 1000\n");
     rig.discharge();

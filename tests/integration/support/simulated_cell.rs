@@ -1,5 +1,5 @@
-//! A simulated cell through the whole core in one process: truth -> sensors -> frames of the DBC -> Monitor, with the ticks
-//! of a replay. Shared by the tests that judge the estimates.
+//! Runs a simulated cell through the whole core in one process: truth -> sensors -> frames of the DBC -> Monitor, with
+//! the ticks of a replay. Shared by the tests that judge the estimates.
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::io::ticks::Ticks;
@@ -7,10 +7,10 @@ use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PE
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
-/// A hole in the record longer than this means that its recorder was asleep, s; there is none here.
+/// A longer gap in the record means that the recorder was asleep, s. Here there is no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
-/// Runs `settings` to its end; after each moment `each` sees its time, the truth, the core, and the events of the core.
+/// Runs `settings` to the end. After each step calls `each` with the time, the truth, the core and the core's events.
 pub(crate) fn live(
     config: MonitorConfig,
     settings: packwatch::sim::Settings,

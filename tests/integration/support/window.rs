@@ -1,8 +1,8 @@
-//! Measured lives with holes: of each record only a window is left, and the same windows come again with the same seed.
+//! Measured lives with gaps: keeps only a window of each record. A seed always gives the same windows.
 
 use std::path::Path;
 
-/// What a window's length is counted in.
+/// Unit of a window's length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum By {
     /// Time.
@@ -24,8 +24,8 @@ impl Uniform {
     }
 }
 
-/// Writes the life to `to` with only a random window of 40 to 70 % left of each record; time stamps stay true, so the
-/// rest is a gap of known length and unknown current.
+/// Writes the life to `to`, keeping only a random window of 40 to 70 % of each record. Time stamps are unchanged, so
+/// the rest becomes a gap of known length and unknown current.
 pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: By) {
     let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
     let mut reader = csv::Reader::from_reader(file);
@@ -47,7 +47,7 @@ pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: By) {
     writer.flush().unwrap();
 }
 
-/// How far along its record each row is.
+/// Position of each row within its record, 0 to 1.
 fn along(record: &[csv::StringRecord], by: By) -> Vec<f64> {
     let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
     let mut along = vec![0.0];
