@@ -1,13 +1,13 @@
-//! DBC text to messages and signals.
+//! Parses DBC text to messages and signals.
 //!
 //! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages with their signals,
-//! multiplexing resolved into conditions on raw selector codes, value tables, units, cycle times, frame formats and
-//! end-to-end protection. [`Database::to_dbc`] writes it; the text reads back equal.
+//! multiplexing resolved to conditions on raw selector codes, value tables, units, cycle times, frame formats and
+//! end-to-end protection. [`Database::to_dbc`] writes the text; parsing that text gives an equal database.
 //!
-//! A file that is not a DBC, an identifier out of range, a name defined twice or multiplexing that cannot be resolved is
-//! a [`DbcError`] with its line. A signal that reaches past its message's end is accepted (decoding it gives
-//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame)), and so is an invalid layout: [`SignalLayout::plan`] rejects
-//! it.
+//! A file that is not a DBC, an identifier out of range, a name defined twice, or multiplexing that cannot be resolved
+//! gives a [`DbcError`] with its line. A signal that extends beyond its message is accepted: decoding it gives
+//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). An invalid layout is accepted, too;
+//! [`SignalLayout::plan`] rejects it.
 
 use std::collections::{HashMap, HashSet};
 
@@ -19,16 +19,16 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 mod attributes;
 mod write;
 
-/// Most nested multiplexors; deeper nesting counts as a loop.
+/// Maximum nesting of multiplexors; deeper nesting counts as a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
 
-/// Why a text is not a usable DBC.
+/// Reason why a text is not a usable DBC.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}")]
 pub struct DbcError {
-    /// Counted from 1.
+    /// Line number, counted from 1.
     pub line: usize,
-    /// The fault: found and allowed.
+    /// The fault: what was found and what is allowed.
     pub what: String,
 }
 
@@ -59,11 +59,11 @@ pub enum FrameFormat {
 /// How a message is repeated after an event; `None` = not stated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
-    /// `GenMsgNrOfRepetition`: frames after the first.
+    /// `GenMsgNrOfRepetition`: number of frames after the first.
     pub count: Option<u32>,
-    /// `GenMsgCycleTimeFast`: time between them, ms.
+    /// `GenMsgCycleTimeFast`: time between these frames, ms.
     pub period_ms: Option<u32>,
-    /// `GenMsgDelayTime`: shortest mean time between two frames of the message, ms.
+    /// `GenMsgDelayTime`: smallest mean time between two frames of the message, ms.
     pub delay_ms: Option<u32>,
 }
 
@@ -72,9 +72,9 @@ pub struct Repetition {
 pub struct Message {
     /// Identifier; extended when the DBC's bit 31 is set.
     pub id: CanId,
-    /// Unique in its database.
+    /// Name, unique in its database.
     pub name: String,
-    /// Payload length the DBC states, bytes.
+    /// Payload length in the DBC, bytes.
     pub len_bytes: u16,
     /// Sending node.
     pub sender: Option<String>,
@@ -84,11 +84,11 @@ pub struct Message {
     pub e2e: Option<Protection>,
     /// `SecOCProfile` and `SecOCDataId`, packwatch's own attributes.
     pub secoc: Option<Authentication>,
-    /// In the file's order.
+    /// Signals in the file's order.
     pub signals: Vec<Signal>,
-    /// `GenMsgCycleTime` (or its default), when above 0.
+    /// `GenMsgCycleTime` (or its default), if above 0.
     pub cycle_time_ms: Option<u32>,
-    /// How it is repeated after an event.
+    /// Repetition after an event.
     pub repetition: Repetition,
     /// `CM_ BO_`.
     pub comment: Option<String>,
@@ -97,19 +97,19 @@ pub struct Message {
 /// One signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// Unique in its message.
+    /// Name, unique in its message.
     pub name: String,
     /// Position and scaling.
     pub layout: SignalLayout,
-    /// As written, may be empty.
+    /// Unit as written; may be empty.
     pub unit: String,
     /// Receiving nodes.
     pub receivers: Vec<String>,
-    /// The signal is in the payload when all conditions hold; outermost multiplexor first.
+    /// The signal is present if all conditions hold; outermost multiplexor first.
     pub conditions: Vec<MuxCondition>,
     /// Whether the presence of other signals depends on this one.
     pub is_multiplexor: bool,
-    /// `VAL_`: raw value (signed for signed signals) and its name.
+    /// `VAL_`: raw values (signed for signed signals) and their names.
     pub values: Vec<(i64, String)>,
     /// `CM_ SG_`.
     pub comment: Option<String>,
@@ -120,12 +120,12 @@ pub struct Signal {
 pub struct MuxCondition {
     /// Index of the multiplexor in its message's `signals`.
     pub selector: usize,
-    /// Raw codes, both ends included; one of the ranges must hold the selector's code.
+    /// Ranges of raw codes, ends included; one of them must contain the selector's code.
     pub ranges: Vec<(u64, u64)>,
 }
 
 impl Database {
-    /// Reads the text of a DBC.
+    /// Parses the text of a DBC.
     ///
     /// # Errors
     /// The first fault, with its line.
@@ -136,7 +136,7 @@ impl Database {
         check_identifiers(&closed)?;
         let dbc = can_dbc::Dbc::try_from(closed.as_str()).map_err(|error| grammar_fault(&error))?;
         let details = DetailTable::new(&dbc);
-        // Pseudo message in which editors keep signals without a message.
+        // Editors keep signals without a message in this pseudo message.
         let messages = dbc.messages.iter().filter(|message| message.name != "VECTOR__INDEPENDENT_SIG_MSG");
         let messages: Result<Vec<_>, _> =
             messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
@@ -146,18 +146,17 @@ impl Database {
         Ok(database)
     }
 
-    /// Reads a DBC file's bytes: UTF-8 (with or without a byte-order mark), or Latin-1 where they are not UTF-8 (a DBC does
-    /// not state its encoding).
+    /// Parses the bytes of a DBC file: UTF-8 (with or without a byte-order mark), or Latin-1 if they are not valid
+    /// UTF-8. A DBC does not state its encoding.
     ///
     /// # Errors
-    /// As [`Self::parse`], and for UTF-16 text.
+    /// Like [`Self::parse`], and for UTF-16 text.
     pub fn parse_bytes(bytes: &[u8]) -> Result<Self, DbcError> {
         if is_utf_16(bytes) {
             let what = "is UTF-16 text, must be UTF-8 or Latin-1: save it in that encoding";
             return Err(DbcError { line: 1, what: what.to_owned() });
         }
-        // Some editors put the mark before Latin-1 text too.
-        // The byte-order mark U+FEFF in UTF-8.
+        // The byte-order mark U+FEFF in UTF-8. Some editors also put it before Latin-1 text.
         let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
@@ -165,12 +164,12 @@ impl Database {
         }
     }
 
-    /// The message of that name.
+    /// The message with the given name.
     pub fn message(&self, name: &str) -> Option<&Message> {
         self.messages.iter().find(|message| message.name == name)
     }
 
-    /// The signal of that full name, `Message.Signal`, with its message.
+    /// The signal with the given full name, `Message.Signal`, and its message.
     pub fn signal(&self, full_name: &str) -> Option<(&Message, &Signal)> {
         let (message, signal) = full_name.split_once('.')?;
         let message = self.message(message)?;
@@ -194,21 +193,21 @@ impl Database {
     }
 }
 
-/// Whether the bytes begin with a byte-order mark of UTF-16, or with a Latin letter in UTF-16.
+/// Whether the bytes start with a UTF-16 byte-order mark, or with a Latin letter in UTF-16.
 fn is_utf_16(bytes: &[u8]) -> bool {
     matches!(bytes, [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..] | [0, _, ..] | [_, 0, ..])
 }
 
 impl Message {
-    /// The signal of that name.
+    /// The signal with the given name.
     pub fn signal(&self, name: &str) -> Option<&Signal> {
         self.signals.iter().find(|signal| signal.name == name)
     }
 }
 
 impl Signal {
-    /// Raw codes (the signal's bits) that its value table calls "not available", "signal not available", "n/a" or
-    /// "SNA", whatever the case and with `_` for blanks.
+    /// Raw codes (the signal's bits) that the value table calls "not available", "signal not available", "n/a" or
+    /// "SNA", ignoring case and with `_` as a blank.
     pub fn not_available_codes(&self) -> Vec<u64> {
         let mask = u64::MAX >> (64 - u32::from(self.layout.length_bits.clamp(1, 64)));
         let says_so = |name: &str| {
@@ -219,7 +218,7 @@ impl Signal {
     }
 }
 
-/// A fault of a message or signal, before its line is known.
+/// A fault of a message or signal whose line is not known yet.
 struct MessageFault {
     message: String,
     signal: Option<String>,
@@ -227,7 +226,7 @@ struct MessageFault {
 }
 
 impl MessageFault {
-    /// Adds the last line in which the text defines the message (or signal).
+    /// Adds the line of the last definition of the message or signal.
     fn at(self, text: &str) -> DbcError {
         let (mut line, mut inside) = (1, false);
         for (number, content) in (1..).zip(text.lines()) {
@@ -250,7 +249,7 @@ impl MessageFault {
 fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
     match error {
         can_dbc::DbcError::Pest(error) => {
-            // The report's last line states the expectation; the lines before it draw the position.
+            // The report's last line states what was expected; the lines before it show the position.
             let report = error.to_string();
             let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= ")).unwrap_or("not a DBC");
             let line = error_line(&report);
@@ -260,13 +259,13 @@ fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
     }
 }
 
-/// The line in pest's report, which opens ` --> line:column`.
+/// The line number in pest's report, which starts with ` --> line:column`.
 fn error_line(report: &str) -> usize {
     let place = report.lines().next().and_then(|first| first.split("--> ").nth(1));
     place.and_then(|place| place.split(':').next()).and_then(|line| line.trim().parse().ok()).unwrap_or(1)
 }
 
-/// Identifiers without the extended bit must have 11 bits (the grammar crate would drop the higher ones).
+/// Checks that identifiers without the extended bit have 11 bits, because the grammar crate would drop the higher bits.
 fn check_identifiers(text: &str) -> Result<(), DbcError> {
     for (line, content) in (1..).zip(text.lines()) {
         let Some(rest) = content.trim_start().strip_prefix("BO_ ") else { continue };
@@ -279,7 +278,7 @@ fn check_identifiers(text: &str) -> Result<(), DbcError> {
     Ok(())
 }
 
-/// Statements about a signal outside its definition.
+/// Statements about a signal outside its `SG_` definition.
 #[derive(Default)]
 struct Details<'a> {
     comment: Option<&'a str>,
@@ -288,7 +287,7 @@ struct Details<'a> {
     multiplex: Vec<&'a can_dbc::ExtendedMultiplex>,
 }
 
-/// Details by message and signal.
+/// [`Details`] by message and signal.
 struct DetailTable<'a>(HashMap<(can_dbc::MessageId, &'a str), Details<'a>>);
 
 impl<'a> DetailTable<'a> {
@@ -334,7 +333,7 @@ fn read_message<'a>(
         can_dbc::MessageId::Extended(id) => CanId::extended(id),
     };
     let id = id.ok_or_else(|| fault(format!("message {}: identifier out of range", message.name)))?;
-    // Longer than a frame is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
+    // A length above 64 bytes is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
     let len_bytes = u16::try_from(message.size)
         .map_err(|_| fault(format!("message {}: length {}, must be 0 to 65535", message.name, message.size)))?;
     let signals: Result<Vec<_>, _> =
@@ -417,8 +416,8 @@ fn number(value: &can_dbc::NumericValue) -> f64 {
     }
 }
 
-/// The chain of conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names parent and
-/// ranges and overrules the number after `m`; without it the parent is the message's only `M`.
+/// The conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names the parent and the ranges,
+/// and takes precedence over the number after `m`. Without it, the parent is the message's only `M`.
 fn conditions<'a>(
     details: &DetailTable<'a>,
     message: &'a can_dbc::Message,
@@ -427,7 +426,7 @@ fn conditions<'a>(
 ) -> Result<Vec<MuxCondition>, String> {
     use can_dbc::MultiplexIndicator as Indicator;
     if depth > MAX_MULTIPLEX_DEPTH {
-        return Err(format!("multiplexors nested more than {MAX_MULTIPLEX_DEPTH} deep, or in a loop"));
+        return Err(format!("multiplexors nested more than {MAX_MULTIPLEX_DEPTH} levels deep, or in a loop"));
     }
     let (selector, ranges) = match (details.get(message, signal).multiplex.as_slice(), signal.multiplexer_indicator) {
         ([entry], _) => {
@@ -457,7 +456,9 @@ fn only_multiplexor(message: &can_dbc::Message) -> Result<usize, String> {
     match (candidates.next(), candidates.next()) {
         (Some((index, _)), None) => Ok(index),
         (None, _) => Err("multiplexed, but the message has no multiplexor (M)".to_owned()),
-        (Some(_), Some(_)) => Err("multiplexed by one of several multiplexors, SG_MUL_VAL_ must say which".to_owned()),
+        (Some(_), Some(_)) => {
+            Err("multiplexed, but the message has several multiplexors (M): SG_MUL_VAL_ must name one".to_owned())
+        }
     }
 }
 

@@ -1,9 +1,9 @@
-//! The plan that turns input frames into readings.
+//! Decodes input frames to readings.
 //!
-//! Built once from the configured signals; per frame it is a look-up by interface and identifier, one by the selector's
-//! code, and a shift and a multiply-add per signal. A signal that is not in the payload (by its multiplexor) gives no
-//! reading; one that is present but unusable gives a reading with its fault. The same identifier on another interface is
-//! another message, and so is the extended identifier of the same number.
+//! The decoding plan is built once from the configured signals. Each frame needs one look-up by interface and
+//! identifier, one by the selector's code, and a shift and a multiply-add per signal. A signal whose multiplexor says
+//! that it is absent gives no reading; one that is present but unusable gives a reading with its fault. The same
+//! identifier on another interface is another message, and so is the extended identifier with the same number.
 
 mod message_table;
 
@@ -16,12 +16,12 @@ use crate::quantity::{BusIndex, Fault};
 
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 
-/// One multiplexor a bound signal depends on: the selector's code must lie in one of the ranges (ends included).
+/// Condition on one multiplexor for a bound signal: the selector's code must lie in one of the ranges (ends included).
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {
     /// The selector.
     pub plan: SignalPlan,
-    /// Codes with which the signal is present.
+    /// Codes for which the signal is present.
     pub ranges: Vec<(u64, u64)>,
 }
 
@@ -31,38 +31,38 @@ impl MuxTest {
     }
 }
 
-/// One configured signal: its source and meaning.
+/// One configured signal: its position, its conversion and its channel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Binding {
     /// Interface.
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// Payload length the DBC states (used when frames are made, not when they are read).
+    /// Payload length in the DBC, bytes. Used to encode frames, not to decode them.
     pub len_bytes: u16,
     /// The signal.
     pub plan: SignalPlan,
-    /// All must hold; empty = always present.
+    /// Conditions that must all hold; empty = always present.
     pub mux: Vec<MuxTest>,
     /// Channel of its readings.
     pub channel: Channel,
-    /// Applied after the DBC's factor and offset: value x scale + offset (a current whose bus counts charging
-    /// positive has scale -1).
+    /// Applied after the DBC's factor and offset: value x scale + offset. For a bus that counts charging positive, the
+    /// scale of the current is -1.
     pub scale: f64,
     /// See `scale`.
     pub offset: f64,
     /// Raw codes (the signal's bits) that mean "not available".
     pub not_available: Vec<u64>,
-    /// Allowed values after scale and offset, both ends included.
+    /// Allowed values after scale and offset, ends included.
     pub range: (f64, f64),
 }
 
 impl Binding {
-    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" from the value
-    /// table. The caller applies the configuration.
+    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" codes from the
+    /// value table. The caller applies the configuration.
     ///
     /// # Errors
-    /// When the layout of the signal or of one of its multiplexors is invalid.
+    /// The layout of the signal or of one of its multiplexors is invalid.
     pub fn new(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Result<Self, LayoutFault> {
         let selectors = signal.conditions.iter().filter_map(|condition| {
             let selector = message.signals.get(condition.selector)?;
@@ -85,7 +85,7 @@ impl Binding {
     /// Whether the payload carries the signal.
     ///
     /// # Errors
-    /// A selector cannot be read.
+    /// A selector cannot be decoded.
     pub fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
         for test in &self.mux {
             let code = test.plan.raw(payload)?;
@@ -96,10 +96,10 @@ impl Binding {
         Ok(true)
     }
 
-    /// The value in the program's unit and sign.
+    /// Decodes the value, in the program's unit and sign.
     ///
     /// # Errors
-    /// Why there is none.
+    /// The reason why the value is not usable.
     pub fn value(&self, payload: &[u8]) -> Result<f64, Fault> {
         if !self.not_available.is_empty() && self.not_available.contains(&self.plan.raw(payload)?) {
             return Err(Fault::NotAvailable);
@@ -109,7 +109,7 @@ impl Binding {
     }
 }
 
-/// All configured signals, found by interface and identifier.
+/// All configured signals, indexed by interface and identifier.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct InputMap {
     /// Sorted by message, then channel.
@@ -124,9 +124,9 @@ impl InputMap {
         Self { messages: MessageTable::new(&bindings), bindings }
     }
 
-    /// Passes the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those that are
-    /// present. When a selector cannot be read, every signal that depends on it is a short frame. Frames that are not
-    /// configured, and remote frames, give no reading.
+    /// Passes the readings of one frame to `each`, in the order of [`Channel`]. Multiplexed signals that are absent
+    /// give no reading. If a selector cannot be decoded, every signal that depends on it gives a short-frame fault.
+    /// Frames that are not configured and remote frames give no readings.
     #[inline]
     pub fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
         if frame.kind() != FrameKind::Remote {
@@ -134,8 +134,8 @@ impl InputMap {
         }
     }
 
-    /// Every configured message, by interface and identifier, with the number of its groups of signals that are present
-    /// together: its multiplexer pages, or a few more; 1 without pages.
+    /// Every configured message by interface and identifier, with its number of signal groups. A group contains signals
+    /// that are present together: usually one group per multiplexer page, sometimes more; 1 without pages.
     pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
         self.messages.messages()
     }
@@ -145,7 +145,7 @@ impl InputMap {
         self.messages().filter(|(other, ..)| *other == bus).map(|(_, id, _)| id).collect()
     }
 
-    /// Every configured channel, ascending, each once.
+    /// Every configured channel in ascending order.
     pub fn channels(&self) -> Vec<Channel> {
         let mut channels: Vec<_> = self.bindings.iter().map(|binding| binding.channel).collect();
         channels.sort_unstable();

@@ -1,8 +1,8 @@
-//! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, the sender's and the receiver's half.
+//! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, for senders and receivers.
 //!
-//! A protected payload begins with a header: a CRC over an agreed data identifier and the rest of the payload, and a
-//! counter that rises by one from frame to frame. From it the receiver detects payloads that are damaged, repeated, lost or
-//! of another message. It detects faults; it does not stop an attacker, who can compute a CRC too.
+//! A protected payload starts with a header: a CRC over an agreed data identifier and the rest of the payload, and a
+//! counter that increases by one with each frame. The header lets the receiver detect payloads that are damaged,
+//! repeated, lost or from another message. It does not stop an attacker, who can compute a CRC, too.
 //!
 //! | profile | bytes of the header | CRC | counter |
 //! | --- | --- | --- | --- |
@@ -11,22 +11,24 @@
 //! | 5 | 0, 1: CRC, low byte first; 2: counter | CRC-16 0x1021, from 0xFFFF, of payload from byte 2, id low, id high | 0 to 255 |
 //!
 //! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it.
-//! The CRC of profile 1 is the one of the AUTOSAR library with its start value and final XOR of 0xFF cancelled.
+//! The CRC of profile 1 equals the AUTOSAR library's CRC-8 with its start value and final XOR (0xFF) cancelled.
 //!
 //! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
 //! Library" as implemented by two peers and four open receivers; vectors in the tests.
 //!
-//! Deviation 1: profile 5 has no SYNC and INITIAL of its own in AUTOSAR (the state machine above it makes them). Here the
-//! receiver of profile 1 serves it too, with the counter modulo 256: both profiles have the same statuses and counts.
-//! Effect: a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK; and its
-//! allowed step grows while frames are missing. As in AUTOSAR's own check of profile 5, the sequence continues from a
-//! counter that jumped too far (a sender that restarted costs one frame, not a turn of 256).
-//! Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) ends at 14 for both profiles, where it means
+//! Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
+//! provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles
+//! have the same statuses and counts. Effect: the first frame of profile 5 is INITIAL and not used, where AUTOSAR's
+//! check alone might return OK; and the allowed step grows while frames are missing. As in AUTOSAR's check of profile
+//! 5, the sequence continues from a counter that jumped too far: a sender that restarted costs one frame, not a round
+//! of 256.
+//! Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) ends at 14 for both profiles, and 14 means
 //! "any number".
-//! Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame, and once
-//! for each period without one where the period is known; where it is unknown, the allowed step grows with bad frames only.
-//! Deviation 4: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
-//! error). Here it is [`Status::WrongCrc`]: no sender can have made the payload.
+//! Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame and,
+//! if the period is known, once for each period without a frame. If the period is unknown, the allowed step grows with
+//! bad frames only.
+//! Deviation 4: in AUTOSAR, the counter 15 of profile 1, which no sender may use, has no status (the check returns an
+//! error). Here it is [`Status::WrongCrc`], because no valid sender creates such a payload.
 
 mod receiver;
 
@@ -37,10 +39,10 @@ pub use receiver::{CheckConfig, Receiver, Status, StatusCounts};
 /// Layout, CRC and counter of a protection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
-    /// Profile 1, variant A: the whole data identifier is in the CRC only.
+    /// Profile 1, variant A: the data identifier is included in the CRC and not sent.
     #[serde(rename = "1A")]
     P01A,
-    /// Profile 1, variant C: four bits of the data identifier are sent, its low byte is in the CRC.
+    /// Profile 1, variant C: four bits of the data identifier are sent, its low byte is included in the CRC.
     #[serde(rename = "1C")]
     P01C,
     /// Profile 5.
@@ -49,7 +51,7 @@ pub enum Profile {
 }
 
 impl Profile {
-    /// Name in a configuration.
+    /// Name in the configuration.
     pub const fn name(self) -> &'static str {
         match self {
             Self::P01A => "1A",
@@ -58,7 +60,7 @@ impl Profile {
         }
     }
 
-    /// Bits of the first three bytes that the protection writes; least significant bit of each byte = bit 0.
+    /// Bits of the first three bytes that the protection writes; bit 0 is the least significant bit of a byte.
     pub const fn header_mask(self) -> [u8; 3] {
         match self {
             Self::P01A => [0xFF, 0x0F, 0],
@@ -75,7 +77,7 @@ impl Profile {
         }
     }
 
-    /// Longest payload the standard protects with this profile, bytes: 240 bits in profile 1; any frame in profile 5.
+    /// Longest payload that the profile may protect, bytes: 240 bits for profile 1, any frame for profile 5.
     pub const fn max_bytes(self) -> usize {
         match self {
             Self::P01A | Self::P01C => 30,
@@ -83,7 +85,7 @@ impl Profile {
         }
     }
 
-    /// Largest data identifier: variant 1C has room for 12 bits of it.
+    /// Largest data identifier: variant 1C uses only 12 bits.
     pub const fn max_data_id(self) -> u16 {
         match self {
             Self::P01C => 0x0FFF,
@@ -99,40 +101,43 @@ impl Profile {
         }
     }
 
-    /// The counter after `counter`; after the largest (and after anything beyond it) comes 0.
+    /// The counter after `counter`. The largest counter, and any invalid one, is followed by 0.
     pub const fn next_counter(self, counter: u8) -> u8 {
         if counter < self.max_counter() { counter + 1 } else { 0 }
     }
 
-    /// Steps from `from` to `to`, both valid: 0 to the largest counter.
+    /// Number of steps from `from` to `to`, which must both be valid: 0 to the largest counter.
     const fn counter_delta(self, from: u8, to: u8) -> u8 {
         if to >= from { to - from } else { self.max_counter().wrapping_sub(from).wrapping_add(to).wrapping_add(1) }
     }
 }
 
-/// Why a payload cannot be protected.
+/// Reason why a payload cannot be protected.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct ProtectError(String);
 
-/// Agreement between sender and receiver of one message.
+/// Protection of one message, as agreed between sender and receiver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Protection {
     /// Layout, CRC and counter.
     pub profile: Profile,
-    /// Data identifier, unique among messages; 1C uses 12 bits of it.
+    /// Data identifier, unique among messages. 1C uses 12 bits of it.
     pub data_id: u16,
 }
 
 impl Protection {
-    /// Writes counter, identifier nibble (1C) and CRC into a payload whose other bytes are final.
+    /// Writes counter, identifier nibble (1C) and CRC to a payload whose other bytes are final.
     ///
     /// # Errors
-    /// When the payload is shorter than the header or the counter beyond the profile's largest; nothing is written then.
+    /// The payload is shorter than the header, or the counter is above the profile's largest. The payload is then
+    /// unchanged.
     pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
         let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
         if found < needed {
-            return Err(ProtectError(format!("payload of {found} bytes, this profile needs {needed} or more")));
+            return Err(ProtectError(format!(
+                "payload of {found} bytes, must be at least {needed} bytes for this profile"
+            )));
         }
         if counter > max {
             return Err(ProtectError(format!("end-to-end counter {counter}, must be 0 to {max}")));
@@ -152,7 +157,7 @@ impl Protection {
         Ok(())
     }
 
-    /// The counter of a payload whose CRC, identifier and counter are valid.
+    /// The counter of a payload with valid CRC, identifier and counter; `None` = something is invalid.
     pub fn verified_counter(&self, payload: &[u8]) -> Option<u8> {
         let counter = self.counter(payload)?;
         let intact = match self.profile {
@@ -163,7 +168,7 @@ impl Protection {
         (intact && counter <= self.profile.max_counter()).then_some(counter)
     }
 
-    /// The counter in the payload, also with a wrong CRC; `None` = too short.
+    /// The counter in the payload, even if the CRC is wrong; `None` = too short.
     pub fn counter(&self, payload: &[u8]) -> Option<u8> {
         match self.profile {
             Profile::P01A | Profile::P01C => payload.get(1).map(|byte| byte & 0x0F),
@@ -171,25 +176,25 @@ impl Protection {
         }
     }
 
-    /// Low nibble of the identifier's high byte, which 1C sends.
+    /// Low nibble of the identifier's high byte, which variant 1C sends.
     const fn id_nibble(&self) -> u8 {
         self.data_id.to_be_bytes()[0] & 0x0F
     }
 
-    /// CRC of profile 1 over everything but its own byte.
+    /// CRC of profile 1, over everything except the CRC itself.
     fn crc8(&self, payload: &[u8]) -> u8 {
         let [high, low] = self.data_id.to_be_bytes();
         let second = if self.profile == Profile::P01C { 0 } else { high };
         crc8(crc8(0, &[low, second]), &payload[1..])
     }
 
-    /// CRC of profile 5 over everything but its own bytes.
+    /// CRC of profile 5, over everything except the CRC itself.
     fn crc16(&self, payload: &[u8]) -> u16 {
         crc16(crc16(0xFFFF, &payload[2..]), &self.data_id.to_le_bytes())
     }
 }
 
-/// CRC of each byte value in a register of so many bits.
+/// Table of the CRC of each byte value, for a register of `bits` bits.
 const fn crc_table(bits: u32, polynomial: u16) -> [u16; 256] {
     let (mut table, mut byte) = ([0; 256], 0);
     while byte < 256 {
@@ -208,7 +213,7 @@ static CRC8: [u16; 256] = crc_table(8, 0x1D);
 static CRC16: [u16; 256] = crc_table(16, 0x1021);
 
 fn crc8(start: u8, bytes: &[u8]) -> u8 {
-    // The lowest byte is the register.
+    // The register is the lowest byte.
     bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 

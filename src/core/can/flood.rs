@@ -1,10 +1,10 @@
-//! Limits the frames per identifier: a faulty sender must not use up the time for the others.
+//! Limits the frame rate per identifier, so that a faulty sender does not use up the processing time of the others.
 //!
-//! In: time and identifier of each received frame. Out: whether it is admitted; dropped frames are counted, and a
-//! [`FloodChange`] says when dropping began and ended. Per message it is a leaky bucket in one number (the time up to which
-//! the allowed rate is spent): a burst of one tenth of a second's frames passes at once, and in the long run the rate.
-//! Deterministic from the stamps; nothing is allocated after the start. Messages that are not configured pass: they are not
-//! decoded and cost almost nothing.
+//! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
+//! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
+//! time up to which the allowed rate is spent. It admits a burst of one tenth of a second's frames at once, and the
+//! allowed rate in the long run. The result depends only on the time stamps, and nothing is allocated after the start.
+//! Messages that are not configured pass, because they are not decoded and cost almost nothing.
 
 use std::num::NonZeroU32;
 
@@ -14,7 +14,7 @@ use crate::can::CanId;
 use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Allowed frames of one identifier.
+/// Allowed rate of one identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FloodConfig {
     /// Frames per second on one interface.
@@ -22,27 +22,28 @@ pub struct FloodConfig {
 }
 
 impl Default for FloodConfig {
-    /// 2,000: a saturated bus of 500 kbit/s carries about 4,000 frames a second in all, and no battery message is sent
-    /// more often than once a millisecond. Twice the fastest intended sender, half of what one faulty sender can send.
+    /// 2,000: a saturated bus of 500 kbit/s carries about 4,000 frames a second in total, and no battery message is
+    /// sent more often than once a millisecond. This is twice the rate of the fastest intended sender and half of what
+    /// one faulty sender can send.
     fn default() -> Self {
         Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
     }
 }
 
-/// Dropping began or ended.
+/// Reports that dropping started or ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodChange {
     /// Interface.
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// Whether dropping began.
+    /// Whether dropping started.
     pub active: bool,
-    /// Frames dropped in this flood so far: 1 when it begins, all of them when it ends.
+    /// Frames dropped in this flood so far: 1 at its start, all of them at its end.
     pub dropped: u64,
 }
 
-/// Frames of one message dropped so far.
+/// Number of dropped frames of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FloodCount {
@@ -50,11 +51,11 @@ pub struct FloodCount {
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// Frames.
+    /// Dropped frames.
     pub dropped: u64,
 }
 
-/// Spent budget and present flood of one message: what a snapshot keeps for a continuation without a break.
+/// Spent budget and current flood of one message, for a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodProgress {
     bus: BusIndex,
@@ -67,36 +68,36 @@ pub struct FloodProgress {
 struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
-    /// Burst that passes at once, ns of the allowed rate.
+    /// Burst that is admitted at once, as time at the allowed rate, ns.
     burst_ns: i64,
     /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
     dropped: u64,
-    /// The present flood: frames dropped in it, and the time of the last one.
+    /// The current flood: frames dropped in it, and the time of the last one.
     flood: Option<(u64, Timestamp)>,
 }
 
-/// The limit for every configured message.
+/// Rate limits of all configured messages.
 #[derive(Debug, Clone)]
 pub struct FloodGate {
     /// Time of one frame at the allowed rate, ns.
     frame_ns: i64,
     /// Sorted by interface and identifier.
     buckets: Vec<LeakyBucket>,
-    /// Index of a message's bucket.
+    /// Maps messages to bucket indices.
     numbers: IdTable,
-    /// Changes that wait to be published, in their order.
+    /// Changes to be published, in order.
     pub(crate) changes: Vec<FloodChange>,
 }
 
 impl FloodGate {
-    /// A gate for these messages, each with its number of pages: a multiplexed message may send all its pages twice at
-    /// once.
+    /// Creates a gate for messages, each with its number of pages. A multiplexed message may send each of its pages
+    /// twice at once.
     pub fn new(config: &FloodConfig, messages: impl IntoIterator<Item = (BusIndex, CanId, usize)>) -> Self {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
-            // Length of the burst that passes at once, ns: a tenth of a second's frames.
+            // Burst that is admitted at once, ns: the frames of a tenth of a second.
             let burst_ns = 100_000_000.max(pages_ns).max(frame_ns);
             LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };
@@ -107,7 +108,7 @@ impl FloodGate {
         Self { frame_ns, numbers, changes: Vec::with_capacity(buckets.len() + 1), buckets }
     }
 
-    /// Inherits counts, spent budget and floods of another gate for the messages that are in both.
+    /// Inherits counts, spent budgets and floods from `old` for the messages that are in both gates.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for bucket in &mut self.buckets {
@@ -118,7 +119,7 @@ impl FloodGate {
         self
     }
 
-    /// Whether a frame is admitted; time never runs backwards except after [`Self::restart`].
+    /// Whether a frame is admitted. `now` must never go back, except after [`Self::restart`].
     #[inline]
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
         let Some(bucket) = self.buckets.get_mut(self.numbers.number(bus, id)) else { return true };
@@ -136,25 +137,25 @@ impl FloodGate {
         false
     }
 
-    /// Ends the floods that are over.
+    /// Ends floods that are over.
     pub fn poll(&mut self, now: Timestamp) {
-        // Without a dropped frame for this long the flood is over, s: dropping that comes and goes is one flood.
+        // A flood is over after this time without a dropped frame, s. Shorter pauses belong to the same flood.
         self.end(|last| now.since(last) >= 1.0);
     }
 
-    /// After sleep or a step of the clock: the whole budget is available, and every flood is over.
+    /// Handles sleep or a clock step: restores the whole budget and ends every flood.
     pub fn restart(&mut self) {
         self.end(|_| true);
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
-    /// Messages with dropped frames, and their number.
+    /// Messages with dropped frames, with their number.
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
     }
 
-    /// Spent budgets and present floods.
+    /// Spent budgets and current floods.
     pub fn progress(&self) -> Vec<FloodProgress> {
         let is_used = |bucket: &&LeakyBucket| bucket.spent_until.is_some() || bucket.flood.is_some();
         let of = |bucket: &LeakyBucket| FloodProgress {
@@ -166,7 +167,7 @@ impl FloodGate {
         self.buckets.iter().filter(is_used).map(of).collect()
     }
 
-    /// Continues stored budgets and floods.
+    /// Restores stored budgets and floods.
     pub fn resume(&mut self, stored: &[FloodProgress]) {
         for of in stored {
             if let Some(bucket) = self.buckets.get_mut(self.numbers.number(of.bus, of.id)) {
@@ -175,7 +176,7 @@ impl FloodGate {
         }
     }
 
-    /// Restores stored counts; those of messages that are no longer configured are dropped.
+    /// Restores stored counts, except those of messages that are no longer configured.
     pub fn restore(&mut self, counts: &[FloodCount]) {
         for bucket in &mut self.buckets {
             let stored = counts.iter().find(|count| (count.bus, count.id) == (bucket.bus, bucket.id));
@@ -208,21 +209,21 @@ mod tests {
         FloodGate::new(&FloodConfig { max_frames_per_s }, [(BUS, ID, pages), (BUS, CanId::Standard(0x101), 1)])
     }
 
-    /// Frames `gap_ns` apart from `from_ns` on; the number admitted.
+    /// Sends `frames` frames at intervals of `gap_ns` from `from_ns` on; returns the number admitted.
     fn taken(gate: &mut FloodGate, from_ns: i64, gap_ns: i64, frames: i64) -> usize {
         let at = |n: i64| Timestamp::from_nanos(from_ns + n * gap_ns);
         (0..frames).filter(|&n| gate.admit(at(n), BUS, ID)).count()
     }
 
     #[test]
-    fn the_allowed_rate_always_passes() {
+    fn allowed_rate_always_passes() {
         let mut gate = gate(2000, 1);
         assert_eq!(taken(&mut gate, 0, 500_000, 100_000), 100_000);
         assert_eq!((gate.counts().count(), gate.changes.drain(..).count()), (0, 0));
     }
 
     #[test]
-    fn a_burst_of_a_tenth_of_the_rate_passes_and_the_rest_does_not() {
+    fn burst_of_tenth_of_rate_passes() {
         let mut gate = gate(2000, 1);
         assert_eq!(taken(&mut gate, 0, 0, 1000), 200);
         assert_eq!(gate.counts().next(), Some(FloodCount { bus: BUS, id: ID, dropped: 800 }));
@@ -230,14 +231,14 @@ mod tests {
     }
 
     #[test]
-    fn ten_times_the_rate_is_cut_to_the_rate() {
+    fn tenfold_rate_is_limited_to_allowed_rate() {
         let mut gate = gate(2000, 1);
         let taken = taken(&mut gate, 0, 50_000, 200_000);
-        assert_eq!(taken, 20_199, "10 s of the rate and the first burst");
+        assert_eq!(taken, 20_199, "10 s at the allowed rate plus the first burst");
     }
 
     #[test]
-    fn other_messages_pass_meanwhile() {
+    fn other_messages_pass_during_flood() {
         let mut gate = gate(10, 1);
         taken(&mut gate, 0, 0, 1000);
         assert!(!gate.admit(Timestamp::ZERO, BUS, ID));
@@ -247,12 +248,12 @@ mod tests {
     }
 
     #[test]
-    fn a_message_of_many_pages_may_send_them_all_at_once() {
+    fn multiplexed_message_may_send_all_pages_at_once() {
         assert_eq!(taken(&mut gate(2000, 256), 0, 0, 1000), 512);
     }
 
     #[test]
-    fn a_flood_is_reported_when_it_begins_and_with_its_count_when_it_ends() {
+    fn flood_is_reported_at_start_and_end() {
         let mut gate = gate(100, 1);
         assert_eq!(taken(&mut gate, 0, 0, 15), 10);
         gate.poll(Timestamp::from_secs(0.9));
@@ -267,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_set_back_does_not_close_the_gate() {
+    fn backward_clock_step_does_not_block_frames() {
         let mut gate = gate(100, 1);
         assert_eq!(taken(&mut gate, 1_000_000_000_000, 0, 15), 10);
         gate.restart();
@@ -276,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_outlive_a_restart() {
+    fn drop_counts_survive_restart() {
         let mut before = gate(100, 1);
         taken(&mut before, 0, 0, 15);
         let mut after = gate(100, 1);

@@ -1,14 +1,14 @@
 //! One CAN frame: classic, FD or remote, with its identifier and up to 64 bytes; independent of any socket.
 //!
-//! A constructor returns `None` for an identifier or length that no frame can have. Error frames are not frames here: the
-//! drivers turn them into [`crate::monitor::BusEvent`].
+//! A constructor returns `None` for an identifier or length that no frame can have. Error frames are not represented:
+//! the drivers convert them to [`crate::monitor::BusEvent`].
 
 use serde::{Deserialize, Serialize};
 
-/// Most payload bytes a frame can carry (CAN FD).
+/// Largest payload of a frame, bytes (CAN FD).
 pub const MAX_DATA: usize = 64;
 
-/// A CAN identifier; 11 and 29 bit identifiers of the same number are different identifiers.
+/// A CAN identifier. An 11-bit and a 29-bit identifier with the same number are different identifiers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum CanId {
     /// 11 bit, 0 to 0x7FF.
@@ -18,17 +18,17 @@ pub enum CanId {
 }
 
 impl CanId {
-    /// A standard identifier, or `None` above 0x7FF.
+    /// A standard identifier; `None` above 0x7FF.
     pub const fn standard(id: u32) -> Option<Self> {
         if id <= 0x7FF { Some(Self::Standard(id as u16)) } else { None }
     }
 
-    /// An extended identifier, or `None` above 0x1FFF_FFFF.
+    /// An extended identifier; `None` above 0x1FFF_FFFF.
     pub const fn extended(id: u32) -> Option<Self> {
         if id <= 0x1FFF_FFFF { Some(Self::Extended(id)) } else { None }
     }
 
-    /// The number by which a DBC names the identifier: bit 31 marks an extended one.
+    /// The number of the identifier in a DBC, where bit 31 marks an extended identifier.
     pub const fn dbc_number(self) -> u32 {
         match self {
             Self::Standard(id) => id as u32,
@@ -36,7 +36,7 @@ impl CanId {
         }
     }
 
-    /// The number without its kind.
+    /// The number without the mark for extended identifiers.
     pub const fn raw(self) -> u32 {
         match self {
             Self::Standard(id) => id as u32,
@@ -46,7 +46,7 @@ impl CanId {
 }
 
 impl std::fmt::Display for CanId {
-    /// As in candump: 3 hex digits for standard, 8 for extended.
+    /// Hexadecimal like candump: 3 digits for standard, 8 for extended identifiers.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Standard(id) => write!(f, "{id:03X}"),
@@ -55,7 +55,7 @@ impl std::fmt::Display for CanId {
     }
 }
 
-/// Whether a frame, classic or FD, can have exactly this length.
+/// Whether a frame, classic or FD, can have exactly this length, bytes.
 pub(crate) const fn is_frame_length(len: usize) -> bool {
     matches!(len, 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64)
 }
@@ -65,7 +65,7 @@ pub(crate) const fn is_frame_length(len: usize) -> bool {
 pub enum FrameKind {
     /// Classic data frame, at most 8 bytes.
     Classic,
-    /// Classic remote request: no data; the length is the requested one.
+    /// Classic remote request: no data; the length is that of the requested frame.
     Remote,
     /// CAN FD data frame, at most 64 bytes.
     Fd {
@@ -76,8 +76,9 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, zeros after the payload. Aligned, so that a word loaded soon after the frame was copied lies within one
-/// store of the copy: across two stores the processor waits for both, longer than decoding takes.
+/// Payload bytes, followed by zeros. The alignment ensures that a word that is loaded soon after the frame was copied
+/// comes from a single store. If it spanned two stores, the processor would wait for both, which takes longer than
+/// decoding.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);
@@ -92,36 +93,37 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A classic data frame, or `None` for more than 8 bytes.
+    /// A classic data frame; `None` for more than 8 bytes.
     pub fn classic(id: CanId, data: &[u8]) -> Option<Self> {
         (data.len() <= 8).then(|| Self::build(id, FrameKind::Classic, data))
     }
 
-    /// An FD data frame, or `None` for a length FD cannot carry (more than 64, or a length between its steps).
+    /// An FD data frame; `None` for a length that FD does not support (above 64, or between its steps).
     pub fn fd(id: CanId, brs: bool, esi: bool, data: &[u8]) -> Option<Self> {
         is_frame_length(data.len()).then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
     }
 
-    /// An FD frame of at least `len` bytes, rounded up to an FD length; `None` above 64.
+    /// An FD frame with at least `len` bytes, rounded up to an FD length; `None` above 64.
     pub fn fd_padded(id: CanId, brs: bool, esi: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
         let len = (len..=MAX_DATA).find(|len| is_frame_length(*len))?;
         Self::fd(id, brs, esi, &payload[..len])
     }
 
-    /// A frame of at least `len` bytes: classic up to 8, FD above; `None` above 64.
+    /// A frame with at least `len` bytes: classic up to 8, FD above; `None` above 64.
     pub(crate) fn padded(id: CanId, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
         if len <= 8 { Self::classic(id, &payload[..len]) } else { Self::fd_padded(id, false, false, len, payload) }
     }
 
-    /// A remote request for `len` bytes, or `None` for more than 8.
+    /// A remote request for `len` bytes; `None` above 8.
     pub fn remote(id: CanId, len: u8) -> Option<Self> {
         (len <= 8).then_some(Self { id, kind: FrameKind::Remote, len, data: Data([0; MAX_DATA]) })
     }
 
-    /// A classic data frame whose payload is the lowest `len` (at most 8) bytes of a word that has zeros above them.
+    /// A classic data frame whose payload is the lowest `len` (at most 8) bytes of `word`; the bytes above must be
+    /// zero.
     #[inline]
     pub fn of_word(id: CanId, word: u64, len: u8) -> Self {
-        debug_assert!(len <= 8 && (len == 8 || word >> (8 * len) == 0), "bytes beyond the payload are zeros");
+        debug_assert!(len <= 8 && (len == 8 || word >> (8 * len) == 0), "bytes beyond the payload must be zero");
         let mut data = [0; MAX_DATA];
         data[..8].copy_from_slice(&word.to_le_bytes());
         Self { id, kind: FrameKind::Classic, len, data: Data(data) }
@@ -157,7 +159,7 @@ impl Frame {
         }
     }
 
-    /// The payload with zeros after it; all zeros for a remote request.
+    /// The payload, followed by zeros; all zeros for a remote request.
     pub(crate) const fn padded_data(&self) -> &[u8; MAX_DATA] {
         &self.data.0
     }
@@ -170,7 +172,7 @@ impl Frame {
         }
     }
 
-    /// Payload length; of a remote request the requested one.
+    /// Payload length, bytes; for a remote request, the requested length.
     pub const fn len(&self) -> usize {
         self.len as usize
     }

@@ -1,8 +1,8 @@
-//! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames, end-to-end
-//! protection and authentication, diagnostic requests and answers over ISO-TP, J1939.
+//! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames,
+//! end-to-end protection and authentication, diagnostics over ISO-TP, J1939.
 //!
-//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are accepted:
-//! bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
+//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are
+//! accepted: bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
 
 pub mod dbc;
 pub mod decode;

@@ -1,7 +1,7 @@
 //! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection, authentication.
 //!
-//! The names and the order of `VFrameFormat`'s words are those of DBC editors; those about end-to-end protection and
-//! authentication are packwatch's own. An invalid attribute counts as missing.
+//! The attribute names and the order of the values of `VFrameFormat` are those of DBC editors; the attributes for
+//! end-to-end protection and authentication are specific to packwatch. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 
@@ -11,69 +11,69 @@ use crate::can::secoc::{self, Authentication};
 
 /// Cycle time, ms.
 pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
-/// Frames after the first one of an event.
+/// Number of frames after the first frame of an event.
 pub(super) const REPETITIONS: &str = "GenMsgNrOfRepetition";
-/// Time between them, ms.
+/// Time between the frames of an event, ms.
 pub(super) const FAST_CYCLE_TIME: &str = "GenMsgCycleTimeFast";
-/// Shortest mean time between two frames, ms.
+/// Smallest mean time between two frames, ms.
 pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
 /// Standard or extended, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
-/// The words of [`FRAME_FORMAT`].
+/// The values of [`FRAME_FORMAT`].
 pub(super) const FRAME_FORMATS: [&str; 16] = {
     let mut words = ["reserved"; 16];
     (words[0], words[1]) = ("StandardCAN", "ExtendedCAN");
     (words[FIRST_FD_FORMAT], words[FIRST_FD_FORMAT + 1]) = ("StandardCAN_FD", "ExtendedCAN_FD");
     words
 };
-/// Place of the first FD word among the words of [`FRAME_FORMAT`].
+/// Index of the first FD format in [`FRAME_FORMATS`].
 pub(super) const FIRST_FD_FORMAT: usize = 14;
 /// Bit rate switch.
 pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
-/// The words of [`BIT_RATE_SWITCH`].
+/// The values of [`BIT_RATE_SWITCH`].
 pub(super) const NO_YES: [&str; 2] = ["0", "1"];
 /// End-to-end protection: profile.
 pub(super) const E2E_PROFILE: &str = "E2EProfile";
-/// The words of [`E2E_PROFILE`].
+/// The values of [`E2E_PROFILE`].
 pub(super) const E2E_PROFILES: [&str; 4] = ["off", "1A", "1C", "5"];
 /// End-to-end protection: data id.
 pub(super) const E2E_DATA_ID: &str = "E2EDataId";
 /// Authentication: profile.
 pub(super) const SECOC_PROFILE: &str = "SecOCProfile";
-/// The words of [`SECOC_PROFILE`].
+/// The values of [`SECOC_PROFILE`].
 pub(super) const SECOC_PROFILES: [&str; 5] = ["off", "1", "3", "fd", "announcement"];
 /// Authentication: data id.
 pub(super) const SECOC_DATA_ID: &str = "SecOCDataId";
 
-/// The profile's place among the words of [`E2E_PROFILE`].
+/// Index of the profile in [`E2E_PROFILES`].
 pub(super) fn profile_index(profile: Profile) -> usize {
     E2E_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
-/// The profile's place among the words of [`SECOC_PROFILE`].
+/// Index of the profile in [`SECOC_PROFILES`].
 pub(super) fn secoc_index(profile: secoc::Profile) -> usize {
     SECOC_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
-/// How the message is repeated.
+/// Repetition of the message after an event.
 pub(super) fn repetition(dbc: &Dbc, id: MessageId) -> Repetition {
     let [count, period_ms, delay_ms] = [REPETITIONS, FAST_CYCLE_TIME, DELAY_TIME].map(|name| positive(dbc, id, name));
     Repetition { count, period_ms, delay_ms }
 }
 
-/// A number, when above 0.
+/// A numeric attribute; `None` = missing, invalid or 0.
 pub(super) fn positive(dbc: &Dbc, id: MessageId, name: &str) -> Option<u32> {
     let whole = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
         AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
-        // Some editors export every number as a float: 100.0 reads as 100.
+        // Some editors export every number as a float: parse 100.0 as 100.
         AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
         AttributeValue::String(ms) => ms.parse().ok(),
     };
     whole.filter(|ms| *ms > 0)
 }
 
-/// Classic unless the attribute says FD.
+/// Frame format; classic unless the attribute says FD.
 pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
     match word(dbc, id, FRAME_FORMAT).as_deref() {
         Some("StandardCAN_FD" | "ExtendedCAN_FD") => {
@@ -83,14 +83,14 @@ pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
     }
 }
 
-/// The protection, when both attributes are valid.
+/// The protection, if both attributes are valid.
 pub(super) fn e2e(dbc: &Dbc, id: MessageId) -> Option<Protection> {
     let name = word(dbc, id, E2E_PROFILE)?;
     let profile = [Profile::P01A, Profile::P01C, Profile::P05].into_iter().find(|profile| profile.name() == name)?;
     Some(Protection { profile, data_id: data_id(dbc, id, E2E_DATA_ID)? })
 }
 
-/// The authentication, when both attributes are valid.
+/// The authentication, if both attributes are valid.
 pub(super) fn secoc(dbc: &Dbc, id: MessageId) -> Option<Authentication> {
     let name = word(dbc, id, SECOC_PROFILE)?;
     let profile = secoc::Profile::ALL.into_iter().find(|profile| profile.name() == name)?;
@@ -104,7 +104,7 @@ fn data_id(dbc: &Dbc, id: MessageId, name: &str) -> Option<u16> {
     }
 }
 
-/// The value of an attribute that is a choice between words: written as the word or as its place among them.
+/// The value of an enumeration attribute, which the DBC gives as the name or as its index.
 fn word(dbc: &Dbc, id: MessageId, name: &str) -> Option<String> {
     let place = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::String(word) => return Some(word.clone()),

@@ -1,4 +1,4 @@
-//! DBC texts read whole, and refused with their line.
+//! Complete DBC texts, and texts rejected with their line.
 
 use super::*;
 
@@ -9,7 +9,7 @@ fn parse(body: &str) -> Result<Database, DbcError> {
 }
 
 #[test]
-fn messages_and_signals_come_with_all_their_details() {
+fn messages_and_signals_are_parsed_with_all_details() {
     let db = parse(
         r#"BO_ 2147484672 Ext: 64 X
  SG_ F : 0|32@1- (1,0) [0|0] "V" X
@@ -53,7 +53,7 @@ SIG_VALTYPE_ 2147484672 F : 1;
 }
 
 #[test]
-fn nested_multiplexing_becomes_a_chain_of_conditions() {
+fn nested_multiplexing_gives_chain_of_conditions() {
     let db = parse(
         r#"BO_ 1 M: 8 X
  SG_ Inner m2M : 8|8@1+ (1,0) [0|0] "" X
@@ -78,7 +78,7 @@ SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
 }
 
 #[test]
-fn faults_name_the_line() {
+fn errors_state_their_line() {
     let line_and_text = |body: &str| {
         let error = parse(body).unwrap_err();
         (error.line, error.to_string())
@@ -108,7 +108,7 @@ fn faults_name_the_line() {
 }
 
 #[test]
-fn multiplexors_in_a_loop_are_refused() {
+fn multiplexor_loops_are_rejected() {
     let error = parse(
         r#"BO_ 1 M: 8 X
  SG_ A m0M : 0|8@1+ (1,0) [0|0] "" X
@@ -121,16 +121,16 @@ SG_MUL_VAL_ 1 B A 0-0;
 }
 
 #[test]
-fn latin_1_bytes_are_read() {
+fn latin_1_bytes_are_decoded() {
     let bytes = [HEAD.as_bytes(), b"BO_ 1 A: 8 X\n SG_ T : 0|8@1+ (1,0) [0|0] \"\xB0C\" X"].concat();
     let db = Database::parse_bytes(&bytes).unwrap();
     assert_eq!(db.signal("A.T").unwrap().1.unit, "\u{b0}C");
 }
 
 #[test]
-fn any_text_never_panics() {
+fn arbitrary_text_never_panics() {
     let mut text = format!("{HEAD}BO_ 1 A: 8 X\n SG_ T M : 0|8@1+ (1,0) [0|0] \"\" X\nSG_MUL_VAL_ 1 T T 0-0;\n");
-    assert!(Database::parse(&text).is_err(), "a multiplexor of itself");
+    assert!(Database::parse(&text).is_err(), "a multiplexor that selects itself");
     while text.pop().is_some() {
         let _ = Database::parse(&text);
     }
@@ -140,7 +140,7 @@ fn any_text_never_panics() {
 }
 
 #[test]
-fn a_byte_order_mark_of_utf_8_is_read_over_and_utf_16_is_refused() {
+fn utf_8_byte_order_mark_is_skipped_and_utf_16_rejected() {
     let text = format!("{HEAD}BO_ 256 M: 8 X\n SG_ T : 0|8@1+ (1,0) [0|0] \"\u{b0}C\" X\n");
     let marked = |bytes: Vec<u8>| Database::parse_bytes(&[b"\xEF\xBB\xBF", bytes.as_slice()].concat());
     let unit = |read: Result<Database, DbcError>| read.unwrap().signal("M.T").unwrap().1.unit.clone();

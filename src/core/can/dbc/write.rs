@@ -1,7 +1,8 @@
-//! Messages and signals to DBC text.
+//! Writes messages and signals as DBC text.
 //!
-//! In: a [`Database`]. Out: text that DBC tools load and that [`Database::parse`] reads back equal. Numbers are written
-//! with as many digits as they need and never with an exponent. Attributes are defined only when a message has them.
+//! In: a [`Database`]. Out: text that DBC tools load and that [`Database::parse`] parses to an equal database. Numbers
+//! are written with as many digits as they need and without an exponent. An attribute is defined only if a message has
+//! it.
 
 use std::fmt::Write as _;
 
@@ -14,11 +15,11 @@ use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
 use crate::can::signal::{ByteOrder, ValueType};
 
-/// Name of no node.
+/// Placeholder for "no node".
 const NO_NODE: &str = "Vector__XXX";
 
 impl Database {
-    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as after reading.
+    /// The text of the DBC. A signal's conditions must refer to multiplexors of its message, as after parsing.
     pub fn to_dbc(&self) -> String {
         let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_:");
         for node in &self.nodes {
@@ -40,11 +41,11 @@ impl Database {
         text
     }
 
-    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 where Latin-1 cannot hold the text.
+    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 if Latin-1 cannot represent the text.
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        // Latin-1 bytes that are valid UTF-8 too would be read as UTF-8.
+        // Latin-1 bytes that are also valid UTF-8 would be parsed as UTF-8.
         latin
             .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
             .unwrap_or_else(|| text.into_bytes())
@@ -81,9 +82,9 @@ impl Database {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
         };
-        // Longest cycle time an editor will accept, ms: an hour.
+        // Longest cycle time that the attribute allows, ms: an hour.
         let cycle_time = "INT 0 3600000";
-        // Most repetitions an editor will accept.
+        // Largest number of repetitions that the attribute allows.
         let repetitions = "INT 0 999999";
         let word = |number: Option<u32>| number.map(|number| number.to_string());
         self.attribute(CYCLE_TIME, cycle_time, "0", |m| word(m.cycle_time_ms), text);
@@ -103,7 +104,7 @@ impl Database {
         }
     }
 
-    /// Defines an attribute and writes its values, if a message has one.
+    /// Defines an attribute and writes its values, if any message has one.
     fn attribute(
         &self,
         name: &str,
@@ -121,7 +122,7 @@ impl Database {
         }
     }
 
-    /// An attribute with a choice between words; the first is the default.
+    /// Writes an enumeration attribute; the first value is the default.
     fn choice(&self, name: &str, words: &[&str], value: impl Fn(&Message) -> Option<String>, text: &mut String) {
         let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
         self.attribute(name, &format!("ENUM {}", quoted.join(",")), &quoted[0], value, text);
@@ -149,7 +150,7 @@ impl Database {
     }
 }
 
-/// The text with its quotes escaped. A text that was read has escaped quotes already.
+/// The text with its quotes escaped. Parsed text already has escaped quotes.
 fn quoted(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -194,7 +195,7 @@ fn write_message(message: &Message, text: &mut String) {
     }
 }
 
-/// ` M`, ` m3`, ` m3M` or nothing.
+/// The multiplexer indicator: ` M`, ` m3`, ` m3M` or nothing.
 fn indicator(signal: &Signal) -> String {
     let code = signal.conditions.last().and_then(|condition| condition.ranges.first()).map(|range| range.0);
     match (code, signal.is_multiplexor) {
@@ -205,7 +206,7 @@ fn indicator(signal: &Signal) -> String {
     }
 }
 
-/// Whether `m3` is not sufficient: ranges, nested multiplexors, or several next to each other.
+/// Whether the indicator is not sufficient: for ranges, nested multiplexors, or several multiplexors side by side.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.conditions.is_empty());

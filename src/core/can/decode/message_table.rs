@@ -1,9 +1,9 @@
-//! The bindings as a decoder uses them: by message, page, and per signal shifts, factors and limits.
+//! Bindings prepared for decoding: by message and page, with shifts, factors and limits per signal.
 //!
-//! In: frames. Out: readings. The codes of a [`Binding`] that give a value are found in advance; every other code, and signals
-//! that are not linear functions of such codes, are judged by the binding itself: floats, signals of 64 bits or over nine bytes,
-//! a scale that is 0 or not finite, several codes for "not available" between the good ones. A selector with too many codes for a
-//! table is read by each binding.
+//! In: frames. Out: readings. The codes of a [`Binding`] that give a good value are computed in advance. The binding
+//! itself handles every other code, and signals that are not linear functions of such codes: floats, signals of 64 bits
+//! or spanning nine bytes, a scale that is 0 or not finite, several "not available" codes between the good ones. If a
+//! selector has too many codes for a table, each binding decodes the selector itself.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -15,62 +15,64 @@ use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault};
 
-/// Most codes of a selector with a table: ten bits. Selectors have 4 to 8.
+/// Most codes of a selector with a table: ten bits. Selectors usually have 4 to 8 bits.
 const MAX_CODES: u64 = 1024;
-/// Most entries of all tables of one message, so that wide ranges on many signals take little memory.
+/// Most entries in all tables of one message, so that wide ranges on many signals use little memory.
 const MAX_GROUPS: usize = 1 << 16;
 
-/// All messages.
+/// The table of all messages.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct MessageTable {
     indices: IdTable,
     messages: Vec<MessageGroups>,
 }
 
-/// One message.
+/// The signals of one message.
 #[derive(Debug, Clone, PartialEq)]
 struct MessageGroups {
     bus: BusIndex,
     id: CanId,
-    /// Every group of signals, in order.
+    /// All groups of signals, in order.
     all: Vec<SignalGroup>,
     pages: Option<PageTable>,
 }
 
-/// Neighbours among the bindings that are present or absent together.
+/// Consecutive bindings with the same multiplexer conditions.
 #[derive(Debug, Clone, PartialEq)]
 struct SignalGroup {
-    /// The bindings, compiled; pages share the list.
+    /// The prepared bindings; pages share the list.
     signals: Arc<[LinearSignal]>,
-    /// Index of the first among all bindings.
+    /// Index of the group's first binding among all bindings.
     first: usize,
-    /// Payloads of this length carry them all; [`NEVER`] where the binding must decide whether they are present.
+    /// A payload of at least this length carries all signals of the group; [`NEVER`] if the binding must decide whether
+    /// they are present.
     bytes_needed: usize,
 }
 
-/// Longer than any payload.
+/// Longer than any payload, bytes.
 const NEVER: usize = usize::MAX;
 
 /// Groups by the selector's code.
 #[derive(Debug, Clone, PartialEq)]
 struct PageTable {
     selector: BitPosition,
-    /// A payload of this length carries every selector of the message; in shorter ones each binding decides.
+    /// A payload of at least this length carries every selector of the message. For shorter payloads, each binding
+    /// decides.
     bytes_needed: usize,
-    /// Per code, and last for every code above: where its groups are.
+    /// Range in `groups` for each code; the last entry is for all larger codes.
     codes: Vec<Range<usize>>,
     groups: Vec<SignalGroup>,
 }
 
-/// Number of [`PayloadWords::words`].
+/// Number of words in [`PayloadWords::words`]. As a word index, it marks signals outside these words.
 const FAR: u8 = 2;
 
-/// Position of a number's bits.
+/// Position of a signal's bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct BitPosition {
-    /// Index among [`PayloadWords::words`]; for a signal that is in none of them, [`FAR`] more.
+    /// Index in [`PayloadWords::words`]; plus [`FAR`] for a signal outside these words.
     word: u8,
-    /// First of eight payload bytes that hold the signal.
+    /// First of the eight payload bytes that contain the signal.
     window: u8,
     up: u8,
     down: u8,
@@ -84,14 +86,15 @@ impl BitPosition {
     }
 }
 
-/// One signal: conversion of good codes. Any other code is left to its binding. 64 bytes, one cache line.
+/// One signal: conversion of good codes. Its binding handles any other code. 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct LinearSignal {
     channel: Channel,
     position: BitPosition,
-    /// The highest bit of a signed signal, 0 for an unsigned one: flipped and subtracted it extends the sign.
+    /// The sign bit of a signed signal, 0 for an unsigned one. XOR with it and subtracting it extends the sign.
     sign: u64,
-    /// Good codes, those within the DBC's and the configured range: the first, its sign flipped, and how many follow it.
+    /// Good codes, which are within the DBC's and the configured range: the first one with its sign bit flipped, and
+    /// the number of codes after it.
     first_good: u64,
     more_good: u64,
     factor: f64,
@@ -103,7 +106,7 @@ struct LinearSignal {
 /// The first bytes of a payload as words.
 struct PayloadWords<'a> {
     frame: &'a Frame,
-    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
+    /// The first eight bytes, padded with zeros: little-endian and big-endian.
     words: [u64; FAR as usize],
 }
 
@@ -120,7 +123,7 @@ impl<'a> PayloadWords<'a> {
         self.frame.len() >= bytes
     }
 
-    /// The bits at a position, the lowest at the bottom.
+    /// The bits at a position, shifted down to bit 0.
     #[inline(always)]
     fn bits(&self, position: &BitPosition) -> u64 {
         let word = match self.words.get(usize::from(position.word)) {
@@ -133,7 +136,7 @@ impl<'a> PayloadWords<'a> {
         word << (position.up & 63) >> (position.down & 63)
     }
 
-    /// A word that does not begin with the payload.
+    /// The word of a signal outside the first eight bytes.
     #[inline(always)]
     fn far_word(&self, position: &BitPosition) -> u64 {
         let from = usize::from(position.window);
@@ -145,7 +148,7 @@ impl<'a> PayloadWords<'a> {
 }
 
 impl MessageTable {
-    /// A table of bindings sorted by message and channel.
+    /// Creates the table from bindings sorted by message and channel.
     pub(super) fn new(bindings: &[Binding]) -> Self {
         let mut messages = Vec::new();
         let mut end = 0;
@@ -177,7 +180,7 @@ impl MessageTable {
                 continue;
             }
             for (n, plan) in group.signals.iter().enumerate() {
-                // Two calls of `each`, not one value made of both: the good one then stays in a register.
+                // Call `each` separately for good and bad values: a good value then stays in a register.
                 match plan.good(&words) {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
                     None => {
@@ -191,14 +194,14 @@ impl MessageTable {
     }
 }
 
-/// The value of a binding that is present.
+/// Decodes a binding that is present.
 #[cold]
 #[inline(never)]
 fn value_of(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Readings of bindings that are present together, if they are.
+/// Decodes bindings that are present together, if they are present.
 fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
     let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
     if present == Ok(false) {
@@ -211,15 +214,15 @@ fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut
 }
 
 impl SignalGroup {
-    /// A group that is certainly present.
+    /// Creates a group that is always present.
     fn new(bindings: &[Binding], run: &Range<usize>) -> Self {
         let bindings = &bindings[run.clone()];
         let bytes_needed = bindings.iter().map(|binding| binding.plan.bytes_needed()).max().unwrap_or(0);
         Self { signals: bindings.iter().map(LinearSignal::new).collect(), first: run.start, bytes_needed }
     }
 
-    /// The same group, whose presence its binding decides.
-    fn to_be_checked(&self) -> Self {
+    /// The same group, but its bindings decide whether it is present.
+    fn with_presence_check(&self) -> Self {
         Self { bytes_needed: NEVER, ..self.clone() }
     }
 }
@@ -229,8 +232,10 @@ impl MessageGroups {
         let groups: Vec<_> = runs.iter().map(|run| SignalGroup::new(bindings, run)).collect();
         let pages = PageTable::new(bindings, runs, &groups);
         let tests = |run: &Range<usize>| bindings[run.start].mux.len();
-        let all =
-            groups.into_iter().zip(runs).map(|(group, run)| if tests(run) > 0 { group.to_be_checked() } else { group });
+        let all = groups
+            .into_iter()
+            .zip(runs)
+            .map(|(group, run)| if tests(run) > 0 { group.with_presence_check() } else { group });
         let first = &bindings[runs[0].start];
         Self { bus: first.bus, id: first.id, all: all.collect(), pages }
     }
@@ -245,7 +250,8 @@ impl MessageGroups {
 }
 
 impl PageTable {
-    /// By the selector that most runs depend on; `None` without one, or when a table would be too large.
+    /// Creates the table for the selector that most runs depend on; `None` without a selector, or if the table would be
+    /// too large.
     fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
@@ -261,7 +267,7 @@ impl PageTable {
             codes: Vec::new(),
             groups: Vec::new(),
         };
-        // The last code stands for every code above: no range reaches it.
+        // The last code stands for all larger codes, which no range contains.
         for code in 0..=codes {
             let start = pages.groups.len();
             for (run, group) in runs.iter().zip(all) {
@@ -269,7 +275,7 @@ impl PageTable {
                     continue;
                 }
                 let check = tests(run).iter().any(|test| test.plan != selector);
-                pages.groups.push(if check { group.to_be_checked() } else { group.clone() });
+                pages.groups.push(if check { group.with_presence_check() } else { group.clone() });
             }
             pages.codes.push(start..pages.groups.len());
             if pages.groups.len() > MAX_GROUPS {
@@ -282,7 +288,7 @@ impl PageTable {
     #[inline]
     fn of(&self, words: &PayloadWords<'_>) -> &[SignalGroup] {
         let code = usize::try_from(words.bits(&self.selector)).unwrap_or(usize::MAX);
-        // There is at least the code that stands for every code above.
+        // The table has at least the entry for all larger codes.
         let groups = &self.codes[code.min(self.codes.len() - 1)];
         &self.groups[groups.clone()]
     }
@@ -296,9 +302,9 @@ fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
 impl LinearSignal {
     fn new(binding: &Binding) -> Self {
         let Binding { channel, scale, offset: shift, .. } = *binding;
-        let nothing = Self {
+        let never_good = Self {
             channel,
-            // One bit, and no code is good.
+            // One bit, without good codes.
             position: BitPosition { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,
@@ -312,11 +318,11 @@ impl LinearSignal {
         let plan = &binding.plan;
         let limits = [plan.low, plan.high, binding.range.0, binding.range.1];
         if !is_regular || !plan.is_simple() || limits.iter().any(|limit| limit.is_nan()) {
-            return nothing;
+            return never_good;
         }
         let sign = if plan.value_type() == ValueType::Signed { 1 << (63 - plan.down) } else { 0 };
         let good = good_codes(binding).and_then(|good| available_codes(binding, sign, good));
-        let Some((first, last)) = good else { return nothing };
+        let Some((first, last)) = good else { return never_good };
         Self {
             position: BitPosition::new(plan),
             sign,
@@ -324,11 +330,11 @@ impl LinearSignal {
             more_good: first.abs_diff(last),
             factor: plan.factor,
             offset: plan.offset,
-            ..nothing
+            ..never_good
         }
     }
 
-    /// The value in the program's unit and sign, if its code is good; the payload carries the signal.
+    /// The value in the program's unit and sign; `None` = the code is not good. The payload must carry the signal.
     #[inline(always)]
     fn good(&self, words: &PayloadWords<'_>) -> Option<f64> {
         let flipped = words.bits(&self.position) ^ self.sign;
@@ -338,21 +344,21 @@ impl LinearSignal {
     }
 }
 
-/// The longest run of good codes without one that means "not available". Those are nearly always at the ends; codes beyond
-/// one in the middle take the binding's own path.
+/// The longest run of good codes without a "not available" code. Such codes are nearly always at the ends of the range.
+/// If one is in the middle, the binding handles the codes beyond it.
 fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
     let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
     let mut missing: Vec<i64> = signed.filter(|code| (first..=last).contains(code)).collect();
     missing.sort_unstable();
-    // At most 63 bits: there is a number before the first and after the last.
+    // Codes have at most 63 bits, so code + 1 and code - 1 do not overflow.
     let begins = std::iter::once(first).chain(missing.iter().map(|code| code + 1));
     let ends = missing.iter().map(|code| code - 1).chain([last]);
     begins.zip(ends).filter(|(begin, end)| begin <= end).max_by_key(|(begin, end)| begin.abs_diff(*end))
 }
 
-/// The first and the last code with a value within both ranges. Every step from the code to the value keeps the order (or
-/// reverses it), rounding included, so that the good codes are neighbours and bisection finds their ends exactly.
+/// The first and the last code with a value in both ranges. Every step from code to value is monotonic, rounding
+/// included. Therefore the good codes are consecutive, and bisection finds their ends exactly.
 fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     let plan = &binding.plan;
     let physical = |code: i64| float_of_signed(code) * plan.factor + plan.offset;
@@ -363,7 +369,7 @@ fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     type Map<'a> = &'a dyn Fn(i64) -> f64;
     let both: [(Map<'_>, f64, f64); 2] = [(&physical, plan.low, plan.high), (&value, binding.range.0, binding.range.1)];
     for (of, low, high) in both {
-        // Along rising values: first not below the lower limit, then above the upper one.
+        // With rising values: the first code not below the lower limit, and the first above the upper limit.
         let (first, end) = if is_rising(of) {
             (first_where(good, |code| of(code) >= low), first_where(good, |code| of(code) > high))
         } else {
@@ -377,7 +383,7 @@ fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     Some(good)
 }
 
-/// The first of neighbouring codes with a property that all later ones have too.
+/// The first code that satisfies a predicate, which must then hold for all later codes; `None` = no code does.
 fn first_where((mut low, mut high): (i64, i64), holds: impl Fn(i64) -> bool) -> Option<i64> {
     if !holds(high) {
         return None;

@@ -1,4 +1,4 @@
-//! Frames an input map decodes, and frames it ignores.
+//! Frames that an input map decodes, and frames that it ignores.
 
 use proptest::prelude::*;
 
@@ -7,8 +7,8 @@ use crate::can::dbc::Database;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
-/// A plain message whose voltage comes first and current last, a paged one with a signal on every page, and one whose
-/// pages hang below pages.
+/// Three messages: a plain one with the voltage first and the current last, a multiplexed one with a signal on every
+/// page, and one with nested pages.
 pub(crate) const DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 Pack: 6 BMS
@@ -51,7 +51,7 @@ pub(crate) const fn sensor(n: u16) -> Channel {
     Channel::Temperature(SensorIndex(n))
 }
 
-/// The first two messages, bound in no particular order; the bus counts charging positive.
+/// The first two messages, bound in no particular order. The bus counts charging positive.
 pub(crate) fn map() -> InputMap {
     InputMap::new(vec![
         bind("Cells.Cell3", cell(2)),
@@ -75,7 +75,7 @@ pub(crate) fn nested() -> InputMap {
 }
 
 #[test]
-fn every_message_is_listed_with_no_fewer_groups_than_pages() {
+fn messages_have_at_least_one_group_per_page() {
     let both = InputMap::new([map().bindings(), nested().bindings()].concat());
     let found: Vec<_> = both.messages().map(|(bus, id, groups)| (bus.0, id.to_string(), groups)).collect();
     assert_eq!(found, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
@@ -96,7 +96,7 @@ const PACK: CanId = CanId::Standard(256);
 const CELLS: CanId = CanId::Standard(257);
 
 #[test]
-fn current_comes_before_temperature_before_voltages_wherever_they_lie() {
+fn readings_are_ordered_current_temperature_voltage() {
     let found = read(PACK, &[0xDF, 0x0D, 65, 0x00, 0x64, 0]);
     assert_eq!(found, [(Channel::Current, Ok(-10.0)), (sensor(0), Ok(25.0)), (Channel::PackVoltage, Ok(355.1))]);
     let found = read(CELLS, &[0, 0x10, 0x0E, 0x11, 0x0E, 0xC4, 0x09]);
@@ -104,8 +104,8 @@ fn current_comes_before_temperature_before_voltages_wherever_they_lie() {
 }
 
 #[test]
-fn signals_between_two_pages_of_a_message_keep_the_channel_order() {
-    // Channels alternate between the pages, so that no page's signals are neighbours.
+fn interleaved_pages_keep_channel_order() {
+    // Channels alternate between the pages, so that the signals of a page are not consecutive.
     let found = InputMap::new(vec![
         bind("Cells.Cell1", cell(0)),
         bind("Cells.Cell3", cell(1)),
@@ -118,14 +118,14 @@ fn signals_between_two_pages_of_a_message_keep_the_channel_order() {
 }
 
 #[test]
-fn only_the_page_that_is_there_is_read() {
+fn only_present_page_is_decoded() {
     let found = read(CELLS, &[1, 0x10, 0x0E, 0xFF, 0xFF, 0, 0]);
     assert_eq!(found, [(sensor(1), Ok(0.0)), (cell(2), Ok(3.6))]);
     assert_eq!(read(CELLS, &[7, 0, 0, 0, 0, 0, 0]), [(sensor(1), Ok(0.0))]);
 }
 
 #[test]
-fn a_signal_below_two_selectors_needs_both_and_ranges_count_with_their_ends() {
+fn nested_signal_needs_both_selectors_in_range() {
     let channels = |outer: u8, inner: u8| -> Vec<Channel> {
         let mut data = [0; 16];
         (data[0], data[1]) = (outer, inner);
@@ -136,7 +136,7 @@ fn a_signal_below_two_selectors_needs_both_and_ranges_count_with_their_ends() {
     assert_eq!(channels(3, 8), [sensor(0), sensor(1), cell(0)]);
     assert_eq!(channels(3, 6), [sensor(0), sensor(1)]);
     assert_eq!(channels(3, 9), [sensor(0), sensor(1)]);
-    assert_eq!(channels(4, 7), [sensor(0), sensor(1), cell(1)], "the inner selector is not there on page 4");
+    assert_eq!(channels(4, 7), [sensor(0), sensor(1), cell(1)], "page 4 has no inner selector");
     assert_eq!(channels(5, 0), [sensor(0), sensor(1), cell(1)]);
     assert_eq!(channels(6, 0), [sensor(0), cell(1)]);
     assert_eq!(channels(9, 0), [sensor(0), sensor(1)]);
@@ -145,18 +145,22 @@ fn a_signal_below_two_selectors_needs_both_and_ranges_count_with_their_ends() {
 }
 
 #[test]
-fn a_short_frame_spoils_only_the_signals_it_does_not_reach() {
+fn short_frame_affects_only_missing_signals() {
     let values = |data: &[u8]| -> Vec<_> { read(CELLS, data).into_iter().map(|(_, value)| value).collect() };
     let short = Err(Fault::ShortFrame);
     assert_eq!(values(&[0, 0x10, 0x0E]), [short, Ok(3.6), short]);
     assert_eq!(values(&[1, 0x10]), [short, short]);
-    // Without the selector the page is unknown: all of them are short.
+    // Without the selector, the page is unknown: all signals are short.
     assert_eq!(values(&[]), [short; 4]);
-    assert_eq!(values(&[0, 0x10, 0x0E, 0x11, 0x0E, 0, 0, 0xFF]), [Ok(0.0), Ok(3.6), Ok(3.601)], "too long is no harm");
+    assert_eq!(
+        values(&[0, 0x10, 0x0E, 0x11, 0x0E, 0, 0, 0xFF]),
+        [Ok(0.0), Ok(3.6), Ok(3.601)],
+        "a longer frame is accepted"
+    );
 }
 
 #[test]
-fn bad_readings_say_why() {
+fn bad_readings_have_their_fault() {
     let values = |data: &[u8]| -> Vec<_> { read(PACK, data).into_iter().map(|(_, value)| value).collect() };
     let out = Err(Fault::OutOfRange);
     assert_eq!(values(&[0x88, 0x13, 255, 0x7F, 0xFF, 0]), [out, Err(Fault::NotAvailable), Ok(500.0)]);
@@ -169,7 +173,7 @@ fn bad_readings_say_why() {
 }
 
 #[test]
-fn the_configured_range_holds_after_scale_and_offset_with_both_ends() {
+fn range_applies_after_scale_with_ends_included() {
     let binding = Binding { scale: 0.5, offset: 1.0, range: (2.0, 3.0), ..bind("Cells.Cell3", cell(2)) };
     let value = |millivolts: u16| {
         let [low, high] = millivolts.to_le_bytes();
@@ -180,7 +184,7 @@ fn the_configured_range_holds_after_scale_and_offset_with_both_ends() {
 }
 
 #[test]
-fn a_configured_code_for_not_available_counts_in_addition_to_the_range() {
+fn not_available_code_applies_besides_range() {
     let binding = Binding { not_available: vec![0, 0xFFFE], ..bind("Cells.Cell3", cell(2)) };
     let map = InputMap::new(vec![binding]);
     let value = |low, high| readings(&map, 0, &Frame::classic(CELLS, &[1, low, high]).unwrap())[0].1;
@@ -189,7 +193,7 @@ fn a_configured_code_for_not_available_counts_in_addition_to_the_range() {
 }
 
 #[test]
-fn codes_for_not_available_are_recognised_at_the_ends_and_in_the_middle_of_the_range() {
+fn not_available_codes_work_anywhere_in_range() {
     let value = |not_available: Vec<u64>, code: i8| {
         let layout = SignalLayout { length_bits: 8, value_type: ValueType::Signed, ..SELECTOR };
         let binding = Binding { not_available, plan: layout.plan().unwrap(), ..bind("Pack.Temperature", sensor(0)) };
@@ -210,7 +214,7 @@ fn codes_for_not_available_are_recognised_at_the_ends_and_in_the_middle_of_the_r
 }
 
 #[test]
-fn another_interface_another_kind_of_identifier_and_remote_requests_are_other_things() {
+fn other_bus_other_id_kind_and_remote_frames_are_ignored() {
     let frame = Frame::classic(PACK, &[0; 6]).unwrap();
     assert_eq!(readings(&map(), 0, &frame).len(), 3);
     assert_eq!(readings(&map(), 1, &frame), []);
@@ -221,7 +225,7 @@ fn another_interface_another_kind_of_identifier_and_remote_requests_are_other_th
 }
 
 #[test]
-fn one_identifier_on_two_interfaces_is_two_messages() {
+fn same_identifier_on_two_buses_is_two_messages() {
     let other = Binding { bus: BusIndex(2), ..bind("Pack.Temperature", sensor(5)) };
     let map = InputMap::new(vec![other, bind("Pack.Voltage", Channel::PackVoltage)]);
     let frame = Frame::classic(PACK, &[0; 6]).unwrap();
@@ -232,14 +236,14 @@ fn one_identifier_on_two_interfaces_is_two_messages() {
 }
 
 #[test]
-fn identifiers_and_channels_are_listed_once_and_in_order() {
+fn identifiers_and_channels_are_unique_and_sorted() {
     assert_eq!(map().ids(BusIndex(0)), [PACK, CELLS]);
     assert_eq!(map().ids(BusIndex(9)), []);
     let all = [Channel::Current, sensor(0), sensor(1), Channel::PackVoltage, cell(0), cell(1), cell(2)];
     assert_eq!(map().channels(), all);
 }
 
-/// Signals of every kind and place, several to a message, some of them on pages.
+/// Signals of every type and position, several per message, some of them multiplexed.
 fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     let order = prop::sample::select(vec![ByteOrder::LittleEndian, ByteOrder::BigEndian]);
     let kind = prop_oneof![
@@ -260,7 +264,7 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     let plan = layout.prop_filter_map("a layout that can be read", |layout| layout.plan().ok());
     let limits = prop::sample::select(vec![(f64::NEG_INFINITY, f64::INFINITY), (f64::NAN, 5.0), (0.0, f64::NAN)]);
     let range = prop_oneof![2 => limits, 3 => (-1e3..0.0, 0.0..1e3)];
-    // Of many lengths the lowest and the highest codes, unsigned and signed; and any.
+    // For many lengths the lowest and the highest codes, unsigned and signed, and random ones.
     let end = (0..64u32, 0..3u64).prop_map(|(down, below)| (u64::MAX >> down).saturating_sub(below));
     let codes = prop::collection::vec(prop_oneof![0..4u64, end, any::<u64>()], 0..4);
     let page = prop::collection::vec((prop::sample::select(vec![0u16, 4, 60]), 0..5u64, 0..3u64), 0..3);
@@ -279,7 +283,7 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     })
 }
 
-/// Reference decoder: every binding of the message by itself.
+/// Reference decoder: decodes every binding of the message separately.
 fn decode_plainly(map: &InputMap, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
     for binding in map.bindings().iter().filter(|binding| (binding.bus, binding.id) == (bus, frame.id())) {
         let value = match binding.holds(frame.data()) {
@@ -306,7 +310,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
     #[test]
-    fn the_plan_gives_bit_for_bit_what_the_bindings_say(
+    fn table_decodes_bit_identical_to_bindings(
         bindings in any_bindings(),
         frames in prop::collection::vec((0..2u8, 0..3u32, prop::collection::vec(prop_oneof![0..16u8, any::<u8>()], 0..17)), 1..20),
     ) {

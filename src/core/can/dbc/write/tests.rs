@@ -1,4 +1,4 @@
-//! What is written reads back equal, and what was written stays as it is.
+//! Written text parses to an equal database, and the shipped DBC does not change.
 
 use proptest::prelude::*;
 
@@ -12,10 +12,10 @@ use crate::can::signal::SignalLayout;
 const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
 
 #[test]
-fn the_shipped_file_is_what_the_writer_makes_of_the_default_layout() {
+fn shipped_dbc_matches_default_layout() {
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
     let mut made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
-    // Sent with authenticated commands only.
+    // Sent only with authenticated commands.
     made.messages.push(default_database().unwrap().message("PACKWATCH_Freshness").unwrap().clone());
     let written = made.to_dbc();
     for (number, (shipped, written)) in (1..).zip(SHIPPED.lines().zip(written.lines())) {
@@ -25,7 +25,7 @@ fn the_shipped_file_is_what_the_writer_makes_of_the_default_layout() {
 }
 
 #[test]
-fn shipped_files_read_back_equal() {
+fn shipped_files_round_trip_unchanged() {
     let texts =
         [SHIPPED, include_str!("../../../../../config/pack96.dbc"), include_str!("../../../../../config/measured.dbc")];
     for text in texts {
@@ -35,7 +35,7 @@ fn shipped_files_read_back_equal() {
 }
 
 #[test]
-fn bytes_are_latin_1_unless_that_would_be_read_as_utf_8() {
+fn bytes_are_latin_1_unless_valid_utf_8() {
     let with_comment = |comment: &str| Database { comment: Some(comment.to_owned()), ..Default::default() };
     assert!(with_comment("\u{b0}C").to_dbc_bytes().windows(2).any(|bytes| bytes == b"\xB0C"));
     for comment in ["plain", "\u{b0}C", "\u{c3}\u{a9}", "\u{20ac} and \u{b0}"] {
@@ -45,14 +45,14 @@ fn bytes_are_latin_1_unless_that_would_be_read_as_utf_8() {
 }
 
 #[test]
-fn a_quote_does_not_end_a_text() {
+fn quotes_in_text_are_escaped() {
     let database = Database { comment: Some("a \"b\" c\\".to_owned()), ..Default::default() };
     let read = Database::parse(&database.to_dbc()).unwrap();
     assert_eq!(read.comment.as_deref(), Some("a \\\"b\\\" c\\ "));
     assert_eq!(Database::parse(&read.to_dbc()).unwrap(), read);
 }
 
-/// Words without quotes and backslashes, which are escaped when written.
+/// Words without quotes and backslashes, which would be escaped.
 const TEXT: &str = "[ -!#-\\[\\]-~\u{b0}\u{b5}\u{20ac}]{0,12}";
 
 fn layouts() -> impl Strategy<Value = SignalLayout> {
@@ -81,7 +81,7 @@ fn layouts() -> impl Strategy<Value = SignalLayout> {
 }
 
 prop_compose! {
-    /// A signal that is always there.
+    /// A signal that is always present.
     fn signals()(
         layout in layouts(),
         unit in TEXT,
@@ -94,18 +94,19 @@ prop_compose! {
     }
 }
 
-/// How a signal hangs on an earlier one: on which multiplexor, for which codes, and whether it is one itself.
-type Hanging = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
+/// How a signal depends on an earlier one: by which multiplexor, for which codes, and whether the signal is a
+/// multiplexor itself.
+type MuxLink = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
 
-fn hangings() -> impl Strategy<Value = Hanging> {
+fn mux_links() -> impl Strategy<Value = MuxLink> {
     let range =
         prop_oneof![(0..300_u64).prop_map(|code| (code, code)), (0..300_u64, 0..9_u64).prop_map(|(a, n)| (a, a + n))];
     let condition = prop::option::of((any::<prop::sample::Index>(), prop::collection::vec(range, 1..3)));
     (condition, any::<bool>())
 }
 
-/// Signals with their names and conditions; nesting stays below the limit for a loop.
-fn assemble(parts: Vec<(Signal, Hanging)>) -> Vec<Signal> {
+/// Signals with their names and conditions. Nesting stays below the limit for a loop.
+fn assemble(parts: Vec<(Signal, MuxLink)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {
         signal.name = format!("S{number}");
@@ -130,7 +131,7 @@ prop_compose! {
         format in prop_oneof![Just(FrameFormat::Classic), any::<bool>().prop_map(|brs| FrameFormat::Fd { brs })],
         e2e in prop::option::of((prop_oneof![Just(Profile::P01A), Just(Profile::P01C), Just(Profile::P05)], any::<u16>())),
         secoc in prop::option::of((prop::sample::select(secoc::Profile::ALL.to_vec()), any::<u16>())),
-        parts in prop::collection::vec((signals(), hangings()), 0..8),
+        parts in prop::collection::vec((signals(), mux_links()), 0..8),
         cycle_time_ms in prop::option::of(1..=3_600_000_u32),
         count in prop::option::of(1..=999_999_u32),
         times_ms in prop::array::uniform2(prop::option::of(1..=3_600_000_u32)),
@@ -162,7 +163,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(500))]
 
     #[test]
-    fn any_database_reads_back_equal(database in databases()) {
+    fn any_database_round_trips_unchanged(database in databases()) {
         let read = Database::parse_bytes(&database.to_dbc_bytes());
         prop_assert_eq!(read, Ok(database));
     }
