@@ -1,16 +1,16 @@
-//! Checks of the protected input messages: status, counts and changes per message.
+//! Checks the protected input messages: status, counts and changes per message.
 //!
-//! In: frames with their time and interface, in the order of their arrival, and the time alone ([`Guards::poll`]). Out: the
-//! [`Status`] of a frame, per-message counts, and a [`GuardChange`] when a message turns from usable to failing or back
-//! (checks in between are only counted). Where a message's cycle time is known, each period without a frame counts as one
-//! NONEWDATA: at one and a half periods after the last frame (half a period of jitter is no loss), and then once a period.
-//! Up to the number of frames that the check allows to be lost this is no change: the next frame will be usable, and a
-//! sender with jitter would fill the log.
+//! In: frames with their time and interface, in order of arrival, and the time alone ([`Guards::poll`]). Out: the
+//! [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message turns from usable to failing or
+//! back; the checks in between are only counted. If a message's cycle time is known, each period without a frame counts
+//! as one NONEWDATA: the first one and a half periods after the last frame (half a period allows for jitter), then one
+//! per period. Missing frames up to the number that the check allows to be lost cause no change: the next frame will be
+//! usable, and a sender with jitter would otherwise fill the log.
 //!
-//! Time without listening is no fault of the sender: after sleep, a restart of the program or a step of the clock the
-//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a restarted program restores the counts
-//! and not the counters: the sender has continued in the meantime, so a stored counter would reject good frames, or accept
-//! an old one that follows it by chance. Only a state that continues without a break restores both ([`Guards::resume`]).
+//! Time without listening is not the sender's fault: after sleep, a restart of the program or a clock step, the
+//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
+//! counts but not the counters: the sender has continued, so a stored counter would reject good frames, or accept an
+//! old frame that follows it by chance. Only a state that resumes without a gap restores both ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -18,23 +18,23 @@ use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// A frame is missed this many periods after the last one; then one more each period.
+/// Number of periods after the last frame at which a frame counts as missed; then one more each period.
 const MISSED_AFTER_PERIODS: f64 = 1.5;
 
-/// One protected message.
+/// Configuration of one protected message.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GuardConfig {
     /// Interface.
     pub bus: BusIndex,
     /// Identifier.
     pub id: CanId,
-    /// Check.
+    /// Settings of the check.
     pub check: CheckConfig,
     /// Period, s, above 0; `None` = unknown, missing frames are not counted.
     pub cycle_time_s: Option<f64>,
 }
 
-/// A message turned from usable to failing, or back.
+/// Reports that a message turned from usable to failing, or back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardChange {
     /// Interface.
@@ -45,7 +45,8 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable now.
     pub usable: bool,
-    /// Checks without a usable frame since it was last usable: so far when it fails, all of them when it is usable again.
+    /// Checks without a usable frame since the message was last usable: so far if it fails, in total if it is usable
+    /// again.
     pub count: u64,
 }
 
@@ -57,11 +58,11 @@ pub struct GuardCounts {
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// How often each status was given.
+    /// Number of checks by status.
     pub counts: StatusCounts,
 }
 
-/// How far one message's check has come: what a snapshot keeps for a continuation without a break.
+/// Progress of one message's check, for a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardProgress {
     bus: BusIndex,
@@ -76,9 +77,9 @@ pub struct GuardProgress {
 struct Guard {
     config: GuardConfig,
     receiver: Receiver,
-    /// When the next frame is missed; `None` = the cycle time is not known, or not yet listening.
+    /// When the next frame counts as missed; `None` = cycle time unknown, or not listening yet.
     missed_at: Option<Timestamp>,
-    /// Periods in a row without a frame.
+    /// Consecutive periods without a frame.
     missed: u64,
     /// Checks without a usable frame since the last usable one; 0 = usable, or no frame yet.
     failed: u64,
@@ -89,22 +90,22 @@ struct Guard {
 pub struct Guards {
     /// Sorted by interface and identifier.
     guards: Vec<Guard>,
-    /// Changes that wait to be published, in their order.
+    /// Changes to be published, in order.
     pub(crate) changes: Vec<GuardChange>,
 }
 
 impl Guards {
-    /// Guards for these messages; of two entries for one message the first counts.
+    /// Creates guards for messages. The first of several entries for the same message counts.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check makes one change, a poll one per message: nothing is allocated later.
+        // A check adds at most one change, a poll one per message: nothing is allocated later.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// Inherits the counts of other guards for the messages that are in both. Where the check is the same, its receiver too:
-    /// then no frame is lost to a new first frame.
+    /// Inherits the counts from `old` for the messages in both. If the check is the same, inherits the receiver, too,
+    /// so that no frame is lost as a new first frame.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {
@@ -118,7 +119,7 @@ impl Guards {
         self
     }
 
-    /// Checks a frame; `None` = its message is not protected, or it is a remote request, which carries no data.
+    /// Checks a frame; `None` = the message is not protected, or the frame is a remote request, which carries no data.
     #[inline]
     pub fn check(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
         if self.guards.is_empty() || frame.kind() == FrameKind::Remote {
@@ -139,19 +140,19 @@ impl Guards {
         Some(status)
     }
 
-    /// Counter that the next frame of a protected message must have; `None` = it is not protected, or any.
+    /// Counter that the next frame of a protected message must have; `None` = not protected, or any counter.
     pub fn next_counter(&self, bus: BusIndex, id: CanId) -> Option<u8> {
         let found = self.guards.binary_search_by_key(&(bus, id), |guard| (guard.config.bus, guard.config.id)).ok()?;
         let guard = &self.guards[found];
         guard.receiver.next_counter(guard.config.check.protection.profile)
     }
 
-    /// Counts the frames that are missing by now.
+    /// Counts frames that are missing at `now`.
     pub fn poll(&mut self, now: Timestamp) {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
-    /// After time without listening, or a step of the clock: every receiver waits for a first frame again; counts stay.
+    /// Handles time without listening or a clock step: every receiver waits for a first frame again. Keeps the counts.
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
             guard.receiver.restart();
@@ -168,7 +169,7 @@ impl Guards {
         })
     }
 
-    /// How far each check has come.
+    /// The progress of each check.
     pub fn progress(&self) -> Vec<GuardProgress> {
         let of = |guard: &Guard| GuardProgress {
             bus: guard.config.bus,
@@ -181,7 +182,7 @@ impl Guards {
         self.guards.iter().map(of).collect()
     }
 
-    /// Continues the checks as they were stored; the counts are restored before.
+    /// Resumes the checks as stored. The caller restores the counts first.
     pub fn resume(&mut self, stored: &[GuardProgress]) {
         for guard in &mut self.guards {
             let key = (guard.config.bus, guard.config.id);
@@ -192,7 +193,7 @@ impl Guards {
         }
     }
 
-    /// Restores stored counts and restarts the receivers. Counts of a message that is no longer protected are dropped.
+    /// Restores stored counts and restarts the receivers. Ignores counts of messages that are no longer protected.
     pub fn restore(&mut self, state: &[GuardCounts]) {
         self.restart();
         for guard in &mut self.guards {
@@ -208,12 +209,12 @@ impl Guard {
     /// Counts one NONEWDATA for each period without a frame.
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
-        // Counting begins with listening.
+        // Missing frames count only from the start of listening.
         let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         if now < missed_at {
             return;
         }
-        // At least one nanosecond: never a division by 0.
+        // At least one nanosecond, to avoid a division by 0.
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let periods = now.nanos().saturating_sub(missed_at.nanos()) / period_ns + 1;
         self.missed_at = Some(missed_at.plus_nanos(periods.saturating_mul(period_ns)));
@@ -223,7 +224,7 @@ impl Guard {
         self.note(status, periods, changes);
     }
 
-    /// Notes a status of one or more checks; adds a change where it turns.
+    /// Records the status of one or more checks; adds a change if the message turns usable or failing.
     fn note(&mut self, status: Status, checks: u64, changes: &mut Vec<GuardChange>) {
         let GuardConfig { bus, id, check, .. } = self.config;
         if status.is_usable() {
@@ -238,7 +239,7 @@ impl Guard {
             return;
         }
         self.failed = match status {
-            // A first frame is neither right nor wrong.
+            // A first frame is neither good nor bad.
             Status::Initial => 0,
             Status::NoNewData if self.missed <= u64::from(check.max_delta_counter_init) => 0,
             Status::NoNewData => self.missed,

@@ -1,27 +1,28 @@
 //! Index of a message by interface and identifier.
 //!
-//! One load for a standard identifier, a binary search for an extended one. Other messages have an index beyond the end.
+//! A standard identifier needs one load, an extended one a binary search. Messages that are not in the table have an
+//! index beyond its end.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
 
 /// Number of standard identifiers.
 const STANDARD_IDS: usize = 0x800;
-/// No message.
+/// Entry of an identifier without message.
 const NONE: u32 = u32::MAX;
 
-/// Indices of messages in their given order.
+/// Indices of messages, in the order in which they were given.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct IdTable {
     buses: Vec<BusTable>,
 }
 
-/// The messages of one interface.
+/// Indices of the messages of one interface.
 #[derive(Debug, Clone, PartialEq)]
 struct BusTable {
-    /// By identifier: 8 KiB, of which the lines of configured messages are in use.
+    /// By identifier: 8 KiB; only cache lines of configured messages are used.
     standard: Box<[u32; STANDARD_IDS]>,
-    /// Every other message, sorted by identifier.
+    /// Extended identifiers, sorted.
     others: Vec<(CanId, u32)>,
 }
 
@@ -32,7 +33,7 @@ impl BusTable {
 }
 
 impl IdTable {
-    /// A table of these messages; of two with the same interface and identifier the first counts.
+    /// Creates a table of messages. The first of several with the same interface and identifier counts.
     pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let mut table = Self::default();
         for ((bus, id), number) in messages.into_iter().zip(0..NONE) {
@@ -44,7 +45,7 @@ impl IdTable {
         table
     }
 
-    /// Index of the message among the given ones; `u32::MAX` or more for any other message.
+    /// Index of the message; `u32::MAX` or more if it is not in the table.
     #[inline]
     pub(crate) fn number(&self, bus: BusIndex, id: CanId) -> usize {
         let Some(ids) = self.buses.get(bus.index()) else { return usize::MAX };
@@ -52,7 +53,7 @@ impl IdTable {
             CanId::Standard(raw) if usize::from(raw) < STANDARD_IDS => ids.standard[usize::from(raw)],
             _ => ids.others.binary_search_by_key(&id, |(id, _)| *id).map_or(NONE, |at| ids.others[at].1),
         };
-        // Lossless: at least 32 bits on every machine this runs on.
+        // Lossless: `usize` has at least 32 bits on all supported machines.
         number as usize
     }
 }
@@ -78,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_message_is_found_by_interface_kind_and_number() {
+    fn messages_are_found_by_bus_kind_and_number() {
         let given = [
             (BusIndex(1), CanId::Extended(0x100)),
             (BusIndex(1), CanId::Standard(0x100)),
@@ -90,12 +91,12 @@ mod tests {
         let numbers: Vec<usize> = (0..given.len()).collect();
         let found = |bus, id| numbers.get(table.number(BusIndex(bus), id)).copied();
         assert_eq!(found(1, CanId::Extended(0x100)), Some(0));
-        assert_eq!(found(1, CanId::Standard(0x100)), Some(1), "the first of two");
+        assert_eq!(found(1, CanId::Standard(0x100)), Some(1), "the first of two entries");
         assert_eq!(found(3, CanId::Standard(0x7FF)), Some(2));
         assert_eq!(found(1, CanId::Extended(0x1FFF_FFFF)), Some(3));
         for (bus, id) in [(0, 0x100), (2, 0x100), (3, 0x100), (9, 0x100), (1, 0)] {
             assert_eq!(found(bus, CanId::Standard(id)), None, "{bus} {id:X}");
         }
-        assert_eq!(found(1, CanId::Standard(u16::MAX)), None, "no identifier at all");
+        assert_eq!(found(1, CanId::Standard(u16::MAX)), None, "not a valid identifier");
     }
 }

@@ -1,42 +1,44 @@
-//! ISO-TP (ISO 15765-2): messages of up to 65,535 bytes from single, first and consecutive frames, and back.
+//! ISO-TP (ISO 15765-2): reassembles messages of up to 65,535 bytes from single, first and consecutive frames, and
+//! segments them.
 //!
-//! In: payloads of one sender's frames with their times. Out: whole messages, and a fault for each one that is lost. Classic
-//! frames and CAN FD (escapes of length), normal and extended addressing. A [`Receiver`] only listens: flow control is the
-//! business of the tester. It keeps one message and never more memory than has arrived.
+//! In: payloads of one sender's frames with their times. Out: complete messages, and a fault for each lost message.
+//! Supports classic frames and CAN FD (length escapes), normal and extended addressing. A [`Receiver`] only listens:
+//! the tester sends flow control. It stores one message, and never more memory than has arrived.
 
 use crate::quantity::Timestamp;
 
-/// Longest silence between two frames of one message, ns (N_Cr of ISO 15765-2, 1 s).
+/// Longest time between two frames of one message, ns (N_Cr of ISO 15765-2, 1 s).
 pub const FRAME_TIMEOUT_NS: i64 = 1_000_000_000;
 
-/// Longest message: lengths beyond 4,095 (the escape of 2016) are accepted up to here.
+/// Longest message, bytes. Lengths above 4,095 use the escape of ISO 15765-2:2016.
 pub const MAX_MESSAGE: usize = 65_535;
 
-/// Flow control that lets everything come at once, without a pause.
+/// Flow control that allows all frames at once, without a pause.
 pub(crate) const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
 /// Longest classic payload, bytes.
 const CLASSIC: usize = 8;
 
-/// Why a message is lost.
+/// Reason why a message is lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum IsoTpFault {
-    /// A consecutive frame has another number than the next one: a frame is missing, doubled or out of order.
+    /// A consecutive frame does not have the next number: a frame is missing, duplicated or out of order.
     WrongSequence,
     /// No consecutive frame within a second.
     Timeout,
-    /// Another message began before the last one ended: two senders, or one that gave up.
+    /// Another message started before the last one ended: two senders, or a sender that gave up.
     Overlap,
-    /// The asking side refused it by flow control (buffer overflow, reserved state).
+    /// The requester refused it by flow control (buffer overflow, reserved state).
     Refused,
-    /// A length that its frame type cannot have: 0, beyond the frame, or a first frame of what fits into one frame.
+    /// A length that its frame type cannot have: 0, beyond the frame, or a first frame although the message fits into
+    /// one frame.
     WrongLength,
     /// Longer than [`MAX_MESSAGE`].
     TooLong,
-    /// A frame shorter than the first one promised.
+    /// A frame is shorter than the first frame requires.
     ShortFrame,
-    /// A consecutive frame although no message has begun.
+    /// A consecutive frame although no message has started.
     NotBegun,
 }
 
@@ -53,7 +55,7 @@ impl IsoTpFault {
         Self::NotBegun,
     ];
 
-    /// In words.
+    /// Description for logs and status.
     pub fn words(self) -> &'static str {
         match self {
             Self::WrongSequence => "wrong sequence",
@@ -68,48 +70,48 @@ impl IsoTpFault {
     }
 }
 
-/// Outcome of a frame; both may be there: a message that ends another one.
+/// Outcome of a frame. Both fields may be set: a frame can interrupt one message and complete another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Received {
-    /// A message was lost.
+    /// A message was lost for this reason.
     pub fault: Option<IsoTpFault>,
-    /// What the frame did for the message it belongs to.
+    /// Effect of the frame on its own message.
     pub progress: Progress,
 }
 
-/// What a frame did.
+/// Effect of a frame on a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Progress {
-    /// Nothing: no frame of a message, or a lost one.
+    /// None: the frame does not belong to a message, or to a lost one.
     #[default]
     None,
-    /// It began a message of several frames.
+    /// The frame started a message of several frames.
     Begun,
-    /// It continued one.
+    /// The frame continued a message.
     Continued,
-    /// It completed one: [`Receiver::message`].
+    /// The frame completed a message, see [`Receiver::message`].
     Complete,
 }
 
 /// Reassembles the messages of one sender.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Receiver {
-    /// First data byte of every frame with extended addressing.
+    /// First data byte of every frame, for extended addressing.
     extension: Option<u8>,
     message: Vec<u8>,
-    /// Length of the message under way; 0 = none is.
+    /// Length of the message being received; 0 = none.
     length: usize,
-    /// Number of the next consecutive frame, 0 to 15.
+    /// Sequence number of the next consecutive frame, 0 to 15.
     next: u8,
-    /// Payload length of its first frame (RX_DL), without the extension.
+    /// Payload length of the first frame (RX_DL), without the extension.
     frame_len: usize,
     latest: Timestamp,
-    /// The message under way is lost, and known to be: its further frames are no further fault.
+    /// The current message is lost, and the loss is reported: its further frames cause no further fault.
     is_discarding: bool,
 }
 
 impl Receiver {
-    /// A receiver before its first frame.
+    /// Creates a receiver before its first frame.
     pub fn new(extension: Option<u8>) -> Self {
         let latest = Timestamp::from_nanos(0);
         Self { extension, message: Vec::new(), length: 0, next: 0, frame_len: 0, latest, is_discarding: false }
@@ -120,7 +122,7 @@ impl Receiver {
         &self.message
     }
 
-    /// Continues as `stored`: a message that cannot be under way is left out.
+    /// Resumes from `stored`. Drops a partial message that is not possible.
     pub fn resume(&mut self, stored: &Self) {
         let is_possible = stored.message.len() < stored.length
             && stored.length <= MAX_MESSAGE
@@ -131,12 +133,12 @@ impl Receiver {
         self.extension = extension;
     }
 
-    /// Whether a message is under way.
+    /// Whether a message is being received.
     pub fn is_receiving(&self) -> bool {
         self.length > 0
     }
 
-    /// Takes a payload of the sender.
+    /// Handles a payload of the sender.
     pub fn handle(&mut self, now: Timestamp, payload: &[u8]) -> Received {
         let late = self.poll(now);
         let Some(data) = without_extension(self.extension, payload) else { return Received::lost(late) };
@@ -145,27 +147,27 @@ impl Receiver {
                 0x0 => self.single(data),
                 0x1 => self.first(now, data),
                 0x2 => self.consecutive(now, control & 0xF, &data[1..]),
-                _ => Received::default(), // flow control and reserved types are no part of a message
+                _ => Received::default(), // flow control and reserved types are not part of a message
             },
             [] => Received::default(),
         };
         Received { fault: late.or(received.fault), ..received }
     }
 
-    /// Takes a flow control of the asking side: one that refuses ends the message under way.
+    /// Handles a flow control frame of the requester: a refusal ends the message being received.
     pub fn handle_flow_control(&mut self, extension: Option<u8>, payload: &[u8]) -> Option<IsoTpFault> {
         let control = *without_extension(extension, payload)?.first()?;
         let is_refusal = control >> 4 == 0x3 && !matches!(control & 0xF, 0 | 1);
         (is_refusal && self.is_receiving()).then(|| self.drop_message(IsoTpFault::Refused))
     }
 
-    /// Gives up a message whose next frame is overdue.
+    /// Drops a message whose next frame is overdue.
     pub fn poll(&mut self, now: Timestamp) -> Option<IsoTpFault> {
         let is_late = self.is_receiving() && now.nanos().saturating_sub(self.latest.nanos()) > FRAME_TIMEOUT_NS;
         is_late.then(|| self.drop_message(IsoTpFault::Timeout))
     }
 
-    /// Forgets a message under way, without a fault: time passed unseen.
+    /// Forgets a partial message without a fault, because frames may have been missed.
     pub fn restart(&mut self) {
         (self.length, self.is_discarding) = (0, true);
     }
@@ -175,7 +177,7 @@ impl Receiver {
         fault
     }
 
-    /// A frame that begins a message: the fault of the one it interrupts.
+    /// Starts a message; returns the fault of the message that it interrupts.
     fn begin(&mut self) -> Option<IsoTpFault> {
         let overlap = self.is_receiving().then_some(IsoTpFault::Overlap);
         (self.length, self.is_discarding) = (0, false);
@@ -184,7 +186,7 @@ impl Receiver {
 
     fn single(&mut self, data: &[u8]) -> Received {
         let overlap = self.begin();
-        // Frames of more than 8 bytes carry their length in the second byte.
+        // Frames with more than 8 bytes carry the length in the second byte.
         let (length, body) = match (data[0] & 0xF, data) {
             (0, [_, length, body @ ..]) if body.len() + 2 > self.classic_len() => (usize::from(*length), body),
             (length, [_, body @ ..]) => (usize::from(length), body),
@@ -208,7 +210,7 @@ impl Receiver {
             _ => (0, data),
         };
         let length = usize::try_from(length).unwrap_or(usize::MAX);
-        // What fits into one frame needs no first frame, and a first frame is full.
+        // A message that fits into one frame has no first frame, and a first frame is full.
         let fault = if length <= body.len() || data.len() < self.classic_len() {
             Some(IsoTpFault::WrongLength)
         } else {
@@ -257,7 +259,7 @@ impl Received {
     }
 }
 
-/// The payload behind the extension; `None` = for another address.
+/// The payload after the extension; `None` = another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),
@@ -265,8 +267,9 @@ fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     }
 }
 
-/// The payloads that carry a message in classic frames, filled up with `padding` (ISO 15765-2 asks for 0xCC, cars send 0x00,
-/// 0x55 and 0xAA too): one single frame, or a first and consecutive ones. Empty for a message without a byte or longer than 4,095.
+/// Segments a message into classic payloads, padded with `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00,
+/// 0x55 and 0xAA): one single frame, or a first and consecutive frames. Empty for a message of 0 bytes or of more than
+/// 4,095.
 pub fn segment(extension: Option<u8>, message: &[u8], padding: u8) -> Vec<[u8; CLASSIC]> {
     let room = CLASSIC - usize::from(extension.is_some());
     let Ok(length) = u16::try_from(message.len()) else { return Vec::new() };

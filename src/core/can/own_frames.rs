@@ -1,8 +1,8 @@
-//! Finds frames with identifiers of our own that we did not send: another sender speaks in our name.
+//! Detects frames with packwatch's own identifiers that packwatch did not send: another sender uses them.
 //!
-//! In: frames that we sent, frames that came. Out: an [`OwnIdChange`] at the first such frame, and when none has come for
-//! [`GONE_S`]. A socket does not receive what it sent; where an adapter or a recorded log returns our frames all the same, each
-//! sent frame may come back once, unchanged, within [`ECHO_S`].
+//! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first such frame, and when none has arrived for
+//! [`GONE_S`]. A socket does not receive what it sent. If an adapter or a recorded log returns sent frames anyway, each
+//! sent frame may return once, unchanged, within [`ECHO_S`].
 
 use std::collections::VecDeque;
 
@@ -12,23 +12,23 @@ use crate::can::id_table::IdTable;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// An echo comes back within this time, s.
+/// Longest time in which an echo returns, s.
 const ECHO_S: f64 = 1.0;
-/// Sent frames that may come back: a second of status, health and alarm frames on two interfaces.
+/// Number of sent frames that may return: those of a second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
-/// Without another such frame for this long the other sender is gone, s.
+/// The other sender is gone after this time without a frame of it, s.
 const GONE_S: f64 = 10.0;
 
-/// Another sender uses our identifiers, or does no more.
+/// Reports that another sender started or stopped using packwatch's identifiers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OwnIdChange {
     /// Interface.
     pub bus: BusIndex,
     /// Identifier of its latest frame.
     pub id: CanId,
-    /// Whether it began.
+    /// Whether it started.
     pub active: bool,
-    /// Frames so far: 1 when it begins, all of them when it ends.
+    /// Frames so far: 1 at the start, all of them at the end.
     pub frames: u64,
 }
 
@@ -43,7 +43,7 @@ pub struct OwnIdUse {
     frames: u64,
 }
 
-/// A frame that we sent, with a check sum in the place of its payload: to keep it needs no memory of its own.
+/// A sent frame, with a checksum instead of its payload, so that storing it allocates no memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct SentFrame {
     time: Timestamp,
@@ -52,8 +52,9 @@ struct SentFrame {
     sum: u64,
 }
 
-/// A sum of a payload and its length, like FNV-1a with words of eight bytes in place of bytes: it is made for every sent frame, and
-/// a copy is to be recognised, not to be proven. Two of one length of up to eight bytes never have the same.
+/// Checksum of a payload and its length: like FNV-1a, but with words of eight bytes instead of bytes, because it is
+/// computed for every sent frame. It identifies copies and is not secure. Two payloads of the same length of up to
+/// eight bytes never have the same checksum.
 fn sum(data: &[u8]) -> u64 {
     let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
     data.chunks(8).fold(start, |sum, chunk| {
@@ -71,19 +72,19 @@ pub struct OwnFramesState {
     sent: VecDeque<SentFrame>,
 }
 
-/// Our identifiers, and what came with them.
+/// packwatch's identifiers, and other senders that use them.
 #[derive(Debug, Clone, Default)]
 pub struct OwnFrames {
     numbers: IdTable,
-    /// Number of our identifiers.
+    /// Number of packwatch's identifiers.
     count: usize,
     state: OwnFramesState,
-    /// Changes that wait to be published, in their order.
+    /// Changes to be published, in order.
     pub(crate) changes: Vec<OwnIdChange>,
 }
 
 impl OwnFrames {
-    /// For these identifiers.
+    /// Creates the detector for packwatch's identifiers.
     pub fn new(own: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let own: Vec<_> = own.into_iter().collect();
         let count = own.len();
@@ -92,13 +93,13 @@ impl OwnFrames {
         own_frames
     }
 
-    /// Whether an identifier is ours.
+    /// Whether an identifier is one of packwatch's.
     #[inline]
     pub fn has(&self, bus: BusIndex, id: CanId) -> bool {
         self.numbers.number(bus, id) < self.count
     }
 
-    /// Takes a frame that we send.
+    /// Handles a sent frame.
     pub fn note_sent(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         if self.has(bus, frame.id()) {
             if self.state.sent.len() >= MAX_SENT {
@@ -108,7 +109,7 @@ impl OwnFrames {
         }
     }
 
-    /// Takes a frame that came.
+    /// Handles a received frame.
     #[inline]
     pub fn handle(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) {
         if self.has(bus, frame.id()) {
@@ -135,7 +136,7 @@ impl OwnFrames {
         }
     }
 
-    /// Finds senders that are gone.
+    /// Detects senders that are gone.
     pub fn poll(&mut self, now: Timestamp) {
         let changes = &mut self.changes;
         self.state.uses.retain(|other| {
@@ -147,30 +148,30 @@ impl OwnFrames {
         });
     }
 
-    /// For how long another sender has been there, s; 0 = there is none.
+    /// How long another sender has been present, s; 0 = no other sender.
     pub fn longest_s(&self, now: Timestamp) -> f64 {
-        // In this very moment it is there already: 0 would say that there is none.
+        // Not 0 in the first moment, because 0 means that there is no other sender.
         self.state.uses.iter().map(|other| now.since(other.since).max(1e-9)).fold(0.0, f64::max)
     }
 
-    /// Interfaces with another sender, and its latest identifier.
+    /// Interfaces with another sender, and the latest identifier used.
     pub fn uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.state.uses.iter().map(|other| (other.bus, other.id))
     }
 
-    /// After time without listening, or a step of the clock: every other sender is gone, and no echo comes.
+    /// Handles time without listening or a clock step: every other sender is gone, and no echo is expected.
     pub fn restart(&mut self) {
         self.poll(Timestamp::from_nanos(i64::MAX));
         self.state.uses.clear();
         self.state.sent.clear();
     }
 
-    /// Returns the state.
+    /// The state to store.
     pub fn state(&self) -> &OwnFramesState {
         &self.state
     }
 
-    /// Continues a state, with these identifiers.
+    /// Restores a stored state; the identifiers stay.
     pub fn resume(&mut self, stored: &OwnFramesState) {
         self.state.clone_from(stored);
         self.state.sent.truncate(MAX_SENT);
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn another_sender_is_reported_once_and_its_end_with_the_count() {
+    fn other_sender_is_reported_at_start_and_end() {
         let mut own = OwnFrames::new([(BUS, OWN)]);
         for k in 0..300_u32 {
             own.handle(at(f64::from(k) * 0.01), BUS, &frame(OWN, 7));
@@ -208,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn an_echo_of_a_sent_frame_is_ours_and_a_second_copy_is_not() {
+    fn only_first_echo_of_sent_frame_is_own() {
         let mut own = OwnFrames::new([(BUS, OWN)]);
         own.note_sent(at(1.0), BUS, &frame(OWN, 1));
         own.handle(at(1.001), BUS, &frame(OWN, 1));
@@ -219,6 +220,6 @@ mod tests {
         own.poll(at(20.0));
         own.changes.clear();
         own.handle(at(22.0), BUS, &frame(OWN, 2));
-        assert_eq!(own.changes.len(), 1, "an echo does not take two seconds");
+        assert_eq!(own.changes.len(), 1, "two seconds are too late for an echo");
     }
 }

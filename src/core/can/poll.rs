@@ -1,10 +1,10 @@
-//! Asks controllers for diagnostic answers, and stops at every sign that it could disturb.
+//! Sends diagnostic requests to controllers, and stops at every sign that it could disturb.
 //!
-//! In: frames, answers, what the car does, the supply voltage, the time. Out: request and flow control frames, and a
-//! [`PollChange`] each time it falls silent or asks again. One request is outstanding at a time. It is silent while another tester
-//! is at work, while the bus sleeps, while the supply is low or not known, and on standby.
+//! In: frames, responses, the state of the car, the supply voltage, the time. Out: request and flow control frames, and
+//! a [`PollChange`] each time that polling stops or starts. One request is outstanding at a time. Polling stops while
+//! another tester is active, while the bus sleeps, while the supply voltage is low or unknown, and on standby.
 //!
-//! Only questions of a [`Service`](super::uds::Service) can be sent: there is no way to express a write, a session or a
+//! Only requests of a [`Service`](super::uds::Service) can be sent: the types cannot express a write, a session or a
 //! routine. Pure: no clock, no socket.
 
 use serde::{Deserialize, Serialize};
@@ -14,119 +14,119 @@ use super::uds::{Controller, PENDING, Question, Refusal};
 use super::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Silence after another tester's request, ns: longer than the pause between the requests of a workshop tester.
+/// Silence after another tester's request, ns. Longer than the pause between the requests of a workshop tester.
 pub const FOREIGN_SILENCE_NS: i64 = 60_000_000_000;
-/// A bus without a frame of others for this long sleeps, ns: broadcasts of a running car come many times a second.
+/// A bus without a frame from other nodes for this long is asleep, ns. A running car broadcasts many times a second.
 pub const ASLEEP_AFTER_NS: i64 = 2_000_000_000;
-/// Longest wait for the next sign of an answer, ns (P2 is 50 ms, N_Cr 1 s).
+/// Longest wait for the next frame of a response, ns (P2 is 50 ms, N_Cr 1 s).
 const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
 
-/// What the car does, as far as the pack's current says it.
+/// State of the car, as derived from the pack current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 pub enum CarState {
     /// The pack is discharged.
     Drive,
     /// The pack is charged.
     Charge,
-    /// No current flows, or it is not known.
+    /// No current flows, or the current is unknown.
     #[default]
     Parked,
 }
 
-/// One question and how often it is asked.
+/// One request and how often it is sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PollRequest {
-    /// The question.
+    /// The value to request.
     pub question: Question,
-    /// Period in each [`CarState`], s; `None` = not asked then.
+    /// Period in each [`CarState`], s; `None` = not sent in this state.
     pub every_s: [Option<f64>; 3],
-    /// The answer has the pack current.
+    /// Whether the response contains the pack current.
     pub has_current: bool,
-    /// The answer has voltages: the current is asked for right before.
+    /// Whether the response contains voltages: the current is then requested right before.
     pub has_voltages: bool,
 }
 
-/// The questions.
+/// Configuration of polling.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PollConfig {
-    /// In the order in which they are asked when several are due.
+    /// Requests, in the order in which they are sent if several are due.
     pub requests: Vec<PollRequest>,
-    /// Most requests in a second, of all questions.
+    /// Maximum number of requests per second, over all requests.
     pub max_requests_per_s: f64,
-    /// Whether a supply voltage is watched: without a good reading nothing is sent.
+    /// Whether a supply voltage is configured: without a good reading nothing is sent.
     pub watches_supply: bool,
 }
 
-/// Reason why nothing is sent.
+/// Reason why polling is stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PollSilence {
-    /// By command.
+    /// Stopped by command.
     Standby,
-    /// Another tester's request was heard less than a minute ago.
+    /// Another tester sent a request less than a minute ago.
     OtherTester,
-    /// The supply voltage is low, or not known.
+    /// The supply voltage is low or unknown.
     LowSupply,
-    /// No frame of others: the bus sleeps.
+    /// The bus is asleep: no frames from other nodes.
     BusAsleep,
 }
 
 impl PollSilence {
-    /// In words.
+    /// Description for logs and status.
     pub fn words(self) -> &'static str {
         match self {
             Self::Standby => "on standby",
-            Self::OtherTester => "another tester is at work",
-            Self::LowSupply => "the supply voltage is low or not known",
+            Self::OtherTester => "another tester is active",
+            Self::LowSupply => "the supply voltage is low or unknown",
             Self::BusAsleep => "the bus sleeps",
         }
     }
 }
 
-/// Something worth a line in a log.
+/// A change of polling, for the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "poll")]
 pub enum PollChange {
-    /// It fell silent.
+    /// Polling stopped.
     Silent {
-        /// Why.
+        /// The reason.
         reason: PollSilence,
     },
-    /// It asks again.
+    /// Polling started again.
     Asking,
-    /// A question is never asked again.
+    /// A controller rejected a request permanently; it is never sent again.
     Refused {
-        /// Controller, by the identifier of its answers.
+        /// The controller, by the identifier of its responses.
         id: CanId,
         /// Service.
         service: u8,
-        /// Identifier of the values.
+        /// Identifier of the requested value.
         identifier: u16,
-        /// Code of the refusal.
+        /// Negative response code.
         code: u8,
     },
 }
 
-/// Outputs; the caller empties them.
+/// Outputs of the poller; the caller empties them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PollOutputs {
     /// Frames to send, in this order.
     pub frames: Vec<(BusIndex, Frame)>,
-    /// What changed.
+    /// Changes to report.
     pub changes: Vec<PollChange>,
 }
 
-/// A question's state.
+/// State of one request.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Item {
     due: Timestamp,
-    /// Failures in a row.
+    /// Consecutive failures.
     failures: u32,
-    /// Never asked again.
+    /// Never sent again.
     is_refused: bool,
 }
 
-/// The question that waits for its answer.
+/// The request whose response is outstanding.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Outstanding {
     index: usize,
@@ -134,35 +134,35 @@ struct Outstanding {
     deadline: Timestamp,
 }
 
-/// Asks.
+/// Sends diagnostic requests.
 #[derive(Debug, Clone)]
 pub struct Poller {
     config: PollConfig,
     progress: PollProgress,
 }
 
-/// How far the questions have come: what a snapshot keeps for a continuation without a break.
+/// Progress of polling, for a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PollProgress {
     items: Vec<Item>,
     outstanding: Option<Outstanding>,
-    /// The latest question, asked or answered.
+    /// The request sent last.
     latest: Option<usize>,
-    /// When the rate allows the next request.
+    /// When the rate limit allows the next request.
     rate_allows_at: Timestamp,
     state: CarState,
     is_standby: bool,
-    /// Until when the latest good reading of the supply holds.
+    /// Time up to which the latest good supply reading is valid.
     supply_good_until: Timestamp,
     foreign_until: Timestamp,
-    /// Latest frame of others on each polled bus.
+    /// Time of the latest frame from other nodes on each polled bus.
     heard: Vec<(BusIndex, Timestamp)>,
-    /// As last reported.
+    /// The silence last reported.
     silence: Option<PollSilence>,
 }
 
 impl Poller {
-    /// A poller that has heard nothing yet: silent.
+    /// Creates a poller that has received nothing yet and is therefore silent.
     pub fn new(config: &PollConfig) -> Self {
         let item = Item { due: Timestamp::LONG_AGO, failures: 0, is_refused: false };
         let mut buses: Vec<BusIndex> = config.requests.iter().map(|request| request.question.controller.bus).collect();
@@ -185,12 +185,12 @@ impl Poller {
         }
     }
 
-    /// How far the questions have come.
+    /// The progress to store.
     pub fn progress(&self) -> &PollProgress {
         &self.progress
     }
 
-    /// Continues stored questions, if they are of the same configuration.
+    /// Resumes stored progress, if it belongs to the same configuration.
     pub fn resume(&mut self, stored: &PollProgress) {
         let questions = self.progress.items.len();
         let exists = |index: usize| index < questions;
@@ -203,52 +203,52 @@ impl Poller {
         }
     }
 
-    /// Whether it sends on a bus, and so has to hear every frame of it.
+    /// Whether it polls on a bus, and therefore must receive every frame of it.
     pub fn is_on(&self, bus: BusIndex) -> bool {
         self.progress.heard.iter().any(|(other, _)| *other == bus)
     }
 
-    /// Why nothing is sent; `None` = it asks.
+    /// Why nothing is sent; `None` = polling is active.
     pub fn silence(&self) -> Option<PollSilence> {
         self.progress.silence
     }
 
-    /// Questions that are never asked again.
+    /// Number of requests that are never sent again.
     pub fn refused(&self) -> usize {
         self.progress.items.iter().filter(|item| item.is_refused).count()
     }
 
-    /// Another period may hold from here on.
+    /// Sets the state of the car, which determines the periods.
     pub fn set_state(&mut self, now: Timestamp, state: CarState) {
         if state == self.progress.state {
             return;
         }
         self.progress.state = state;
         for index in 0..self.progress.items.len() {
-            // A shorter period begins now, not when the longer one is over.
+            // A shorter period starts now, not after the longer one.
             if let Some(period_s) = self.period_s(index) {
                 self.progress.items[index].due = self.progress.items[index].due.min(now.plus_secs(period_s));
             }
         }
     }
 
-    /// Takes a reading of the supply voltage: until when it may be counted on, `None` = it is low or bad.
+    /// Handles a reading of the supply voltage: `good_until` is the time up to which it is valid; `None` = low or bad.
     pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
         self.progress.supply_good_until = good_until.unwrap_or(Timestamp::LONG_AGO);
     }
 
-    /// Sets or ends the standby.
+    /// Starts or ends standby.
     pub fn set_standby(&mut self, is_standby: bool) {
         self.progress.is_standby = is_standby;
     }
 
-    /// Begins again after time without the buses: nothing was heard.
+    /// Handles time without listening: no frame has been received.
     pub fn restart(&mut self) {
         self.progress.outstanding = None;
         self.progress.heard.iter_mut().for_each(|(_, at)| *at = Timestamp::LONG_AGO);
     }
 
-    /// Takes a frame of others; those of [`Self::poll`] do not come back.
+    /// Handles a received frame of another node. Frames that the poller sent must not be passed.
     pub fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut PollOutputs) {
         let Some(heard) = self.progress.heard.iter_mut().find(|(other, _)| *other == bus) else { return };
         let of_polled = |wanted: fn(&Controller) -> CanId| {
@@ -263,13 +263,13 @@ impl Poller {
             self.progress.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
             self.progress.outstanding = None;
         } else if !of_polled(|controller| controller.response) {
-            // An answer to a question of ours does not say that the car is awake by itself.
+            // A response to a request of packwatch does not prove that the car is awake by itself.
             heard.1 = now;
         }
         self.poll(now, out);
     }
 
-    /// The answer of several frames to the outstanding question begins: the rest may come.
+    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control.
     pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
         let Some(question) = self.outstanding_of(controller) else { return };
         self.extend_wait(now, ANSWER_WITHIN_NS);
@@ -280,14 +280,14 @@ impl Poller {
         out.frames.extend(Frame::classic(request, &payload).map(|frame| (bus, frame)));
     }
 
-    /// A further part of the answer.
+    /// Handles a further frame of the response.
     pub fn handle_continued(&mut self, now: Timestamp, controller: &Controller) {
         if self.outstanding_of(controller).is_some() {
             self.extend_wait(now, ANSWER_WITHIN_NS);
         }
     }
 
-    /// A whole answer.
+    /// Handles a complete response.
     pub fn handle_answer(&mut self, now: Timestamp, question: &Question, out: &mut PollOutputs) {
         if let Some(Outstanding { index, .. }) = self.progress.outstanding
             && self.config.requests[index].question == *question
@@ -298,7 +298,7 @@ impl Poller {
         }
     }
 
-    /// A refusal.
+    /// Handles a negative response.
     pub fn handle_refusal(&mut self, now: Timestamp, controller: &Controller, refusal: Refusal, out: &mut PollOutputs) {
         let Refusal { service, code } = refusal;
         let Some(question) = self.outstanding_of(controller).filter(|question| question.service as u8 == service)
@@ -306,11 +306,11 @@ impl Poller {
             return;
         };
         if code == PENDING {
-            // Longest wait after "wait", ns (P2*).
+            // Longest wait after "response pending", ns (P2*).
             return self.extend_wait(now, 5_000_000_000);
         }
         let Some(Outstanding { index, .. }) = self.progress.outstanding.take() else { return };
-        // Refusals that will not change: service not supported, request out of range, security access denied.
+        // Permanent: service not supported, request out of range, security access denied.
         if [0x11, 0x31, 0x33].contains(&code) {
             self.progress.items[index].is_refused = true;
             let (id, service) = (controller.response, question.service as u8);
@@ -349,7 +349,8 @@ impl Poller {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to do; `None` = only a frame, a command or a reading can change that.
+    /// When [`poll`](Self::poll) has something to do next; `None` = only a frame, a command or a reading can change
+    /// that.
     pub fn next_due(&self) -> Option<Timestamp> {
         match self.progress.silence {
             Some(PollSilence::OtherTester) => return Some(self.progress.foreign_until),
@@ -378,7 +379,7 @@ impl Poller {
         }
     }
 
-    /// The question to ask next and when.
+    /// The next request and its due time.
     fn next(&self) -> Option<(usize, Timestamp)> {
         let waiting = self
             .progress
@@ -393,7 +394,7 @@ impl Poller {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
 
-    /// The question to ask before this one: that for the current before one for voltages.
+    /// The request to send first: before a request for voltages, the one for the current.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {
@@ -418,29 +419,29 @@ impl Poller {
         self.progress.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
         self.progress.latest = Some(index);
         self.progress.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
-        // Without a period in this state it is asked for the sake of another one.
+        // A request without a period in this state is sent only for the sake of another one.
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);
-        // On time, the next one keeps the rhythm.
+        // A request that was sent on time keeps its rhythm.
         item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
     }
 
-    /// Waits longer, but not for ever.
+    /// Extends the wait for the response, up to a limit.
     fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
         if let Some(outstanding) = &mut self.progress.outstanding {
-            // Longest wait in all, ns: a gateway may say "wait" for ever.
+            // Longest wait in total, ns: a gateway may respond "pending" forever.
             outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(30_000_000_000));
         }
     }
 
-    /// Asks a question that failed less often.
+    /// Increases the pause after a failed request.
     fn fail(&mut self, now: Timestamp, index: usize) {
         let period_s = self.period_s(index).unwrap_or(1.0);
         let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
-        // Longest pause of a question that fails, s.
+        // Longest pause after failures, s.
         item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(600.0))));
     }
 
@@ -450,7 +451,7 @@ impl Poller {
     }
 }
 
-/// Whether an identifier is used by testers alone: the requests of ISO 15765-4, physical and to all.
+/// Whether only testers use an identifier: the physical and functional requests of ISO 15765-4.
 fn is_tester(id: CanId) -> bool {
     match id {
         CanId::Standard(raw) => raw == 0x7DF || (0x7E0..=0x7E7).contains(&raw),

@@ -1,19 +1,20 @@
-//! Finds a second sender of an unprotected input message, by the rate of its frames against their cycle time.
+//! Detects a second sender of an unprotected input message by comparing the frame rate with the message's cycle time.
 //!
-//! In: time and identifier of each frame, whether its current contradicts the frames around it, the time alone
+//! In: time and identifier of each frame, whether its current contradicts the neighbouring frames, the time alone
 //! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found and when it is gone.
 //!
-//! Per window of [`WINDOW_NS`] the frames are counted. More than [`EXCESS`] times the expected number in [`WINDOWS`] windows in
-//! a row is a second sender where there is a second sign of it: each frame of the first one falls between two of the other, so
-//! that one interval in each of its periods is much shorter than the mean; or the currents alternate. A sender that becomes
-//! faster, as many do when the vehicle wakes, gives neither. Short intervals that a message has anyway, as the pages of a
-//! multiplexed one that come in a burst, are learned with its rate and count for nothing. The expected number is the highest
-//! steady rate so far, or that of the DBC's cycle time if it is higher; the rate is stored, so that a second sender is found after
-//! a restart, too.
+//! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if [`WINDOWS`] consecutive windows have
+//! more than [`EXCESS`] times the expected number of frames, and if there is a second sign: either many intervals are
+//! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the currents
+//! alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither. Short intervals
+//! that a message always has, such as those between the pages of a multiplexed message sent in a burst, are learned
+//! with its rate and do not count. The expected number is the highest steady rate so far, or that of the DBC's cycle
+//! time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
 //!
-//! Limits: a second sender as slow as the first of fewer than [`LEAST_PER_S`] frames a second, one of a message that always comes
-//! in bursts or more than twenty times as often, if it carries no current, and one that is there before the rate is known, if its
-//! currents do not differ, are not found. A message with end-to-end protection needs none of this: its counters do not fit.
+//! Limits: the following second senders are not found: one of a message with fewer than [`LEAST_PER_S`] frames a second
+//! that is as slow as the first sender; one of a message without a current that always arrives in bursts, or that sends
+//! more than twenty times as often; one that is present before the rate is known, if its currents do not differ. A
+//! message with end-to-end protection does not need this check: the counters of two senders do not fit.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,43 +24,44 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Length of a window, ns.
 const WINDOW_NS: i64 = 1_000_000_000;
-/// Frames beyond this many times the expected number are too many; two senders of one cycle are twice.
+/// Factor on the expected number of frames above which there are too many; a second sender with the same cycle doubles
+/// it.
 const EXCESS: f64 = 1.5;
-/// Room for frames that the bus has delayed into the window.
+/// Additional frames allowed, for frames that arbitration delayed into the window.
 const DELAYED: f64 = 1.5;
-/// Windows in a row with too many frames: a burst after a pause of the bus is one.
+/// Number of consecutive windows with too many frames. A burst after a pause of the bus affects only one.
 const WINDOWS: u32 = 3;
-/// Windows in a row without, after which the second sender is gone.
+/// Number of consecutive normal windows after which the second sender is gone.
 const GONE_WINDOWS: u32 = 10;
-/// Windows in a row with about as many frames that make a rate steady.
+/// Number of consecutive windows with a similar number of frames after which a rate is steady.
 const STEADY_WINDOWS: u32 = 20;
-/// Deviation that is about as many, part of the frames, and frames.
+/// Largest deviation of a similar number of frames: relative part plus number of frames.
 const STEADY: (f64, f64) = (0.2, 1.0);
-/// Frames a second from which a rate is learned: fewer in a window say little.
+/// Lowest rate that is learned, frames a second: fewer frames in a window are not significant.
 const LEAST_PER_S: f64 = 3.0;
-/// An interval shorter than this part of the mean is a short one.
+/// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Short intervals, or contradictions, per expected frame that are a sign of a second sender.
+/// Short intervals or contradictions per expected frame that indicate a second sender.
 const SIGNS: f64 = 0.4;
-/// Part of the frames that comes after a short interval by chance: other messages delay them.
+/// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
 
-/// A second sender was found, or is gone.
+/// Reports that a second sender was found or is gone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SenderChange {
     /// Interface.
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// Whether it was found.
+    /// Whether a second sender was found.
     pub active: bool,
     /// Frames in the latest second.
     pub frames_per_s: u32,
-    /// Expected frames in a second.
+    /// Expected frames per second.
     pub expected_per_s: f64,
 }
 
-/// What is known of one message; all of it is part of a snapshot.
+/// Rate statistics of one message; all fields are part of a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MessageRate {
@@ -67,23 +69,23 @@ pub struct MessageRate {
     id: CanId,
     /// Highest steady rate, 1/s.
     learned_per_s: Option<f64>,
-    /// Part of its frames that come after a short interval.
+    /// Fraction of its frames that usually follow a short interval.
     usual_short: f64,
-    /// Rate of the latest windows, and for how many it has been steady.
+    /// Rate of the latest windows, and the number of windows for which it has been steady.
     candidate: f64,
     steady: u32,
-    /// Windows in a row with too many frames, and without.
+    /// Consecutive windows with too many frames, and consecutive normal windows.
     excess: u32,
     calm: u32,
-    /// Begin of the window; `None` = no frame since listening began.
+    /// Start of the window; `None` = no frame since listening started.
     window_from: Option<Timestamp>,
     frames: u32,
     short: u32,
     contradictions: u32,
     latest: Timestamp,
-    /// The last two currents of the message, A.
+    /// The previous two currents of the message, A.
     currents_a: [Option<f64>; 2],
-    /// Whether a second sender is there.
+    /// Whether there is a second sender.
     is_doubtful: bool,
 }
 
@@ -92,17 +94,17 @@ pub struct MessageRate {
 pub struct SecondSenders {
     /// Sorted by interface and identifier.
     rates: Vec<MessageRate>,
-    /// Rate by the DBC's cycle time, 1/s.
+    /// Rate from the DBC's cycle time, 1/s.
     configured_per_s: Vec<Option<f64>>,
     numbers: IdTable,
-    /// No window ends before this time.
+    /// No window ends before this time plus the length of a window.
     next_end: Option<Timestamp>,
-    /// Changes that wait to be published, in their order.
+    /// Changes to be published, in order.
     pub(crate) changes: Vec<SenderChange>,
 }
 
 impl SecondSenders {
-    /// For these messages, each with the cycle time (s) of its frames where it is known.
+    /// Creates the detector for messages, each with its cycle time, s, if known.
     pub fn new(messages: impl IntoIterator<Item = (BusIndex, CanId, Option<f64>)>) -> Self {
         let mut messages: Vec<_> = messages.into_iter().collect();
         messages.sort_by_key(|(bus, id, _)| (*bus, *id));
@@ -117,7 +119,7 @@ impl SecondSenders {
         }
     }
 
-    /// Whether a second sender of a message is there.
+    /// Whether a message has a second sender.
     pub fn is_doubtful(&self, bus: BusIndex, id: CanId) -> bool {
         self.rates.get(self.numbers.number(bus, id)).is_some_and(|rate| rate.is_doubtful)
     }
@@ -127,7 +129,7 @@ impl SecondSenders {
         self.rates.iter().filter(|rate| rate.is_doubtful).map(|rate| (rate.bus, rate.id))
     }
 
-    /// Counts a frame.
+    /// Counts a received frame.
     #[inline]
     pub fn handle(&mut self, now: Timestamp, bus: BusIndex, id: CanId) {
         let number = self.numbers.number(bus, id);
@@ -139,7 +141,8 @@ impl SecondSenders {
         }
     }
 
-    /// Takes the current of a frame that was [counted](Self::handle); `step_a` is the smallest step that is no noise.
+    /// Handles the current of a frame that was [counted](Self::handle). `step_a` is the smallest step that exceeds
+    /// noise, A.
     pub fn note_current(&mut self, bus: BusIndex, id: CanId, current_a: f64, step_a: f64) {
         let Some(rate) = self.rates.get_mut(self.numbers.number(bus, id)) else { return };
         let [before, between] = rate.currents_a;
@@ -151,7 +154,7 @@ impl SecondSenders {
         rate.currents_a = [between, Some(current_a)];
     }
 
-    /// Ends the windows that are over: a message that no longer comes has no second sender.
+    /// Ends the windows that are over. A message that has stopped has no second sender.
     pub fn poll(&mut self, now: Timestamp) {
         let is_over = |from: Timestamp| now.nanos().saturating_sub(from.nanos()) >= WINDOW_NS;
         if !self.next_end.is_some_and(is_over) {
@@ -163,8 +166,8 @@ impl SecondSenders {
         self.next_end = self.rates.iter().filter_map(|rate| rate.window_from).min();
     }
 
-    /// After time without listening, or a step of the clock: counting begins again. Rates stay, and so does a second sender until
-    /// enough windows have come without.
+    /// Handles time without listening or a clock step: counting restarts. Rates are kept, and so is a second sender
+    /// until enough normal windows have passed.
     pub fn restart(&mut self) {
         for rate in &mut self.rates {
             *rate = MessageRate {
@@ -177,12 +180,13 @@ impl SecondSenders {
         self.next_end = None;
     }
 
-    /// What is known of each message.
+    /// The statistics of each message, to store.
     pub fn snapshot(&self) -> Vec<MessageRate> {
         self.rates.clone()
     }
 
-    /// Continues stored messages; [`restart`](Self::restart) follows where the program was not running in between.
+    /// Restores stored statistics. Call [`restart`](Self::restart) afterwards if the program was not running in
+    /// between.
     pub fn restore(&mut self, stored: &[MessageRate]) {
         for of in stored.iter().filter(|of| of.is_possible()) {
             if let Some(rate) = self.rates.get_mut(self.numbers.number(of.bus, of.id)) {
@@ -224,7 +228,7 @@ impl MessageRate {
         if self.window_from.is_none() {
             self.window_from = Some(now);
         } else if self.candidate > 0.0 {
-            // The mean of the window before: that of this one is not known yet.
+            // Uses the mean rate up to the previous window, because that of the current window is not known yet.
             let interval_ns = now.nanos().saturating_sub(self.latest.nanos()) as f64;
             self.short = self.short.saturating_add(u32::from(interval_ns * self.candidate < SHORT * WINDOW_NS as f64));
         }
@@ -232,7 +236,7 @@ impl MessageRate {
         self.latest = now;
     }
 
-    /// Ends the window, if it is over.
+    /// Ends the current window if it is over.
     #[inline]
     fn end_windows(&mut self, now: Timestamp, configured: Option<f64>, changes: &mut Vec<SenderChange>) {
         let Some(from) = self.window_from else { return };
@@ -241,7 +245,7 @@ impl MessageRate {
             let rates = configured.into_iter().chain(self.learned_per_s);
             self.end_window(rates.reduce(f64::max), changes);
             let next = from.plus_nanos(WINDOW_NS);
-            // A message that has paused begins a new window with its next frame.
+            // After a pause, the next frame of the message starts a new window.
             self.window_from = (passed_ns < 2 * WINDOW_NS).then_some(next);
         }
     }
@@ -267,14 +271,15 @@ impl MessageRate {
         (self.frames, self.short, self.contradictions) = (0, 0, 0);
     }
 
-    /// Signs of a second sender in the window. What intervals are usual has to be known before a short one is a sign.
+    /// Number of signs of a second sender in the window. A short interval counts only once the usual share of short
+    /// intervals is learned.
     fn signs(&self, frames: f64) -> f64 {
         let usual = frames * self.usual_short.max(CHANCE_SHORT);
         let short = self.learned_per_s.map_or(0.0, |_| f64::from(self.short) - usual);
         short.max(f64::from(self.contradictions))
     }
 
-    /// Learns a steady rate; a higher one replaces a lower one where no second sender causes it.
+    /// Learns a steady rate. A higher rate replaces a lower one, unless a second sender causes it.
     fn learn(&mut self, frames: f64, is_excess: bool) {
         let (part, count) = STEADY;
         let is_steady = (frames - self.candidate).abs() <= part * self.candidate + count;

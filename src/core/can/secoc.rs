@@ -1,25 +1,26 @@
-//! AUTOSAR secure on-board communication (SecOC): the layout of an authenticated payload, and what its authenticator covers.
+//! AUTOSAR secure on-board communication (SecOC): the layout of an authenticated payload, and the input of its
+//! authenticator.
 //!
 //! ```text
 //! data | freshness, its low bits | authenticator, its first bits      most significant bit first
 //! ```
 //!
-//! The authenticator is AES-128-CMAC over data id (16 bit), data and the whole freshness (64 bit), big-endian. Key and cipher
-//! belong to the caller, who passes the 16 bytes of a CMAC: this module has no secret and needs none to give the same results
-//! again.
+//! The authenticator is AES-128-CMAC over data id (16 bit), data and the whole freshness (64 bit), big-endian. Key and
+//! cipher belong to the caller, who passes the 16 bytes of a CMAC. This module contains no secret, so its results can
+//! be reproduced without one.
 //!
-//! | profile | freshness | authenticator | bytes | a guess is right once in |
+//! | profile | freshness | authenticator | bytes | a guess succeeds once in |
 //! | --- | --- | --- | --- | --- |
 //! | 1 | 8 bit | 24 bit | 4 | 1.7 x 10^7 |
-//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8, tried with each freshness that fits |
+//! | 3 | 4 bit | 28 bit | 4 | 2.7 x 10^8, tried with each possible freshness |
 //! | fd | 32 bit | 64 bit | 12 | 1.8 x 10^19 |
 //! | announcement | 36 bit | 28 bit | 8 | 2.7 x 10^8 |
 //!
-//! Source: AUTOSAR Classic Platform R22-11, "Specification of Secure Onboard Communication": profiles 1 and 3, order and width
-//! of the covered fields. The profiles `fd` and announcement are packwatch's own lengths.
+//! Source: AUTOSAR Classic Platform R22-11, "Specification of Secure Onboard Communication": profiles 1 and 3, order
+//! and width of the authenticated fields. The lengths of the profiles `fd` and `announcement` are packwatch's own.
 //!
-//! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here the receiver of commands announces it
-//! ([`FreshnessWindow`]); the values that packwatch sends rise by one from frame to frame.
+//! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here, the receiver of commands announces
+//! it ([`FreshnessWindow`]); the values that packwatch sends increase by one with each frame.
 
 mod window;
 
@@ -29,25 +30,25 @@ use super::MAX_DATA;
 
 pub use window::{ANNOUNCEMENT_STEP, FreshnessWindow};
 
-/// Longest input of an authenticator: data id, payload, freshness, bytes.
+/// Longest input of an authenticator, bytes: data id, payload, freshness.
 const MAX_INPUT: usize = 2 + MAX_DATA + 8;
 
-/// Bytes of a whole authenticator, AES-128-CMAC.
+/// A complete authenticator (AES-128-CMAC).
 pub type Mac = [u8; 16];
 
-/// Lengths of what is sent of freshness and authenticator.
+/// Number of bits sent of freshness and authenticator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
-    /// AUTOSAR's profile 1.
+    /// AUTOSAR profile 1.
     #[serde(rename = "1")]
     P1,
-    /// AUTOSAR's profile 3.
+    /// AUTOSAR profile 3.
     #[serde(rename = "3")]
     P3,
-    /// For FD frames.
+    /// For CAN FD frames.
     #[serde(rename = "fd")]
     Fd,
-    /// Of the frame that announces the freshness of commands.
+    /// For the frame that announces the freshness of commands.
     #[serde(rename = "announcement")]
     Announcement,
 }
@@ -56,7 +57,7 @@ impl Profile {
     /// All profiles.
     pub const ALL: [Self; 4] = [Self::P1, Self::P3, Self::Fd, Self::Announcement];
 
-    /// Name in a configuration.
+    /// Name in the configuration.
     pub const fn name(self) -> &'static str {
         match self {
             Self::P1 => "1",
@@ -91,16 +92,16 @@ impl Profile {
     }
 }
 
-/// Agreement between sender and receiver of an authenticated message; the key is not part of it.
+/// Authentication of one message, as agreed between sender and receiver, without the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Authentication {
-    /// Lengths.
+    /// Lengths of freshness and authenticator.
     pub profile: Profile,
     /// Data identifier, unique among the messages of one key.
     pub data_id: u16,
 }
 
-/// What an authenticator is computed over.
+/// Input of an authenticator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MacInput {
     bytes: [u8; MAX_INPUT],
@@ -115,8 +116,8 @@ impl MacInput {
 }
 
 impl Authentication {
-    /// What the authenticator of this payload and freshness covers; `None` = the payload is shorter than the trailer, or its data
-    /// longer than a frame.
+    /// Input of the authenticator for this payload and freshness; `None` = the payload is shorter than the trailer, or
+    /// its data longer than a frame.
     pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
         let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
         let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };
@@ -127,18 +128,18 @@ impl Authentication {
         Some(input)
     }
 
-    /// The low bits of the freshness in a payload; `None` = it is too short.
+    /// The low bits of the freshness in a payload; `None` = the payload is too short.
     pub fn sent_freshness(&self, payload: &[u8]) -> Option<u64> {
         let trailer = self.trailer(payload)?;
         u64::try_from(trailer >> self.profile.mac_bits()).ok()
     }
 
-    /// Writes the low bits of a freshness, and zeros in place of the authenticator.
+    /// Writes the low bits of a freshness, and zeros as the authenticator.
     pub fn write_freshness(&self, payload: &mut [u8], freshness: u64) {
         self.write_trailer(payload, u128::from(freshness & self.freshness_mask()) << self.profile.mac_bits());
     }
 
-    /// Writes the first bits of an authenticator behind the freshness.
+    /// Writes the first bits of an authenticator after the freshness.
     pub fn write_mac(&self, payload: &mut [u8], mac: Mac) {
         if let Some(trailer) = self.trailer(payload) {
             let bits = self.profile.mac_bits();
@@ -146,25 +147,25 @@ impl Authentication {
         }
     }
 
-    /// Whether the payload carries the first bits of `mac`; takes the same time wherever they differ.
+    /// Whether the payload carries the first bits of `mac`, in constant time.
     pub fn has_mac(&self, payload: &[u8], mac: Mac) -> bool {
         let sent_bits = (1 << self.profile.mac_bits()) - 1;
-        // One difference of whole words: no byte is compared before another.
+        // Compare whole words, so that the time does not depend on the position of a difference.
         self.trailer(payload)
             .is_some_and(|trailer| std::hint::black_box(trailer & sent_bits ^ self.first_bits(mac)) == 0)
     }
 
-    /// The mask of the freshness' bits that are sent.
+    /// Mask of the freshness bits that are sent.
     pub(super) const fn freshness_mask(&self) -> u64 {
         (1 << self.profile.freshness_bits()) - 1
     }
 
     const fn first_bits(&self, mac: Mac) -> u128 {
-        // Bits of a whole authenticator.
+        // 128 = bits of a complete authenticator.
         u128::from_be_bytes(mac) >> (128 - self.profile.mac_bits())
     }
 
-    /// The end of the payload as a number.
+    /// The trailer of the payload as a number.
     fn trailer(&self, payload: &[u8]) -> Option<u128> {
         let start = payload.len().checked_sub(self.profile.trailer_bytes())?;
         Some(payload.get(start..)?.iter().fold(0, |number, byte| number << 8 | u128::from(*byte)))
@@ -178,10 +179,11 @@ impl Authentication {
     }
 }
 
-/// Most freshness values that one payload can stand for: two announcements serve 32 values, profile 3 sends 16 codes.
+/// Most freshness values that one payload can represent: two announcements cover 32 values, profile 3 sends 4 bits (16
+/// codes).
 const MAX_CANDIDATES: usize = 2;
 
-/// A payload and the freshness values it may have: all that is needed to check its authenticator, except the key.
+/// A payload's possible freshness values: everything needed to check its authenticator, except the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MacCheck {
     authentication: Authentication,
@@ -189,7 +191,8 @@ pub struct MacCheck {
 }
 
 impl MacCheck {
-    /// The freshness with which the authenticator of `payload` is right; `None` = with none. `mac` is AES-128-CMAC.
+    /// The freshness for which the authenticator of `payload` is correct; `None` = for none. `mac` computes
+    /// AES-128-CMAC.
     pub fn verify(&self, payload: &[u8], mac: impl Fn(&[u8]) -> Mac) -> Option<u64> {
         let is_right = |freshness: &u64| {
             let input = self.authentication.mac_input(payload, *freshness);
@@ -198,12 +201,12 @@ impl MacCheck {
         self.candidates.into_iter().flatten().find(is_right)
     }
 
-    /// Whether the payload may have a freshness at all.
+    /// Whether no freshness value is possible.
     pub fn is_empty(&self) -> bool {
         self.candidates.iter().all(Option::is_none)
     }
 
-    /// Whether it may have this freshness.
+    /// Whether this freshness value is possible.
     pub fn has(&self, freshness: u64) -> bool {
         self.candidates.contains(&Some(freshness))
     }

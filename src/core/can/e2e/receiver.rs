@@ -1,15 +1,16 @@
-//! The receiver of one protected message: E2E_P01Check of AUTOSAR, called once per frame (or once per period without one).
+//! The receiver of one protected message: E2E_P01Check of AUTOSAR, called once per frame (or once per period without
+//! one).
 //!
-//! In: payloads in the order of their arrival. Out: a [`Status`] each, and the count of each status. State, with AUTOSAR's
-//! names: WaitForFirstData (`last_valid` is `None`); LastValidCounter; MaxDeltaCounter, which grows by one with each call,
-//! because each call may stand for a lost frame, and is reset by each valid frame; NoNewOrRepeatedDataCounter; and
-//! SyncCounter, the valid frames still required before a broken sequence is trusted again.
+//! In: payloads in order of arrival. Out: a [`Status`] for each, and counts by status. State, with AUTOSAR's names:
+//! WaitForFirstData (`last_valid` is `None`); LastValidCounter; MaxDeltaCounter, which grows by one with each call,
+//! because each call may stand for a lost frame, and which each valid frame resets; NoNewOrRepeatedDataCounter; and
+//! SyncCounter, the number of valid frames still required before a broken sequence is trusted again.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Profile, Protection};
 
-/// NoNewOrRepeatedDataCounter stops here, as in AUTOSAR: a `max_no_new_or_repeated_data` of 14 allows any number.
+/// Limit of NoNewOrRepeatedDataCounter, as in AUTOSAR: a `max_no_new_or_repeated_data` of 14 allows any number.
 const MAX_REPEATED: u8 = 14;
 
 /// Settings of the check of one message.
@@ -17,16 +18,17 @@ const MAX_REPEATED: u8 = 14;
 pub struct CheckConfig {
     /// Profile and data identifier.
     pub protection: Protection,
-    /// Frames that may be lost between two calls; each call without a valid frame allows one more.
+    /// Number of frames that may be lost between two calls; each call without a valid frame allows one more.
     pub max_delta_counter_init: u8,
-    /// Calls in a row without a new frame after which the sequence is broken; 14 = any number.
+    /// Number of consecutive calls without a new frame after which the sequence is broken; 14 = any number.
     pub max_no_new_or_repeated_data: u8,
-    /// Valid frames required after a broken sequence: each of them is [`Status::Sync`]; 0 = none.
+    /// Number of valid frames required after a broken sequence; each has the status [`Status::Sync`].
     pub sync_counter_init: u8,
 }
 
 impl CheckConfig {
-    /// One frame may be lost, repetitions do not break the sequence, a broken sequence is trusted again at once.
+    /// Default settings: one frame may be lost, repetitions do not break the sequence, a broken sequence is trusted
+    /// again at once.
     pub const fn new(protection: Protection) -> Self {
         Self { protection, max_delta_counter_init: 1, max_no_new_or_repeated_data: MAX_REPEATED, sync_counter_init: 0 }
     }
@@ -41,13 +43,13 @@ pub enum Status {
     Ok = 0,
     /// No frame in its period.
     NoNewData = 1,
-    /// Damaged, too short, of another message, or with an invalid counter.
+    /// Damaged, too short, from another message, or with an invalid counter.
     WrongCrc = 2,
-    /// Intact and in sequence, one of those required after a broken sequence.
+    /// Intact and in sequence, but one of those required after a broken sequence.
     Sync = 3,
-    /// The first intact frame: nothing to compare its counter with.
+    /// The first intact frame: there is no previous counter to compare with.
     Initial = 4,
-    /// Intact, but the counter is that of the last frame.
+    /// Intact, but with the same counter as the last frame.
     Repeated = 5,
     /// Intact; some frames before it were lost, no more than allowed.
     OkSomeLost = 6,
@@ -68,7 +70,7 @@ impl Status {
         Self::WrongSequence,
     ];
 
-    /// Whether the payload may be used: AUTOSAR's mapping with profile behaviour 1.
+    /// Whether the payload may be used, according to AUTOSAR's mapping with profile behaviour 1.
     pub const fn is_usable(self) -> bool {
         match self {
             Self::Ok | Self::OkSomeLost | Self::Sync => true,
@@ -102,7 +104,7 @@ impl StatusCounts {
         self.0[status as usize]
     }
 
-    /// Every status with its count, zeros too.
+    /// Every status with its count, including zeros.
     pub fn iter(&self) -> impl Iterator<Item = (Status, u64)> + '_ {
         Status::ALL.into_iter().map(|status| (status, self.get(status)))
     }
@@ -118,16 +120,16 @@ impl StatusCounts {
     }
 }
 
-/// State of one message's receiver. Its counts are stored apart from it.
+/// State of one message's receiver. Its counts are stored separately.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Receiver {
     /// Counter of the last valid frame; `None` = none yet.
     last_valid: Option<u8>,
-    /// Largest step of the counter the next frame may show.
+    /// Largest counter step that the next frame may have.
     max_delta: u8,
-    /// Calls in a row without a new frame.
+    /// Consecutive calls without a new frame.
     no_new_or_repeated: u8,
-    /// Valid frames still required.
+    /// Number of valid frames still required.
     sync: u8,
     #[serde(skip)]
     counts: StatusCounts,
@@ -145,7 +147,7 @@ impl Receiver {
         status
     }
 
-    /// Takes a number of periods without a frame.
+    /// Counts periods without a frame.
     pub(crate) fn no_new_data(&mut self, config: &CheckConfig, periods: u64) -> Status {
         self.grow(config.protection.profile, periods);
         self.count_repeated(periods);
@@ -153,23 +155,23 @@ impl Receiver {
         Status::NoNewData
     }
 
-    /// A receiver that waits for its first frame and has these counts.
+    /// Creates a receiver that waits for its first frame, with these counts.
     pub(crate) fn with_counts(counts: StatusCounts) -> Self {
         Self { counts, ..Self::default() }
     }
 
-    /// Continues as `stored`, with the counts of this one.
+    /// Resumes from `stored`, but keeps the counts.
     pub(crate) fn resume(&mut self, profile: Profile, stored: &Self) {
         let last_valid = stored.last_valid.filter(|counter| *counter <= profile.max_counter());
         *self = Self { last_valid, counts: self.counts, ..stored.clone() };
     }
 
-    /// Waits for a first frame again and keeps the counts.
+    /// Waits for a first frame again; keeps the counts.
     pub fn restart(&mut self) {
         *self = Self::with_counts(self.counts);
     }
 
-    /// Counter of the next frame in sequence; `None` = any.
+    /// Counter of the next frame in sequence; `None` = any counter.
     pub fn next_counter(&self, profile: Profile) -> Option<u8> {
         self.last_valid.map(|last| profile.next_counter(last))
     }
@@ -179,7 +181,7 @@ impl Receiver {
         &self.counts
     }
 
-    /// Each call may stand for a lost frame.
+    /// Increases the allowed step, because each call may stand for a lost frame.
     fn grow(&mut self, profile: Profile, calls: u64) {
         self.max_delta = grown(self.max_delta, calls, profile.max_counter());
     }
@@ -188,7 +190,7 @@ impl Receiver {
         self.no_new_or_repeated = grown(self.no_new_or_repeated, calls, MAX_REPEATED);
     }
 
-    /// An intact frame with this counter.
+    /// Handles an intact frame with this counter.
     fn take(&mut self, config: &CheckConfig, counter: u8) -> Status {
         let Some(last) = self.last_valid else {
             self.accept(config, counter);
@@ -202,8 +204,9 @@ impl Receiver {
         if delta > self.max_delta {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
-            // Profile 5 continues from any intact frame, and so does a synchronisation. Profile 1 without one keeps the last
-            // accepted counter until the sender reaches it again or the allowed step reaches the sender.
+            // Profile 5, and a configured synchronisation, continue from any intact frame. Profile 1 without
+            // synchronisation keeps the last accepted counter until the sender reaches it again, or until the allowed
+            // step is large enough.
             if self.sync > 0 || config.protection.profile == Profile::P05 {
                 self.accept(config, counter);
             }
@@ -222,7 +225,7 @@ impl Receiver {
         self.max_delta = config.max_delta_counter_init;
     }
 
-    /// Whether this frame, in sequence, is one of those required after a broken sequence.
+    /// Whether this frame, which is in sequence, is one of those required after a broken sequence.
     fn synchronise(&mut self, config: &CheckConfig) -> bool {
         if self.no_new_or_repeated > config.max_no_new_or_repeated_data {
             self.sync = config.sync_counter_init;

@@ -1,4 +1,4 @@
-//! Vectors, and what holds for any payload.
+//! Test vectors, and properties of arbitrary payloads.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -15,7 +15,7 @@ fn protected(profile: Profile, data_id: u16, payload: &[u8], counter: u8) -> Vec
 }
 
 #[test]
-fn crcs_give_the_published_check_values() {
+fn crcs_match_published_check_values() {
     assert_eq!(crc8(0, b"123456789"), 0x37);
     assert_eq!(crc16(0xFFFF, b"123456789"), 0x29B1);
     // The library's CRC-8 SAE J1850 starts from 0xFF and inverts its result.
@@ -23,7 +23,7 @@ fn crcs_give_the_published_check_values() {
 }
 
 #[test]
-fn profile_1a_gives_the_vectors() {
+fn profile_1a_matches_test_vectors() {
     assert_eq!(protected(Profile::P01A, 0x0123, &[0; 8], 0), [0xCC, 0, 0, 0, 0, 0, 0, 0]);
     assert_eq!(protected(Profile::P01A, 0x0123, &[0; 8], 1), [0x91, 1, 0, 0, 0, 0, 0, 0]);
     let upper_nibble_kept = protected(Profile::P01A, 0x0123, &[0xFF, 0xF5, 0, 0, 0, 0, 0, 0], 0);
@@ -31,28 +31,28 @@ fn profile_1a_gives_the_vectors() {
 }
 
 #[test]
-fn profile_1c_gives_the_vectors() {
+fn profile_1c_matches_test_vectors() {
     assert_eq!(protected(Profile::P01C, 0x0123, &[0; 8], 0), [0x2A, 0x10, 0, 0, 0, 0, 0, 0]);
     assert_eq!(protected(Profile::P01C, 0x0123, &[0xFF, 0xFF, 0, 0, 0, 0, 0, 0], 1), [0x77, 0x11, 0, 0, 0, 0, 0, 0]);
 }
 
 #[test]
-fn profile_5_gives_the_vector() {
+fn profile_5_matches_test_vector() {
     assert_eq!(protected(Profile::P05, 0x1234, &[0; 8], 0), [0x1C, 0xCA, 0, 0, 0, 0, 0, 0]);
 }
 
 #[test]
-fn counters_run_over_where_the_profile_says() {
+fn counter_wraps_at_limit_of_profile() {
     for (profile, last) in [(Profile::P01A, 14), (Profile::P01C, 14), (Profile::P05, 255)] {
         assert_eq!((profile.next_counter(0), profile.next_counter(last - 1), profile.next_counter(last)), (1, last, 0));
         assert_eq!(profile.counter_delta(last, 0), 1);
         assert_eq!(profile.counter_delta(5, 4), last);
     }
-    assert_eq!(Profile::P01A.next_counter(15), 0, "an invalid counter leads to a valid one");
+    assert_eq!(Profile::P01A.next_counter(15), 0, "an invalid counter is followed by a valid one");
 }
 
 #[test]
-fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
+fn unprotectable_payload_is_error_and_unchanged() {
     for profile in PROFILES {
         let protection = Protection { profile, data_id: 1 };
         let needed = profile.header_bytes();
@@ -65,7 +65,11 @@ fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
             assert_eq!(short, vec![0xAA; found]);
             assert_eq!(protection.verified_counter(&short), None);
         }
-        assert_eq!(protection.protect(&mut vec![0; needed], 0), Ok(()), "the header alone can be protected");
+        assert_eq!(
+            protection.protect(&mut vec![0; needed], 0),
+            Ok(()),
+            "a payload with only the header can be protected"
+        );
     }
     let mut payload = [0xAA; 8];
     let protection = Protection { profile: Profile::P01A, data_id: 1 };
@@ -74,7 +78,7 @@ fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
 }
 
 #[test]
-fn counter_15_of_profile_1_is_refused_although_its_crc_is_right() {
+fn profile_1_counter_15_is_rejected_despite_valid_crc() {
     let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
     let mut payload = [0; 8];
     payload[1] = 15;
@@ -83,20 +87,20 @@ fn counter_15_of_profile_1_is_refused_although_its_crc_is_right() {
 }
 
 #[test]
-fn the_nibble_of_the_identifier_sent_by_1c_is_compared() {
+fn profile_1c_compares_identifier_nibble() {
     let (sender, receiver) = (0x0123, Protection { profile: Profile::P01C, data_id: 0x0223 });
     assert_eq!(receiver.verified_counter(&protected(Profile::P01C, sender, &[0; 8], 3)), None, "the CRCs are equal");
 }
 
 #[test]
-fn profiles_are_written_as_in_a_configuration() {
+fn profiles_serialise_with_configuration_names() {
     for profile in PROFILES {
         assert_eq!(serde_json::to_string(&profile).unwrap(), format!("\"{}\"", profile.name()));
     }
 }
 
 #[test]
-fn the_mask_is_what_protect_writes() {
+fn header_mask_covers_bytes_written_by_protect() {
     for profile in PROFILES {
         let mut written = [0_u8; 64];
         for (counter, data_id) in
@@ -114,7 +118,8 @@ fn the_mask_is_what_protect_writes() {
     }
 }
 
-/// Frames of `wrong_bits` wrong bits that pass the check, and how many were tried: every choice of bits of a payload.
+/// Tries every choice of `wrong_bits` wrong bits of a payload; returns the number that passes the check and the number
+/// tried.
 fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: usize) -> (usize, usize) {
     let mut payload = payload.to_vec();
     protection.protect(&mut payload, counter).unwrap();
@@ -125,7 +130,7 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
         missed += usize::from(protection.verified_counter(&payload).is_some());
         tried += 1;
         flip(&mut payload);
-        // The next choice in ascending order: the last bit that can move up moves, those above it follow.
+        // The next choice in ascending order: the last bit that can move up moves, and those above it follow.
         let last = 8 * payload.len() - wrong_bits;
         let Some(place) = (0..wrong_bits).rfind(|place| chosen[*place] < last + place) else { break };
         let first = chosen[place] + 1;
@@ -134,9 +139,9 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
     (missed, tried)
 }
 
-/// The figures of the manual's page `ecu/protection.md`, "What a profile finds".
+/// The figures in the section "What a profile finds" of the manual's page `ecu/protection.md`.
 #[test]
-fn every_error_of_up_to_three_bits_is_found_or_counted_in_the_manual() {
+fn undetected_bit_errors_match_manual() {
     const ZEROS: [u8; 12] = [0; 12];
     const MIXED: [u8; 12] = [0x13, 0xF7, 0xA5, 0x00, 0xFF, 0x3C, 0x81, 0x5E, 0x22, 0x9B, 0xE0, 0x47];
     let most_missed = |profile: Profile, length: usize, counters: &[u8], wrong_bits: usize| {
@@ -169,7 +174,7 @@ fn any_protection() -> impl Strategy<Value = Protection> {
 
 proptest! {
     #[test]
-    fn what_is_protected_is_verified_and_one_wrong_bit_is_not(
+    fn protected_payload_verifies_unless_bit_flips(
         protection in any_protection(),
         mut payload in prop::collection::vec(any::<u8>(), 3..=30),
         counter: u8,
@@ -184,12 +189,12 @@ proptest! {
     }
 
     #[test]
-    fn another_messages_payload_is_not_accepted(
+    fn payload_of_other_message_is_rejected(
         data_id: u16, bit in 0_u32..16, mut payload in prop::collection::vec(any::<u8>(), 3..=30),
     ) {
         for profile in PROFILES {
             if profile == Profile::P01C && bit >= 12 {
-                continue; // 1C has no place for these
+                continue; // 1C cannot send these identifiers
             }
             Protection { profile, data_id }.protect(&mut payload, 0).unwrap();
             let other = Protection { profile, data_id: data_id ^ 1 << bit };
@@ -198,7 +203,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_get_a_status(
+    fn arbitrary_bytes_get_status(
         protection in any_protection(),
         payloads in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..=64), 0..40),
     ) {

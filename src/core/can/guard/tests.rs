@@ -1,4 +1,4 @@
-//! Messages that fail and come back, frames that do not come, and what a restart keeps.
+//! Messages that fail and recover, missing frames, and the effects of a restart.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -28,7 +28,7 @@ fn damaged() -> Frame {
     Frame::classic(ID, &[0; 8]).unwrap()
 }
 
-/// The moment `periods` periods after the start, in tenths.
+/// The moment `tenths` tenths of a period after the start.
 fn at(tenths: i64) -> Timestamp {
     Timestamp::from_nanos(1_700_000_000_000_000_000 + tenths * PERIOD_NS / 10)
 }
@@ -42,21 +42,21 @@ fn count(guards: &Guards, status: Status) -> u64 {
 }
 
 #[test]
-fn only_the_protected_message_of_that_interface_is_checked() {
+fn only_protected_messages_are_checked() {
     let mut guards = guards(None);
     assert_eq!(guards.check(at(0), BUS, &frame(0)), Some(Status::Initial));
     assert_eq!(guards.check(at(0), BusIndex(1), &frame(1)), None);
     assert_eq!(guards.check(at(0), BUS, &Frame::classic(CanId::Extended(0x100), &[0; 8]).unwrap()), None);
-    assert_eq!(guards.check(at(0), BUS, &Frame::remote(ID, 8).unwrap()), None, "requests data, carries none");
+    assert_eq!(guards.check(at(0), BUS, &Frame::remote(ID, 8).unwrap()), None, "a remote request carries no data");
     assert_eq!(guards.check(at(0), BUS, &frame(1)), Some(Status::Ok));
     assert_eq!(Guards::default().check(at(0), BUS, &frame(0)), None);
 }
 
 #[test]
-fn a_failing_message_is_reported_once_and_once_when_it_is_back() {
+fn failing_message_is_reported_once_and_on_recovery() {
     let mut guards = guards(None);
     [frame(0), frame(1)].iter().for_each(|frame| assert!(guards.check(at(0), BUS, frame).is_some()));
-    assert_eq!(changes(&mut guards), [], "a first frame is no failure");
+    assert_eq!(changes(&mut guards), [], "a first frame is not a failure");
     (0..5).for_each(|_| assert_eq!(guards.check(at(1), BUS, &damaged()), Some(Status::WrongCrc)));
     assert_eq!(changes(&mut guards), [(Status::WrongCrc, false, 1)]);
     assert_eq!(guards.check(at(2), BUS, &frame(1)), Some(Status::Repeated));
@@ -66,26 +66,26 @@ fn a_failing_message_is_reported_once_and_once_when_it_is_back() {
 }
 
 #[test]
-fn each_period_without_a_frame_counts_once_however_often_one_looks() {
+fn missed_periods_count_once_for_any_poll_rate() {
     let mut guards = guards(Some(0.1));
     guards.check(at(0), BUS, &frame(0));
     guards.check(at(10), BUS, &frame(1));
     for tenths in 11..=24 {
         guards.poll(at(tenths));
     }
-    assert_eq!(count(&guards, Status::NoNewData), 0, "up to one and a half periods");
+    assert_eq!(count(&guards, Status::NoNewData), 0, "none missed before one and a half periods");
     for tenths in 25..=54 {
         guards.poll(at(tenths));
     }
     assert_eq!(count(&guards, Status::NoNewData), 3);
-    assert_eq!(changes(&mut guards), [(Status::NoNewData, false, 2)], "one may be lost, by the configuration");
-    assert_eq!(guards.check(at(57), BUS, &frame(6)), Some(Status::OkSomeLost), "the frames missed were counted");
+    assert_eq!(changes(&mut guards), [(Status::NoNewData, false, 2)], "the configuration allows one lost frame");
+    assert_eq!(guards.check(at(57), BUS, &frame(6)), Some(Status::OkSomeLost), "the missed frames were counted");
     assert_eq!(changes(&mut guards), [(Status::OkSomeLost, true, 4)]);
-    assert_eq!(count(&guards, Status::NoNewData), 4, "the one before this frame too");
+    assert_eq!(count(&guards, Status::NoNewData), 4, "including the one before this frame");
 }
 
 #[test]
-fn as_many_frames_as_may_be_lost_turn_nothing() {
+fn allowed_number_of_missed_frames_changes_nothing() {
     let mut guards = guards(Some(0.1));
     guards.check(at(0), BUS, &frame(0));
     for turn in 1..=100 {
@@ -96,7 +96,7 @@ fn as_many_frames_as_may_be_lost_turn_nothing() {
 }
 
 #[test]
-fn missed_periods_do_not_depend_on_when_one_looks() {
+fn missed_periods_do_not_depend_on_poll_times() {
     let (mut often, mut rarely) = (guards(Some(0.1)), guards(Some(0.1)));
     for guards in [&mut often, &mut rarely] {
         guards.check(at(0), BUS, &frame(0));
@@ -108,7 +108,7 @@ fn missed_periods_do_not_depend_on_when_one_looks() {
 }
 
 #[test]
-fn a_message_that_never_comes_is_missed_from_the_first_look_on() {
+fn absent_message_is_missed_from_first_poll() {
     let mut guards = guards(Some(0.1));
     guards.poll(at(0));
     guards.poll(at(100));
@@ -117,7 +117,7 @@ fn a_message_that_never_comes_is_missed_from_the_first_look_on() {
 }
 
 #[test]
-fn after_time_asleep_nothing_was_missed_and_the_first_frame_is_initial() {
+fn after_sleep_nothing_is_missed_and_frame_is_initial() {
     let mut guards = guards(Some(0.1));
     guards.check(at(0), BUS, &frame(0));
     guards.check(at(10), BUS, &frame(1));
@@ -129,7 +129,7 @@ fn after_time_asleep_nothing_was_missed_and_the_first_frame_is_initial() {
 }
 
 #[test]
-fn a_message_that_failed_before_a_restart_is_reported_when_it_is_back() {
+fn failed_message_is_reported_usable_after_restart() {
     let mut guards = guards(None);
     guards.check(at(0), BUS, &damaged());
     guards.restart();
@@ -139,15 +139,15 @@ fn a_message_that_failed_before_a_restart_is_reported_when_it_is_back() {
 }
 
 #[test]
-fn a_snapshot_keeps_the_counts_and_no_counter() {
+fn snapshot_keeps_counts_but_no_counter() {
     let mut before = guards(Some(0.1));
     [frame(0), frame(1), damaged()].iter().for_each(|frame| assert!(before.check(at(0), BUS, frame).is_some()));
     let text = serde_json::to_string(&before.counts().collect::<Vec<_>>()).unwrap();
     let mut after = guards(Some(0.1));
     after.restore(&serde_json::from_str::<Vec<GuardCounts>>(&text).unwrap());
     assert!(after.counts().eq(before.counts()));
-    assert_eq!(after.check(at(50), BUS, &frame(2)), Some(Status::Initial), "not OK: who knows what came in between");
+    assert_eq!(after.check(at(50), BUS, &frame(2)), Some(Status::Initial), "not OK: frames in between are unknown");
     let mut other = Guards::new(vec![config(CanId::Standard(0x300), None)]);
     other.restore(&before.counts().collect::<Vec<_>>());
-    assert_eq!(other.counts().map(|of| of.counts.total()).sum::<u64>(), 0, "counts of a message no longer protected");
+    assert_eq!(other.counts().map(|of| of.counts.total()).sum::<u64>(), 0, "the message is no longer protected");
 }

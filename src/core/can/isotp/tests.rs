@@ -1,4 +1,4 @@
-//! ISO-TP: segmented messages put together, every damage named, any frames without a panic.
+//! ISO-TP: reassembly, a fault for every kind of damage, and arbitrary frames without a panic.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -10,10 +10,10 @@ fn at(ms: i64) -> Timestamp {
     Timestamp::from_nanos(ms * 1_000_000)
 }
 
-/// What is done to the frames of a message.
+/// Modifications of the frames of a message.
 type Harm = fn(&mut Vec<Vec<u8>>);
 
-/// Payloads of one sender, a millisecond apart; the messages and faults they give.
+/// Receives payloads of one sender at intervals of a millisecond; returns the messages and faults.
 fn receive(extension: Option<u8>, payloads: &[Vec<u8>]) -> (Vec<Vec<u8>>, Vec<IsoTpFault>) {
     let mut receiver = Receiver::new(extension);
     let (mut messages, mut faults) = (Vec::new(), Vec::new());
@@ -36,7 +36,7 @@ fn message(length: usize) -> Vec<u8> {
 }
 
 #[test]
-fn the_leafs_answer_is_put_together() {
+fn leaf_response_is_reassembled() {
     // Frames of a 2019 Leaf, group 1 of service 0x21 (its log: 0x35 = 53 bytes).
     let frames: Vec<Vec<u8>> = [
         [0x10, 0x35, 0x61, 0x01, 0xFF, 0xFF, 0xF3, 0xCC],
@@ -59,7 +59,7 @@ fn the_leafs_answer_is_put_together() {
 }
 
 #[test]
-fn each_fault_is_named_once_and_the_next_message_is_whole() {
+fn faults_are_reported_once_and_next_message_received() {
     use IsoTpFault::*;
     let whole = payloads(&message(30));
     let with = |change: fn(&mut Vec<Vec<u8>>)| {
@@ -87,39 +87,39 @@ fn each_fault_is_named_once_and_the_next_message_is_whole() {
 }
 
 #[test]
-fn a_message_that_is_not_continued_within_a_second_is_given_up() {
+fn message_times_out_after_one_second() {
     let frames = payloads(&message(30));
     let mut receiver = Receiver::new(None);
     receiver.handle(at(0), &frames[0]);
     assert_eq!(receiver.handle(at(1000), &frames[1]).progress, Progress::Continued);
     assert_eq!(receiver.poll(at(2000)), None);
     assert_eq!(receiver.poll(at(2001)), Some(IsoTpFault::Timeout));
-    assert_eq!(receiver.handle(at(2002), &frames[2]), Received::default(), "known to be lost");
+    assert_eq!(receiver.handle(at(2002), &frames[2]), Received::default(), "the loss was already reported");
     receiver.handle(at(3000), &frames[0]);
     let late = receiver.handle(at(4001), &frames[1]);
     assert_eq!(late, Received { fault: Some(IsoTpFault::Timeout), progress: Progress::None });
 }
 
 #[test]
-fn flow_control_that_refuses_ends_the_message() {
+fn refusing_flow_control_ends_message() {
     let mut receiver = Receiver::new(None);
     receiver.handle(at(0), &payloads(&message(30))[0]);
     for goes_on in [[0x30, 0, 0], [0x31, 0, 0], [0x22, 0, 0]] {
         assert_eq!(receiver.handle_flow_control(None, &goes_on), None);
     }
     assert_eq!(receiver.handle_flow_control(None, &[0x32, 0, 0]), Some(IsoTpFault::Refused));
-    assert_eq!(receiver.handle_flow_control(None, &[0x32, 0, 0]), None, "none is under way");
+    assert_eq!(receiver.handle_flow_control(None, &[0x32, 0, 0]), None, "no message is being received");
 }
 
 #[test]
-fn longer_frames_of_can_fd_are_understood() {
-    // A single frame of 20 bytes with its escape, and a message of 100 bytes in frames of 64.
+fn can_fd_frames_are_reassembled() {
+    // A single frame of 20 bytes with a length escape, and a message of 100 bytes in frames of 64.
     let single = [&[0x00, 20][..], &message(20), &[0xCC; 2]].concat();
     let long = message(100);
     let first = [&[0x10, 100][..], &long[..62]].concat();
     let rest = [&[0x21][..], &long[62..], &[0xCC; 9]].concat();
     assert_eq!(receive(None, &[single, first, rest]), (vec![message(20), long], vec![]));
-    // Lengths beyond 4,095 come with an escape of four bytes.
+    // Lengths above 4,095 use an escape of four bytes.
     let long = message(5000);
     let mut frames = vec![[&[0x10, 0, 0, 0, 0x13, 0x88][..], &long[..58]].concat()];
     let numbers = (1..16_u8).chain([0]).cycle();
@@ -128,7 +128,7 @@ fn longer_frames_of_can_fd_are_understood() {
 }
 
 #[test]
-fn extended_addressing_takes_the_first_byte() {
+fn extended_addressing_uses_first_byte() {
     let frames: Vec<Vec<u8>> = segment(Some(0xF1), &message(25), 0).into_iter().map(|f| f.to_vec()).collect();
     assert!(frames.iter().all(|frame| frame[0] == 0xF1));
     assert_eq!(receive(Some(0xF1), &frames), (vec![message(25)], vec![]));
@@ -137,18 +137,19 @@ fn extended_addressing_takes_the_first_byte() {
 
 proptest! {
     #[test]
-    fn what_was_cut_is_put_together(length in 1_usize..4096, extension in any::<Option<u8>>(), padding in any::<u8>()) {
+    fn segmented_messages_are_reassembled(length in 1_usize..4096, extension in any::<Option<u8>>(), padding in any::<u8>()) {
         let frames: Vec<Vec<u8>> = segment(extension, &message(length), padding).into_iter().map(|f| f.to_vec()).collect();
         prop_assert_eq!(receive(extension, &frames), (vec![message(length)], vec![]));
     }
 
-    /// One frame lost, doubled or out of order within its message: what is accepted was sent, and what came whole is accepted.
-    /// (Where the end of one message takes the place of the next one's beginning, the protocol itself sees no fault.)
+    /// With one frame lost, duplicated or out of order in its message, every accepted message was sent, and every
+    /// message that arrived intact is accepted. (If the end of one message replaces the start of the next, the protocol
+    /// itself cannot detect a fault.)
     #[test]
-    fn no_damaged_message_is_accepted(
+    fn damaged_messages_are_never_accepted(
         lengths in proptest::collection::vec(1_usize..80, 1..20), place in any::<proptest::sample::Index>(), kind in 0..3_u8
     ) {
-        // Each message has bytes of its own, so that a mixture shows.
+        // Each message has its own bytes, so that a mixture is visible.
         let sent: Vec<Vec<u8>> = (0_u8..).zip(&lengths).map(|(tag, &length)| vec![tag; length]).collect();
         let mut frames: Vec<(usize, Vec<u8>)> =
             sent.iter().enumerate().flat_map(|(n, m)| payloads(m).into_iter().map(move |p| (n, p))).collect();
@@ -165,12 +166,12 @@ proptest! {
         let (received, _) = receive(None, &plain);
         prop_assert!(received.iter().all(|message| sent.contains(message)));
         for (number, message) in sent.iter().enumerate().filter(|(number, _)| *number != harmed) {
-            prop_assert!(received.contains(message), "message {} came whole", number);
+            prop_assert!(received.contains(message), "message {} arrived intact", number);
         }
     }
 
     #[test]
-    fn any_bytes_are_accepted(payloads in proptest::collection::vec(proptest::collection::vec(any::<u8>(), 0..64), 0..60)) {
+    fn arbitrary_bytes_never_panic(payloads in proptest::collection::vec(proptest::collection::vec(any::<u8>(), 0..64), 0..60)) {
         let (messages, _) = receive(None, &payloads);
         let bytes: usize = payloads.iter().map(Vec::len).sum();
         prop_assert!(messages.iter().map(Vec::len).sum::<usize>() <= bytes);

@@ -1,4 +1,4 @@
-//! Polling: which request is due when, answers with a current before them, standby and silence.
+//! Polling: due times of requests, the current before voltages, standby and silence.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -27,7 +27,7 @@ fn request(identifier: u16, every_s: f64) -> PollRequest {
     PollRequest { question: question(identifier), every_s, has_current: false, has_voltages: false }
 }
 
-/// A poller in a driving car, whose bus has a frame of others every 100 ms while it is awake.
+/// A poller in a moving car, whose bus carries a frame from another node every 100 ms while it is awake.
 struct Bench {
     poller: Poller,
     out: PollOutputs,
@@ -35,7 +35,7 @@ struct Bench {
     is_awake: bool,
     sent: Vec<(i64, Vec<u8>)>,
     changes: Vec<(i64, PollChange)>,
-    /// What the controller does with a request.
+    /// How the controller responds to a request.
     answer: fn(&[u8]) -> Behaviour,
 }
 
@@ -113,17 +113,17 @@ impl Bench {
 }
 
 #[test]
-fn each_question_has_its_period_and_answers_get_flow_control() {
+fn requests_keep_period_and_responses_get_flow_control() {
     let mut bench = Bench::new(vec![request(1, 1.0), request(2, 3.0)]);
     bench.run(6050);
     let of = |id: u16| bench.requests().iter().filter(|(_, other)| *other == id).map(|(ms, _)| *ms).collect::<Vec<_>>();
     assert_eq!(of(1), [100, 1100, 2100, 3100, 4100, 5100], "in its rhythm from the first frame on");
-    assert_eq!(of(2), [200, 3200], "after the other, at ten a second");
+    assert_eq!(of(2), [200, 3200], "after the other request, at ten requests a second");
     assert_eq!(bench.sent[..2], [(100, vec![3, 0x22, 0, 1, 0, 0, 0, 0]), (100, vec![0x30, 0, 0, 0, 0, 0, 0, 0])]);
 }
 
 #[test]
-fn nothing_is_sent_for_a_minute_after_another_testers_request() {
+fn polling_pauses_one_minute_after_other_tester() {
     for foreign in [REQUEST, CanId::Standard(0x7DF), CanId::Standard(0x7E0), CanId::Extended(0x18DA_10F1)] {
         let mut bench = Bench::new(vec![request(1, 0.5)]);
         bench.run(2000);
@@ -139,7 +139,7 @@ fn nothing_is_sent_for_a_minute_after_another_testers_request() {
 }
 
 #[test]
-fn no_flow_control_is_sent_for_the_answer_to_another_tester() {
+fn response_to_other_tester_gets_no_flow_control() {
     let mut bench = Bench::new(vec![request(1, 1.0)]);
     bench.answer = |_| Behaviour::Nothing;
     bench.run(100);
@@ -147,11 +147,11 @@ fn no_flow_control_is_sent_for_the_answer_to_another_tester() {
     let before = bench.sent.len();
     bench.poller.handle_begun(at(bench.now_ms), &CONTROLLER, &mut bench.out);
     bench.take();
-    assert_eq!(bench.sent.len(), before, "the question was outstanding, but another one asks now");
+    assert_eq!(bench.sent.len(), before, "a request was outstanding, but another tester is active now");
 }
 
 #[test]
-fn a_sleeping_bus_is_left_alone_and_own_answers_do_not_keep_it_awake() {
+fn sleeping_bus_is_not_polled_despite_own_responses() {
     let mut bench = Bench::new(vec![request(1, 0.5)]);
     bench.run(10_000);
     bench.is_awake = false;
@@ -159,7 +159,7 @@ fn a_sleeping_bus_is_left_alone_and_own_answers_do_not_keep_it_awake() {
     bench.run(60_000);
     assert!(bench.requests().iter().all(|(ms, _)| *ms < last + 2000), "{:?}", bench.requests().last());
     let before = bench.requests().len();
-    // A late answer is no frame of others.
+    // A late response does not count as a frame from another node.
     bench.hear(RESPONSE, &[3, 0x62, 0, 1, 0, 0, 0, 0]);
     bench.run(5000);
     assert_eq!(bench.requests().len(), before);
@@ -169,7 +169,7 @@ fn a_sleeping_bus_is_left_alone_and_own_answers_do_not_keep_it_awake() {
 }
 
 #[test]
-fn a_low_or_unknown_supply_stops_it() {
+fn low_or_unknown_supply_stops_polling() {
     let mut bench =
         Bench::with(PollConfig { requests: vec![request(1, 0.5)], max_requests_per_s: 10.0, watches_supply: true });
     bench.run(2000);
@@ -188,7 +188,7 @@ fn a_low_or_unknown_supply_stops_it() {
 }
 
 #[test]
-fn on_standby_nothing_is_sent() {
+fn standby_stops_polling() {
     let mut bench = Bench::new(vec![request(1, 0.5)]);
     bench.poller.set_standby(true);
     bench.run(5000);
@@ -199,7 +199,7 @@ fn on_standby_nothing_is_sent() {
 }
 
 #[test]
-fn a_refusal_for_good_is_the_end_and_other_failures_wait_longer_and_longer() {
+fn permanent_refusal_ends_request_and_failures_back_off() {
     let mut bench = Bench::new(vec![request(1, 1.0), request(2, 1.0), request(3, 1.0)]);
     bench.answer = |payload| match payload[3] {
         1 => Behaviour::Refuses(0x31),
@@ -218,7 +218,7 @@ fn a_refusal_for_good_is_the_end_and_other_failures_wait_longer_and_longer() {
 }
 
 #[test]
-fn one_request_is_outstanding_and_a_controller_that_says_wait_is_waited_for_but_not_for_ever() {
+fn pending_response_is_awaited_up_to_limit() {
     let mut bench = Bench::new(vec![request(1, 1.0), request(2, 1.0)]);
     bench.answer = |_| Behaviour::Nothing;
     bench.run(150);
@@ -233,7 +233,7 @@ fn one_request_is_outstanding_and_a_controller_that_says_wait_is_waited_for_but_
 }
 
 #[test]
-fn the_current_is_asked_for_right_before_the_cells() {
+fn current_is_requested_right_before_voltages() {
     let current = PollRequest { has_current: true, ..request(1, 1.0) };
     let cells = |identifier| PollRequest { has_voltages: true, ..request(identifier, 2.0) };
     let mut bench = Bench::new(vec![cells(2), current, cells(3)]);
@@ -245,7 +245,7 @@ fn the_current_is_asked_for_right_before_the_cells() {
 }
 
 #[test]
-fn what_the_car_does_sets_the_period() {
+fn car_state_sets_request_period() {
     let mut bench = Bench::new(vec![request(1, 1.0)]);
     bench.run(5000);
     let driving = bench.requests().len();
@@ -262,10 +262,10 @@ fn what_the_car_does_sets_the_period() {
 }
 
 proptest! {
-    /// Whatever comes: only requests of reading services and flow control are sent, never within a minute of another tester,
-    /// never more than the rate, and the driver does not spin.
+    /// For any input: sends only requests of reading services and flow control, nothing within a minute of another
+    /// tester's request, no more than the allowed rate; and the driver does not spin.
     #[test]
-    fn it_keeps_its_promises_for_any_input(
+    fn poller_keeps_its_limits_for_any_input(
         acts in proptest::collection::vec((0_u8..8, 0_u16..3000, any::<[u8; 8]>()), 1..80)
     ) {
         let mut bench = Bench::new(vec![request(1, 0.2), request(2, 0.7)]);

@@ -1,11 +1,11 @@
-//! Senders by hand: steady, jittering, faster, slower, doubled.
+//! Simulated senders: steady, jittering, faster, slower, doubled.
 
 use super::*;
 
 const BUS: BusIndex = BusIndex(0);
 const ID: CanId = CanId::Standard(0x100);
 
-/// Frames of several senders, each with its period (ms), from and to when (s), and jitter (part of the period).
+/// Simulates senders, each with its period (ms), start and end (s), and jitter (fraction of the period).
 fn run(rates: &mut SecondSenders, senders: &[(f64, f64, f64, f64)]) -> Vec<(f64, bool)> {
     let mut times: Vec<(i64, usize)> = Vec::new();
     let mut noise = 0x2545_F491_u64;
@@ -35,7 +35,7 @@ fn watched(cycle_s: Option<f64>) -> SecondSenders {
 }
 
 #[test]
-fn a_second_sender_is_found_within_five_seconds_and_its_end_is_noticed() {
+fn second_sender_is_found_within_five_seconds() {
     for (first_ms, second_ms) in [(10.0, 1.0), (100.0, 1.0), (100.0, 10.0), (100.0, 100.0), (10.0, 10.0), (20.0, 30.0)]
     {
         let found = run(&mut watched(None), &[(first_ms, 0.0, 120.0, 0.05), (second_ms, 60.0, 90.0, 0.05)]);
@@ -46,17 +46,17 @@ fn a_second_sender_is_found_within_five_seconds_and_its_end_is_noticed() {
 }
 
 #[test]
-fn with_a_cycle_time_it_is_found_from_the_start() {
+fn known_cycle_time_finds_second_sender_at_start() {
     let found = run(&mut watched(Some(0.1)), &[(100.0, 0.0, 20.0, 0.0), (5.0, 2.0, 20.0, 0.0)]);
     assert!(matches!(found[..], [(at_s, true)] if at_s < 7.0), "{found:?}");
 }
 
 #[test]
-fn one_sender_that_jitters_or_changes_its_cycle_is_none() {
+fn jitter_or_new_cycle_is_not_second_sender() {
     for jitter in [0.0, 0.3] {
         let waking = [(100.0, 0.0, 60.0, jitter), (10.0, 60.0, 120.0, jitter)];
         let mut rates = watched(None);
-        // Both periods are of one sender: it gives one current.
+        // One sender has both periods, and therefore one current.
         let mut found = Vec::new();
         for (period_ms, from_s, to_s, jitter) in waking {
             found.extend(run(&mut rates, &[(period_ms, from_s, to_s, jitter)]));
@@ -68,7 +68,7 @@ fn one_sender_that_jitters_or_changes_its_cycle_is_none() {
 }
 
 #[test]
-fn a_stored_rate_finds_a_second_sender_after_a_restart() {
+fn stored_rate_finds_second_sender_after_restart() {
     let mut before = watched(None);
     assert_eq!(run(&mut before, &[(100.0, 0.0, 60.0, 0.05)]), []);
     let mut after = watched(None);

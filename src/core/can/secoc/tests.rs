@@ -9,7 +9,7 @@ use crate::quantity::Timestamp;
 
 const COMMAND: Authentication = Authentication { profile: Profile::P1, data_id: 0x0124 };
 
-/// Not a cipher: each input has another result, which is all that is asked of it here.
+/// Not a cipher: these tests only need different results for different inputs.
 fn mac(input: &[u8]) -> Mac {
     let mut state: u128 = 0x6C62_272E_07BB_0142_62B8_2175_6295_C58D;
     for byte in input {
@@ -31,7 +31,7 @@ fn sealed(authentication: Authentication, data: &[u8], freshness: u64) -> Vec<u8
 }
 
 #[test]
-fn the_trailer_is_freshness_and_authenticator_most_significant_bit_first() {
+fn trailer_is_freshness_then_authenticator_msb_first() {
     let whole = [0xA1, 0xB2, 0xC3, 0xD4, 0xE5, 0xF6, 0x07, 0x18, 0x29, 0x3A, 0x4B, 0x5C, 0x6D, 0x7E, 0x8F, 0x90];
     let written = |profile| {
         let authentication = Authentication { profile, data_id: 1 };
@@ -47,21 +47,21 @@ fn the_trailer_is_freshness_and_authenticator_most_significant_bit_first() {
 }
 
 #[test]
-fn the_authenticator_covers_data_id_data_and_whole_freshness() {
+fn authenticator_covers_data_id_data_and_freshness() {
     let input = COMMAND.mac_input(&[1, 2, 3, 4, 0xEE, 0xEE, 0xEE, 0xEE], 0x0102_0304_0506_0708).unwrap();
     assert_eq!(input.bytes(), [0x01, 0x24, 1, 2, 3, 4, 1, 2, 3, 4, 5, 6, 7, 8]);
     assert_eq!(COMMAND.mac_input(&[0; 3], 0), None, "shorter than the trailer");
-    assert_eq!(COMMAND.mac_input(&[0; 69], 0), None, "more data than a frame has");
+    assert_eq!(COMMAND.mac_input(&[0; 69], 0), None, "more data than a frame can carry");
 }
 
 #[test]
-fn a_value_is_accepted_once_and_nothing_below_it_afterwards() {
+fn freshness_is_accepted_once_and_in_rising_order() {
     let mut window = FreshnessWindow::default();
     window.begin(Timestamp::from_secs(1000.0));
     let announced = window.announce();
     let fits = |window: &FreshnessWindow, value| window.check(COMMAND, &sealed(COMMAND, &[1; 4], value)).has(value);
     assert!(fits(&window, announced) && fits(&window, announced + 15), "announced");
-    assert!(fits(&window, announced - 16), "announced before");
+    assert!(fits(&window, announced - 16), "announced previously");
     assert!(!fits(&window, announced - 17) && !fits(&window, announced + 16), "too old, not yet announced");
     window.accept(announced + 5);
     for value in announced - 16..announced + 6 {
@@ -69,16 +69,16 @@ fn a_value_is_accepted_once_and_nothing_below_it_afterwards() {
     }
     assert!(fits(&window, announced + 6));
     window.announce();
-    assert!(fits(&window, announced + 6), "still of the announcement before");
+    assert!(fits(&window, announced + 6), "still covered by the previous announcement");
     window.announce();
     assert!(!fits(&window, announced + 15), "two announcements later it is old");
     let last = window.announce();
     window.expire();
-    assert!(!fits(&window, last + 15), "after time without listening nothing of before is accepted");
+    assert!(!fits(&window, last + 15), "after time without listening, no earlier value is accepted");
 }
 
 #[test]
-fn a_restart_begins_beyond_everything_the_run_before_announced() {
+fn restart_begins_beyond_all_announced_values() {
     for (stored_s, now_s) in [(0.0, 1.7e9), (1.7e9, 1.7e9 + 100.0), (1.7e9, 0.0)] {
         let mut run = FreshnessWindow::default();
         run.begin(Timestamp::from_secs(stored_s));
@@ -97,7 +97,7 @@ fn a_restart_begins_beyond_everything_the_run_before_announced() {
 }
 
 #[test]
-fn the_sent_bits_roll_over_and_the_value_does_not() {
+fn sent_bits_wrap_but_value_does_not() {
     for profile in [Profile::P1, Profile::P3, Profile::Fd] {
         let authentication = Authentication { profile, data_id: 7 };
         let mut window = FreshnessWindow { announced: (1 << 32) - 40 * ANNOUNCEMENT_STEP, accepted: 0 };
@@ -107,14 +107,14 @@ fn the_sent_bits_roll_over_and_the_value_does_not() {
                 let payload = sealed(authentication, &[9; 4], value);
                 assert_eq!(window.check(authentication, &payload).verify(&payload, mac), Some(value), "{profile:?}");
                 window.accept(value);
-                assert_eq!(window.check(authentication, &payload).verify(&payload, mac), None, "{profile:?} again");
+                assert_eq!(window.check(authentication, &payload).verify(&payload, mac), None, "{profile:?}, repeated");
             }
         }
     }
 }
 
 #[test]
-fn an_impossible_stored_window_is_found() {
+fn impossible_stored_window_is_detected() {
     assert!(FreshnessWindow::default().is_possible());
     assert!(FreshnessWindow { announced: 1600, accepted: 1615 }.is_possible());
     for (announced, accepted) in [(1601, 0), (1600, 1616), (u64::MAX - 15, 0)] {
@@ -124,7 +124,7 @@ fn an_impossible_stored_window_is_found() {
 
 proptest! {
     #[test]
-    fn any_payload_has_at_most_two_candidates_and_one_wrong_bit_is_not_verified(
+    fn payload_with_one_wrong_bit_is_never_verified(
         profile in prop::sample::select(vec![Profile::P1, Profile::P3, Profile::Fd]),
         data in prop::collection::vec(any::<u8>(), 0..=20),
         step in 0_u64..1 << 40, offset in 0_u64..32, bit: prop::sample::Index,
@@ -140,7 +140,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_judged(payload in prop::collection::vec(any::<u8>(), 0..=64), announced: u32) {
+    fn arbitrary_bytes_never_panic(payload in prop::collection::vec(any::<u8>(), 0..=64), announced: u32) {
         for profile in Profile::ALL {
             let window = FreshnessWindow { announced: u64::from(announced) * ANNOUNCEMENT_STEP, accepted: 0 };
             let authentication = Authentication { profile, data_id: 1 };

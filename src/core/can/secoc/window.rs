@@ -1,27 +1,29 @@
-//! The freshness that commands may have: announced by their receiver, never accepted twice, old after two announcements.
+//! Freshness values that commands may have: announced by the receiver, never accepted twice, expired after two
+//! announcements.
 //!
-//! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the announced value
-//! or one of those up to the next, each once and in rising order. Accepted is what lies above everything accepted before, is
-//! not older than the announcement before the last, and was announced: a command that is held back is worthless two seconds
-//! later, and one made for a value that an attacker invents is worthless until this receiver announces it.
+//! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
+//! announced value or one of those up to the next announcement, each once and in rising order. A value is accepted if
+//! it is above every value accepted before, not older than the previous announcement, and already announced. So a
+//! command that an attacker holds back expires after two seconds, and one with an invented value is useless until the
+//! receiver announces that value.
 //!
-//! The sender keeps nothing over a restart: it waits for an announcement. The receiver does: it begins
-//! [`RESTART_STEPS`] announcements beyond its stored state, and not before the time of its clock, so that no value of the run
-//! before comes again although it was not stored.
+//! The sender stores nothing across a restart: it waits for an announcement. The receiver stores its state. After a
+//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and not below the value for the time of
+//! its clock, so that no value of the previous run is used again, even if it was not stored.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Authentication, MAX_CANDIDATES, MacCheck};
 use crate::quantity::Timestamp;
 
-/// From one announcement to the next; the commands that one of them serves.
+/// Difference between two announcements, and the number of commands that one announcement allows.
 pub const ANNOUNCEMENT_STEP: u64 = 16;
-/// Announcements skipped at a start: more than an hour of a state that could not be stored.
+/// Announcements skipped at a start: more than an hour in which the state could not be stored.
 const RESTART_STEPS: u64 = 4096;
-/// Beyond this a stored value is damaged: it would take 10^9 years.
+/// A stored value above this is damaged: it would take 10^9 years.
 const MAX_FRESHNESS: u64 = 1 << 60;
 
-/// The freshness values that a receiver accepts.
+/// Freshness values that a receiver accepts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FreshnessWindow {
@@ -32,7 +34,7 @@ pub struct FreshnessWindow {
 }
 
 impl FreshnessWindow {
-    /// Begins a run at `now`, beyond everything an earlier run can have announced.
+    /// Begins a run at `now`, beyond every value that an earlier run can have announced.
     pub fn begin(&mut self, now: Timestamp) {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(ANNOUNCEMENT_STEP);
         self.advance(RESTART_STEPS);
@@ -45,7 +47,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Ends the validity of everything announced: after time without listening.
+    /// Expires every announced value, after time without listening.
     pub fn expire(&mut self) {
         self.advance(2);
     }
@@ -54,12 +56,12 @@ impl FreshnessWindow {
         self.announced = self.announced.saturating_add(steps * ANNOUNCEMENT_STEP).min(MAX_FRESHNESS);
     }
 
-    /// The lowest value that is accepted.
+    /// The lowest acceptable value.
     pub fn lowest(&self) -> u64 {
         self.announced.saturating_sub(ANNOUNCEMENT_STEP).max(self.accepted.saturating_add(1))
     }
 
-    /// The values that a payload's freshness may stand for; none = it is old, or too short.
+    /// The values that a payload's freshness may represent; none if it is expired or the payload is too short.
     pub fn check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         let mut candidates = [None; MAX_CANDIDATES];
         if let Some(sent) = authentication.sent_freshness(payload) {
@@ -75,7 +77,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Takes a value: from here on neither it nor a lower one is accepted.
+    /// Accepts a value: from now on, neither this value nor a lower one is acceptable.
     pub fn accept(&mut self, freshness: u64) {
         self.accepted = self.accepted.max(freshness);
     }

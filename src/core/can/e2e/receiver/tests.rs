@@ -1,4 +1,4 @@
-//! Every pair of state and event, and runs of frames as a bus has them.
+//! Every pair of state and event, and realistic sequences of frames.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -6,14 +6,14 @@ use super::*;
 
 const LAST: u8 = 7;
 
-/// Classes of state the receiver distinguishes; LastValidCounter is 7 in all but the first.
+/// Classes of receiver states; LastValidCounter is 7 in all except the first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
     /// WaitForFirstData.
     Waiting,
     /// Accepted, nothing missed: the next call allows a step of 2.
     Following,
-    /// The sequence broke and 2 more frames must show it.
+    /// The sequence is broken, and 2 more valid frames are required.
     Syncing,
     /// More calls without a new frame than configured.
     Silent,
@@ -83,8 +83,8 @@ fn apply(receiver: &mut Receiver, config: &CheckConfig, what: Input) -> Status {
     receiver.check(config, &frame(config, counter))
 }
 
-/// In profile 1 the right CRC over an invalid counter (CRC found by trying); in profile 5, where 15 is a counter like
-/// any other, a frame of another message.
+/// For profile 1, a frame with an invalid counter and a correct CRC (found by trial); for profile 5, where 15 is a
+/// normal counter, a frame of another message.
 fn counter_15(config: &CheckConfig) -> [u8; 8] {
     let mut payload = frame(config, 14);
     let other = Protection { data_id: 0x0456, ..config.protection };
@@ -98,7 +98,8 @@ fn counter_15(config: &CheckConfig) -> [u8; 8] {
     payload
 }
 
-/// Input AUTOSAR's check says, `sync` = SyncCounterInit; and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated, Sync) after.
+/// Result of AUTOSAR's check, with `sync` = SyncCounterInit, and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated,
+/// Sync) afterwards.
 fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
     use Input::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
     use State::{Following, Silent, Syncing, Waiting};
@@ -106,7 +107,7 @@ fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Op
     let (last, grown) = (before.last_valid, before.max_delta + 1);
     let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
     let at = |step: u8| Some(LAST + step);
-    // A silence too long requires the synchronisation, and this frame is the first of it.
+    // A too long silence requires synchronisation, and this frame is its first.
     let left = sync.saturating_sub(1);
     let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {
@@ -131,7 +132,7 @@ fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Op
 }
 
 #[test]
-fn every_pair_of_state_and_event_is_as_in_the_standard() {
+fn state_and_event_pairs_follow_standard() {
     for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
         for (sync, state, what) in [0, 2]
             .into_iter()
@@ -152,27 +153,27 @@ fn every_pair_of_state_and_event_is_as_in_the_standard() {
 }
 
 #[test]
-fn lost_frames_are_accepted_up_to_the_allowed_step() {
+fn lost_frames_are_accepted_up_to_allowed_step() {
     let config = CheckConfig { max_delta_counter_init: 3, ..config(Profile::P01A, 0) };
     for (step, status) in [(1, Status::Ok), (4, Status::OkSomeLost), (5, Status::WrongSequence)] {
         let mut receiver = Receiver { last_valid: Some(13), max_delta: 3, ..Receiver::default() };
         let counter = (13 + step) % 15;
-        assert_eq!(receiver.check(&config, &frame(&config, counter)), status, "{step} steps, over the end");
+        assert_eq!(receiver.check(&config, &frame(&config, counter)), status, "{step} steps, with wrap-around");
     }
 }
 
 #[test]
-fn profile_1_without_a_synchronisation_waits_until_the_sender_comes_round() {
+fn profile_1_without_sync_waits_for_sender_counter() {
     let config = config(Profile::P01A, 0);
     let mut receiver = in_state(State::Following);
-    // The sender is 6 ahead and continues by 1 a frame, as fast as the allowed step grows.
+    // The sender is 6 ahead and advances by 1 per frame, as fast as the allowed step grows.
     let statuses: Vec<_> = (0..11).map(|n| receiver.check(&config, &frame(&config, (LAST + 6 + n) % 15))).collect();
     assert!(statuses[..9].iter().all(|status| *status == Status::WrongSequence), "{statuses:?}");
     assert_eq!(statuses[9..], [Status::Repeated, Status::Ok]);
 }
 
 #[test]
-fn profile_5_continues_from_a_counter_that_jumped() {
+fn profile_5_continues_after_counter_jump() {
     let config = config(Profile::P05, 0);
     let mut receiver = in_state(State::Following);
     let statuses = [100, 101, 102].map(|counter| receiver.check(&config, &frame(&config, counter)));
@@ -180,7 +181,7 @@ fn profile_5_continues_from_a_counter_that_jumped() {
 }
 
 #[test]
-fn with_a_synchronisation_a_jump_costs_as_many_frames_as_configured() {
+fn counter_jump_costs_configured_sync_frames() {
     let config = config(Profile::P01C, 2);
     let mut receiver = in_state(State::Following);
     let statuses = [14, 0, 1, 2].map(|counter| receiver.check(&config, &frame(&config, counter)));
@@ -188,18 +189,18 @@ fn with_a_synchronisation_a_jump_costs_as_many_frames_as_configured() {
 }
 
 #[test]
-fn silence_without_end_stays_in_range() {
+fn endless_silence_keeps_counters_in_range() {
     for profile in [Profile::P01A, Profile::P05] {
         let config = CheckConfig::new(config(profile, 0).protection);
         let mut receiver = in_state(State::Following);
         (0..1000).for_each(|_| assert_eq!(receiver.no_new_data(&config, 1), Status::NoNewData));
         assert_eq!((receiver.no_new_or_repeated, receiver.max_delta), (14, profile.max_counter()));
-        assert_eq!(receiver.check(&config, &frame(&config, 3)), Status::OkSomeLost, "any counter but the last");
+        assert_eq!(receiver.check(&config, &frame(&config, 3)), Status::OkSomeLost, "any counter except the last");
     }
 }
 
 #[test]
-fn a_restart_waits_for_a_first_frame_and_keeps_the_counts() {
+fn restart_waits_for_first_frame_and_keeps_counts() {
     let config = config(Profile::P01A, 0);
     let mut receiver = in_state(State::Following);
     assert_eq!(receiver.check(&config, &frame(&config, 8)), Status::Ok);
@@ -209,7 +210,7 @@ fn a_restart_waits_for_a_first_frame_and_keeps_the_counts() {
 }
 
 #[test]
-fn statuses_are_numbered_and_named_as_they_are_written() {
+fn statuses_serialise_with_number_and_name() {
     for (number, status) in Status::ALL.into_iter().enumerate() {
         assert_eq!(status as usize, number);
         assert_eq!(serde_json::to_string(&status).unwrap(), format!("\"{}\"", status.name()));
