@@ -106,7 +106,7 @@ fn all_faults_are_reported_with_exit_code_78() {
     assert_eq!(code, 78);
     let at = |name: &str, line: usize| format!("{}:{line}: ", folder.path().join(name).display());
     let beginnings = [
-        at("pack.toml", 1) + "interface is missing, must be at least one table [[interface]]",
+        at("pack.toml", 1) + "interface is missing, must have at least one table [[interface]]",
         at("pack.toml", 4) + "input.current.signal is missing",
         at("pack.toml", 2) + "pack.cells = 0, must be 1 to 1024",
         at("pack.toml", 6) + "input.speed is not a known key",
@@ -159,7 +159,7 @@ fn commands_without_key_are_called_unauthenticated() {
     let commands = "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 0x321\n";
     let (_folder, file) = with_drop_ins(&[("commands.toml", commands)]);
     let said = good(&["check", file.to_str().unwrap()]);
-    assert!(said.contains("commands of other ECUs are unauthenticated: every node of the bus can make one"), "{said}");
+    assert!(said.contains("commands of other ECUs are unauthenticated: every node on the bus can send them"), "{said}");
 }
 
 #[test]

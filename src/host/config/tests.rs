@@ -278,7 +278,7 @@ fn broken_syntax_hides_no_other_fault_and_invents_none() {
     }
     assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
     let all = read_texts(PACK, DBC, DBC).unwrap_err();
-    assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more faults of syntax from here"));
+    assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more syntax faults from here on"));
 }
 
 #[test]
@@ -297,10 +297,9 @@ fn a_signal_in_two_dbc_files_is_ambiguous() {
     let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
     assert_eq!(
         all[0],
-        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one place, is in pack.dbc and twin.dbc"
+        "pack.toml:9: input.current.signal = \"Status.Current\", must be unique, but is in pack.dbc and twin.dbc"
     );
-    let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give each cell one signal, \
-                1 is Cells.CellVoltage1 and Cells.CellVoltage1";
+    let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must match one signal per cell, but number 1 matches Cells.CellVoltage1 and Cells.CellVoltage1";
     assert!(all.contains(&cell.to_owned()), "{all:#?}");
 }
 

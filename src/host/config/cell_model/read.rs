@@ -128,7 +128,8 @@ fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, fau
         return AgedOcv::default();
     }
     AgedOcv::of_electrodes(&keys.config(), soc, head.capacity_ah, rows).unwrap_or_else(|| {
-        keys.place.note("positive_content", "these electrodes do not say how the cell ages");
+        keys.place
+            .note("positive_content", "the ageing of the open-circuit curve cannot be computed from these contents");
         AgedOcv::default()
     })
 }

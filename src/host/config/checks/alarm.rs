@@ -106,7 +106,10 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
             let same = |other: &&Alarm| other.rule == alarm.rule && other.thresholds().any(|(_, s, _)| s == severity);
             if let Some(twin) = raw.alarms[..index].iter().find(same) {
                 let line = twin.place.at.beside(place.line_of(key));
-                place.fault(key, format!("must be one per rule, {} in {line} has one", twin.place.path));
+                place.fault(
+                    key,
+                    format!("must be given once per rule, but {} in {line} also gives it", twin.place.path),
+                );
             }
         }
         check_needs(alarm, raw);
@@ -124,13 +127,13 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
     let missing = match alarm.rule {
-        Rule::UsableCapacityLow if !raw.is_written::<Usable>() => "must have a table [usable] that states the load",
-        Rule::TemperatureHigh if raw.temperatures.is_empty() && !raw.broken => "must have an [[input.temperature]]",
-        Rule::CellImbalance if cells < 2 => "must have the voltages of at least two cells",
+        Rule::UsableCapacityLow if !raw.is_written::<Usable>() => "requires a table [usable], which states the load",
+        Rule::TemperatureHigh if raw.temperatures.is_empty() && !raw.broken => "requires an [[input.temperature]]",
+        Rule::CellImbalance if cells < 2 => "requires the voltages of at least two cells",
         Rule::CellLeak | Rule::ConnectionResistance | Rule::ChannelFaulty if cells < 3 => {
-            "must have the voltages of at least three cells"
+            "requires the voltages of at least three cells"
         }
-        Rule::BmsDisagrees if !is_reported => "must have [input.reported_soc] or [input.reported_soh]",
+        Rule::BmsDisagrees if !is_reported => "requires [input.reported_soc] or [input.reported_soh]",
         _ => "",
     };
     if !missing.is_empty() {
@@ -140,7 +143,7 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
         && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
     if alarm.when != Comparison::Mean && (!alarm.rule.spec().has_deviation || is_raw_period) {
         let what = if is_raw_period {
-            "must be \"mean\" with recharge.alarm_on = \"raw\": that period has no standard deviation"
+            "must be \"mean\" with recharge.alarm_on = \"raw\": the raw period has no standard deviation"
         } else {
             "must be \"mean\": the value of this rule has no standard deviation"
         };
@@ -155,21 +158,21 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let mut milder: Option<(&str, f64)> = None;
     for (key, _, threshold) in alarm.thresholds() {
         let Some(set) = rated.value(alarm.rule, threshold.set) else {
-            place.fault(key, "must be a number: nothing is 100 % for this rule");
+            place.fault(key, "must be a number: percentages are not defined for this rule");
             continue;
         };
         check_unit(alarm, key, set);
         match threshold.clear.map(|clear| rated.value(alarm.rule, clear)) {
-            Some(None) => place.fault(key, "must clear at a number: nothing is 100 % for this rule"),
+            Some(None) => place.fault(key, "must clear at a number: percentages are not defined for this rule"),
             Some(Some(clear)) if sign * (clear - set) > 0.0 => {
-                place.fault(key, format!("must clear at {set} or {side} it, on the healthy side, not at {clear}"));
+                place.fault(key, format!("must clear at {set} or {side}, not at {clear}"));
             }
             Some(Some(_)) | None => {}
         }
         check_reachable(alarm, key, rated, set, &threshold);
         if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
             let beyond = if sign > 0.0 { "above" } else { "below" };
-            place.fault(key, format!("must be {beyond} {other} = {value}: it is the graver one"));
+            place.fault(key, format!("must be {beyond} {other} = {value}: it is the more severe threshold"));
         }
         milder = Some((key, set));
     }
@@ -180,7 +183,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if lasts_only_while_there(alarm.rule) {
         if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
-            alarm.place.fault(written, "must not be given: it is cleared at 0, when all is in order again");
+            alarm.place.fault(written, "must not be given: the alarm clears when the fault has ended");
         }
         return;
     }
@@ -193,7 +196,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
     let is_within = (0.0..=high).contains(&set); // otherwise there is a fault already, or it is never raised
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
-        alarm.place.fault(written, format!("must leave a value that clears {key} within {range}, not {clear}"));
+        alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
     }
 }
 

@@ -108,7 +108,7 @@ fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {
                 break;
             }
             if signals.iter().any(|other: &Signal| other.name == name) {
-                signal.place.fault("name", format!("must be unique in its answer, {name} is there already"));
+                signal.place.fault("name", format!("must be unique in its answer, but {name} already exists"));
             }
             signals.push(as_in_a_dbc(signal, name, bit));
             first_bytes.push(bit / 8);
@@ -154,12 +154,12 @@ fn numbered(keys: &AnswerSignalKeys) -> Vec<(String, u64)> {
     let has_number = keys.name.contains("{n}");
     let Some(numbers) = keys.numbers.as_ref() else {
         if has_number {
-            keys.place.fault("name", "has {n}, must have `numbers` that it counts through");
+            keys.place.fault("name", "contains {n}, requires the key numbers");
         }
         return vec![(keys.name.clone(), first)];
     };
     if !has_number {
-        keys.place.fault("name", "must have {n} in place of the number");
+        keys.place.fault("name", "must contain {n} for the number");
         return Vec::new();
     }
     let step = u64::from(keys.step.unwrap_or(keys.length.into()));
@@ -172,7 +172,7 @@ fn check_numbers(keys: &AnswerSignalKeys) {
         && keys.length.is_multiple_of(8)
         && keys.step.is_none_or(|step| step.is_multiple_of(8));
     if keys.byte_order == WireOrder::Little && !is_whole {
-        keys.place.fault("byte_order", "must be \"big\" for a signal that is not of whole bytes");
+        keys.place.fault("byte_order", "must be \"big\" for a signal that does not consist of whole bytes");
     }
     if keys.factor == 0.0 {
         keys.place.fault("factor", "must not be 0");

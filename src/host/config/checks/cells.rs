@@ -59,10 +59,10 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
     match (chemistry, rated_ah) {
         (Some(chemistry), Some(rated_ah)) => return Some((chemistry, rated_ah)),
         (Some(_), None) => {
-            place.fault("chemistry", "needs rated_capacity_ah, the capacity on the label of one cell");
+            place.fault("chemistry", "requires rated_capacity_ah, the capacity on the label of one cell");
         }
         (None, _) => {
-            place.fault("cell_model", "must be a cell model file; or chemistry and rated_capacity_ah must be given");
+            place.fault("cell_model", "must be a cell model file if chemistry and rated_capacity_ah are not given");
         }
     }
     None
@@ -88,7 +88,10 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     let Some(pack) = &raw.pack else { return Vec::new() };
     if raw.is_pack_total() {
         for keys in &raw.modules {
-            keys.place.fault("cells", "must be without [input.pack_voltage]: the pack is estimated as one cell");
+            keys.place.fault(
+                "cells",
+                "must not be given together with [input.pack_voltage]: the pack is then estimated as one cell",
+            );
         }
         return Vec::new();
     }
@@ -98,7 +101,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     }
     let is_elsewhere = |cell: u16| raw.modules.iter().any(|keys| numbers(keys).any(|it| it == cell));
     if let Some(last) = raw.modules.last().filter(|_| (1..=pack.cells).all(is_elsewhere)) {
-        last.place.fault("cells", "must leave cells that are of [pack]'s own kind");
+        last.place.fault("cells", "must leave at least one cell of the pack's own type");
     }
     let of_keys = |keys: &'a PackModule| {
         let mut cells: Vec<u16> = numbers(keys).filter(|cell| (1..=pack.cells).contains(cell)).collect();

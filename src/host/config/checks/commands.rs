@@ -18,7 +18,7 @@ pub(crate) fn commands(
 ) -> Option<(CommandConfig, Option<GuardConfig>)> {
     let keys = raw.commands.as_ref().filter(|commands| commands.enabled)?;
     if !raw.is_written::<Output>() || raw.is_output_disabled() {
-        keys.place.fault("enabled", "must have a table [output] that is enabled: the outcome of a command is sent");
+        keys.place.fault("enabled", "requires an enabled table [output]: every command is answered with a reply frame");
     }
     let bus = raw.one_bus(keys.interface.as_deref(), &keys.place)?;
     let (output, database) = output?;
@@ -27,23 +27,24 @@ pub(crate) fn commands(
     let secoc = plan.authentication();
     let Some(data_id) = secoc.map(|secoc| secoc.data_id).or(plan.protection().map(|protection| protection.data_id))
     else {
-        let what = "must be \"1A\", \"1C\" or \"5\", or have secoc beside it: commands are never taken unprotected";
+        let what = "must be \"1A\", \"1C\" or \"5\" if secoc is not given: unprotected commands are not accepted";
         keys.place.fault("e2e", what);
         return None;
     };
     if secoc.is_some() && plan.protection().is_some() {
-        keys.place.fault("e2e", "must not be given with secoc: the authenticator finds all that a checksum finds");
+        keys.place
+            .fault("e2e", "must not be given together with secoc, which detects everything that a checksum detects");
     }
     if secoc.is_some() && output.plan.freshness().is_none() {
-        keys.place.fault("secoc", "must have the message PACKWATCH_Freshness in output.dbc");
+        keys.place.fault("secoc", "requires the message PACKWATCH_Freshness in output.dbc");
     }
     let id = plan.id();
     if output.buses.contains(&bus) && output.plan.ids().contains(&id) {
-        keys.place.fault("id", format!("must not be that of a frame that is sent, {id}"));
+        keys.place.fault("id", format!("must not be the identifier of a sent frame, {id}"));
     }
     check_no_input(&keys.place, id, &[bus], found);
     if output.plan.messages().any(|sent| sent.data_id() == Some(data_id)) {
-        keys.place.fault("data_id", "must differ from those of the frames that are sent");
+        keys.place.fault("data_id", "must differ from the data ids of the sent frames");
     }
     let is_fd = database.messages.iter().any(|m| m.id == plan.id() && m.format != FrameFormat::Classic);
     if is_fd {

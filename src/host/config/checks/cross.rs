@@ -48,20 +48,20 @@ fn vehicle(raw: &RawTables) {
 
 fn interfaces(raw: &RawTables) {
     if raw.interfaces.is_empty() && raw.has_all_interfaces() {
-        raw.faults.add(&raw.file, 1, "interface is missing, must be at least one table [[interface]]");
+        raw.faults.add(&raw.file, 1, "interface is missing, must have at least one table [[interface]]");
     }
     if let Some(one_too_many) = raw.interfaces.get(MAX_INTERFACES) {
-        one_too_many.place.fault("name", format!("must be at most {MAX_INTERFACES} interfaces"));
+        one_too_many.place.fault("name", format!("is one interface too many, must be at most {MAX_INTERFACES}"));
     }
     for (index, interface) in raw.interfaces.iter().enumerate() {
         let name = &interface.name;
         if name.len() > MAX_INTERFACE_NAME || name.contains('/') || name.contains(char::is_whitespace) {
-            let what = format!("must be at most {MAX_INTERFACE_NAME} characters without blank or /");
+            let what = format!("must be at most {MAX_INTERFACE_NAME} characters without spaces or /");
             interface.place.fault("name", &what);
         }
         if let Some(first) = raw.interfaces[..index].iter().find(|other| other.name == *name) {
             let first = first.place.line_of("name").beside(interface.place.line_of("name"));
-            interface.place.fault("name", format!("must be unique, is also the name in {first}"));
+            interface.place.fault("name", format!("must be unique, but is also the name in {first}"));
         }
     }
 }
@@ -80,7 +80,7 @@ fn voltages(raw: &RawTables) {
             raw.note(raw.input.as_ref().map(|input| &input.place), text);
         }
         (true, true) => {
-            let text = "input.pack_voltage stands beside [input.cell_voltage], must be one of them";
+            let text = "input.pack_voltage and input.cell_voltage are both given, must be only one of them";
             raw.note(raw.pack_voltage.as_ref().map(|input| &input.place), text);
         }
         (true, false) | (false, true) => {}
@@ -91,16 +91,17 @@ fn voltages(raw: &RawTables) {
 fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(keys), Some(pack)) = (&raw.balancing, &raw.pack) else { return };
     if raw.is_pack_total() {
-        keys.place
-            .table_fault("stands beside [input.pack_voltage], must be without it: the pack is estimated as one cell");
+        keys.place.table_fault(
+            "must not be given together with [input.pack_voltage]: the pack is then estimated as one cell",
+        );
     }
     if !pack.balancing {
-        pack.place.fault("balancing", "must be true where there is [input.balancing]");
+        pack.place.fault("balancing", "must be true if [input.balancing] is given");
     }
     // Passive resistors take a few hundredths.
     let most_a = raw.rated_ah(model).map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
-        let what = format!("must be at most {most_a:?} A, a fifth of the pack's rated capacity in an hour");
+        let what = format!("must be at most {most_a:?} A (C/5 of the pack's rated capacity)");
         keys.place.fault("bleed_a", &what);
     }
 }
@@ -109,7 +110,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
 fn sources(raw: &RawTables) {
     let Some(input) = raw.input.as_ref().filter(|input| input.dbc.is_empty()) else { return };
     if !raw.broken && !raw.is_written::<DiagnosticInput>() {
-        input.place.fault("dbc", "must be a list of DBC files where there is no [[input.diagnostic]]");
+        input.place.fault("dbc", "must be a list of DBC files if there is no [[input.diagnostic]]");
     }
 }
 
@@ -117,10 +118,15 @@ fn sources(raw: &RawTables) {
 fn temperatures(pack: &Pack, raw: &RawTables) {
     if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {
-            sensor.place.table_fault("is one too many, must be one: the pack is estimated as one cell");
+            sensor.place.table_fault(
+                "is one sensor too many, must be one: with [input.pack_voltage] the pack is estimated as one cell",
+            );
         }
         for sensor in raw.temperatures.iter().filter(|sensor| sensor.cells.is_some()) {
-            sensor.place.fault("cells", "must not be given: the pack is estimated as one cell");
+            sensor.place.fault(
+                "cells",
+                "must not be given together with [input.pack_voltage]: the pack is then estimated as one cell",
+            );
         }
         return;
     }
@@ -142,7 +148,7 @@ fn limits(raw: &RawTables) {
         if let (Some(low), Some(high)) = (low, high)
             && high <= low
         {
-            place.fault(key, format!("must be above {low}, the smallest"));
+            place.fault(key, format!("must be above {low}, the lower limit"));
         }
     };
     if let Some(keys) = &raw.voltage_limits {

@@ -20,7 +20,7 @@ pub(crate) fn node(
         if !raw.broken && !raw.is_written::<J1939>() {
             for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
                 let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
-                alarm.place.fault(key, "must have a table [j1939], without it nothing is sent on J1939");
+                alarm.place.fault(key, "requires a table [j1939]; without it nothing is sent on J1939");
             }
         }
         return None;
@@ -72,7 +72,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
             if let Some((twin, _)) = codes.iter().find(same) {
                 let line = twin.place.at.beside(alarm.place.line_of("spn"));
                 let (path, fmi) = (&twin.place.path, own.code.fmi());
-                let what = format!("must not give two rules one code, {path} in {line} has it with FMI {fmi} ({key})");
+                let what =
+                    format!("must be unique per rule, but {path} in {line} has the same code with FMI {fmi} ({key})");
                 alarm.place.fault("spn", &what);
                 is_good = false;
             }
@@ -145,10 +146,10 @@ fn check_ids(
     let sent = node.sent_ids();
     if let Some(input) = found.iter().find(|f| f.bus == bus && sent.contains(&f.message.id)) {
         let (name, id) = (&input.message.name, input.message.id);
-        keys.place.fault("address", format!("must not be the address of an input, {name} has {id}"));
+        keys.place.fault("address", format!("must not be the source address of an input, but {name} has {id}"));
     }
     let output = output.filter(|output| output.buses.contains(&bus));
     if let Some(id) = output.and_then(|output| output.plan.ids().into_iter().find(|id| sent.contains(id))) {
-        keys.place.fault("address", format!("must not be the address in the identifier of a frame of [output], {id}"));
+        keys.place.fault("address", format!("must not be the source address of a frame of [output], {id}"));
     }
 }

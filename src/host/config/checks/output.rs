@@ -53,7 +53,7 @@ pub(crate) fn output(
         None => None,
     };
     if frames[4].period_ms.is_some() {
-        frames[4].place.fault("period_ms", "must not be given: a reply is sent on a command only");
+        frames[4].place.fault("period_ms", "must not be given: a reply is sent only after a command");
     }
     frames[..5].iter().for_each(check_sent_secoc);
     let freshness = freshness_settings(&frames[5], command_settings.as_ref());
@@ -104,7 +104,7 @@ pub(crate) fn message_settings(keys: &FrameKeys<'_>) -> Option<MessageSettings> 
     let id = match keys.id {
         Some(id) => Some(configured_id(keys, id)?),
         None if keys.extended => {
-            keys.place.fault("extended", "must have an id beside it");
+            keys.place.fault("extended", "requires the key id");
             return None;
         }
         None => None,
@@ -125,7 +125,7 @@ fn configured_id(keys: &FrameKeys<'_>, id: u32) -> Option<CanId> {
 fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
     let profile = match keys.e2e {
         None if keys.data_id.is_some() && keys.secoc.is_none() => {
-            keys.place.fault("data_id", "must have e2e or secoc beside it");
+            keys.place.fault("data_id", "requires e2e or secoc");
             return None;
         }
         None => return Some(E2eSetting::AsBase),
@@ -133,7 +133,7 @@ fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
         Some(E2eKey(Some(profile))) => profile,
     };
     let Some(data_id) = keys.data_id else {
-        let what = format!("must be given, 0 to {:#X}, with e2e = \"{}\"", profile.max_data_id(), profile.name());
+        let what = format!("must be 0 to {:#X} with e2e = \"{}\"", profile.max_data_id(), profile.name());
         keys.place.fault("data_id", &what);
         return None;
     };
@@ -144,7 +144,7 @@ fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
 fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     let Some(profile) = keys.secoc else { return Some(None) };
     if keys.data_id.is_none() {
-        keys.place.fault("data_id", format!("must be given, 0 to 0xFFFF, with secoc = \"{}\"", profile.name()));
+        keys.place.fault("data_id", format!("must be 0 to 0xFFFF with secoc = \"{}\"", profile.name()));
     }
     keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
@@ -169,15 +169,15 @@ fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -
     for (key, _) in unused.into_iter().filter(|(_, is_given)| *is_given) {
         is_good = false;
         let what = if key == "data_id" {
-            "must not be given without commands.secoc: nothing is announced"
+            "must not be given without commands.secoc: there is nothing to announce"
         } else {
-            "must not be given: the announcement is authenticated in its own way, once a second"
+            "must not be given: the announcement has a fixed authentication and period"
         };
         keys.place.fault(key, what);
     }
     let Some(data_id) = keys.data_id.filter(|_| is_sent) else {
         if is_sent {
-            keys.place.fault("data_id", "must be given, 0 to 0xFFFF, with commands.secoc");
+            keys.place.fault("data_id", "must be 0 to 0xFFFF with commands.secoc");
         }
         return (is_good && !is_sent).then(MessageSettings::default);
     };
@@ -206,13 +206,17 @@ fn check_ids(
         let (one, id) = (message.message.name(), message.id);
         if let Some(other) = sent[..index].iter().find(|other| other.id == id) {
             let other = other.message.name();
-            keys.place.fault("id", format!("{one} and {other} frame would both be {id}, must differ"));
+            keys.place
+                .fault("id", format!("must differ: the {one} and {other} frames would both have identifier {id}"));
         }
         check_no_input(keys.place, id, buses, found);
         let Some(data_id) = message.data_id() else { continue };
         if let Some(other) = sent[..index].iter().find(|other| other.data_id() == Some(data_id)) {
             let other = other.message.name();
-            keys.place.fault("data_id", format!("{one} and {other} frame would both have {data_id:#X}, must differ"));
+            keys.place.fault(
+                "data_id",
+                format!("must differ: the {one} and {other} frames would both have data id {data_id:#X}"),
+            );
         }
     }
 }

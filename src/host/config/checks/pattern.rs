@@ -27,7 +27,7 @@ impl Pattern {
             pieces.push(match name {
                 "n" => PatternPiece::Cell,
                 "m" => PatternPiece::Any,
-                _ => return Err("must have {n} (cell's number) and {m} (any number) as its only braces".to_owned()),
+                _ => return Err("must use braces only for {n} (the cell's number) and {m} (any number)".to_owned()),
             });
             rest = tail;
         }

@@ -63,7 +63,7 @@ fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
     let unit = needed(resolved.channel).map_or("", |(_, unit)| unit);
     let (name, low, high) = (name(resolved, resolved.signal), digits(low, 3), digits(high, 3));
     let what = format!(
-        "the bits of {name} hold {low} to {high} {unit} after factor and scale, must reach {} to {} {unit}",
+        "{name} can carry only {low} to {high} {unit} after factor and scale, must overlap {} to {} {unit}",
         digits(from, 3),
         digits(to, 3)
     );
@@ -135,7 +135,7 @@ fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     let whose = if beyond.len() == 1 { "its" } else { "their" };
     let (byte, len, file) = (signal.layout.end_byte(), resolved.message.len_bytes, resolved.file);
     let mut what = format!(
-        "{}{others} in byte {byte} of {whose} message, must end within the {len} that {file} gives it",
+        "{}{others} in byte {byte} of {whose} message, must end within the {len} bytes stated in {file}",
         name(resolved, signal)
     );
     if let Some((order, layout)) = other_order(&signal.layout)
@@ -180,7 +180,7 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
             1 => " (and 1 other pair)".to_owned(),
             more => format!(" (and {more} other pairs)"),
         };
-        place.fault("signal", format!("{first} and {second}{more} share bits of one message, must be apart"));
+        place.fault("signal", format!("{first} and {second}{more} share bits of one message, must not overlap"));
     }
 }
 
@@ -269,7 +269,7 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
         place.warn(key, format!("the unit of {name} is {unit:?}, {found}, where {wanted} is expected"));
     } else {
         let what =
-            format!("the unit of {name} is {unit:?}, {found}, must be {wanted} (scale = 1.0 if the DBC is wrong)");
+            format!("the unit of {name} is {unit:?}, {found}, must be {wanted} (set scale = 1.0 if the DBC is wrong)");
         place.fault("signal", &what);
     }
 }
@@ -292,14 +292,16 @@ fn conversion(
     let beside =
         if is_scale || unit.offset == 0.0 { String::new() } else { format!(", with offset = {}", toml(unit.offset)) };
     if !is_held && !is_converted(place) {
-        let what = format!("the unit of {name} is {text:?}, in which its bits hold no pack's value: taken as {wanted}");
+        let what = format!(
+            "the unit of {name} is {text:?}, but its bits cannot carry a plausible value in that unit: read as {wanted}"
+        );
         place.warn("signal", &what);
     } else if is_converted(place) {
-        place.warn(key, format!("would be {needed}{beside} by the unit {text:?} of {name}"));
+        place.warn(key, format!("should be {needed}{beside} according to the unit {text:?} of {name}"));
     } else {
         let unscaled = if key == "offset" { "0.0" } else { "1.0" };
         let what = format!(
-            "must be {needed}{beside}: the unit of {name} is {text:?} ({unscaled} if the DBC is wrong and it is {wanted})"
+            "must be {needed}{beside}: the unit of {name} is {text:?} (set {unscaled} if the DBC is wrong and the unit is {wanted})"
         );
         place.fault(key, &what);
     }
@@ -369,21 +371,17 @@ impl AllowedRange<'_> {
         match (place.has(low_key), place.has(high_key)) {
             (true, true) => {} // noted where the keys are compared
             (false, true) => {
-                let what = format!(
-                    "allows nothing: the smallest plausible value is {low} {unit} ({origin}), must be above it"
-                );
+                let what = format!("must be above {low} {unit}, the smallest plausible value {origin}");
                 place.fault(high_key, &what);
             }
             (true, false) => {
-                let what = format!(
-                    "allows nothing: the largest plausible value is {high} {unit} ({origin}), must be below it"
-                );
+                let what = format!("must be below {high} {unit}, the largest plausible value {origin}");
                 place.fault(low_key, &what);
             }
             (false, false) => {
                 let (from, to) = (digits(dbc.0, 9), digits(dbc.1, 9));
                 let what = format!(
-                    "the DBC's range is {from} to {to} {unit} after scale, must have values a pack can have; [{}] overrides it",
+                    "the DBC's range is {from} to {to} {unit} after scale, must contain plausible values (set [{}] to override it)",
                     place.path
                 );
                 if let Some(input) = input {
@@ -402,11 +400,8 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     if min < high && max > low {
         return;
     }
-    let what = format!(
-        "allows {} to {} V, must allow some of the {low} to {high} V of the cell model",
-        digits(min, 9),
-        digits(max, 9)
-    );
+    let what =
+        format!("allows {} to {} V, must overlap the cell model's {low} to {high} V", digits(min, 9), digits(max, 9));
     let key = range.keys[usize::from(max <= low)];
     match range.input.filter(|_| !range.place.has(key)) {
         Some(input) => input.fault("signal", &what),
@@ -426,15 +421,17 @@ pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
         let (ratio, own_ah) = (digits(beside, 3), digits(own_ah, 3));
-        let what =
-            format!("are cells of {ratio} times the {own_ah} Ah of the pack's own, which carry the same current");
+        let what = format!("have {ratio} times the {own_ah} Ah of the pack's own cells, which carry the same current");
         keys.place.warn("cells", &what);
     }
     initial_of(&keys.place, keys.initial_capacity_ah, model);
     let ratio = model.rated_capacity_ah / model.capacity_ah;
     if ratio.max(1.0 / ratio) >= OTHER_CELL {
-        let what =
-            format!("must be that of one cell of {:?}, which has {} Ah", model.name, digits(model.capacity_ah, 3));
+        let what = format!(
+            "must be the capacity of one cell of {:?}, which has {} Ah",
+            model.name,
+            digits(model.capacity_ah, 3)
+        );
         keys.place.fault("rated_capacity_ah", &what);
     }
 }
@@ -444,7 +441,10 @@ fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel) {
     if !bounds::INITIAL_CAPACITY.has(initial_ah / model.capacity_ah) {
         let [low, high] =
             [bounds::INITIAL_CAPACITY.low, bounds::INITIAL_CAPACITY.high].map(|by| digits(by * model.capacity_ah, 3));
-        place.fault("initial_capacity_ah", format!("must be that of a cell of {:?}, {low} to {high} Ah", model.name));
+        place.fault(
+            "initial_capacity_ah",
+            format!("must be plausible for a cell of {:?}, {low} to {high} Ah", model.name),
+        );
     }
 }
 
@@ -462,12 +462,11 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let hint = parallel_cells(ratio, pack.strings);
     if unlike >= OTHER_CELL {
         let [low, high] = [1.0 / OTHER_CELL, OTHER_CELL].map(|by| digits(model.rated_capacity_ah * by, 3));
-        let what = format!("{found}, must be that of one cell of this model, {low} to {high} Ah{hint}");
+        let what = format!("{found}, must be the capacity of one cell of this model, {low} to {high} Ah{hint}");
         pack.place.fault("rated_capacity_ah", &what);
     } else {
         let soh = digits(100.0 * pack.initial_capacity_ah.unwrap_or(model.capacity_ah) / rated_ah, 3);
-        let what =
-            format!("{found}: SOH begins at {soh} %, and resistances are those of a cell of {model_ah} Ah{hint}");
+        let what = format!("{found}: SOH starts at {soh} %, and the resistances are for a cell of {model_ah} Ah{hint}");
         pack.place.warn("rated_capacity_ah", &what);
     }
 }
@@ -478,12 +477,12 @@ fn parallel_cells(ratio: f64, strings: u16) -> String {
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;
     let whole = ratio.round();
     if strings > 1 && is_about(f64::from(strings)) {
-        format!("; it is that of all {strings} strings together")
+        format!("; it seems to be the capacity of all {strings} strings together")
     } else if whole >= 2.0 && is_about(whole) {
         let strings = whole * f64::from(strings);
-        format!("; {whole} cells in parallel are strings = {strings} without this key")
+        format!("; for {whole} cells in parallel set strings = {strings} and remove this key")
     } else if ratio > 1.0 {
-        "; no number of cells in parallel gives it".to_owned()
+        "; no number of parallel cells explains it".to_owned()
     } else {
         String::new()
     }

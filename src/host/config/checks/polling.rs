@@ -42,14 +42,14 @@ pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>]) -> Option<Poll
         }
     }
     if requests.is_empty() && !raw.broken {
-        let what = "must be false: no answer that is read has drive_every_s, charge_every_s or parked_every_s";
+        let what = "must be false: no answer in use has drive_every_s, charge_every_s or parked_every_s";
         keys.place.fault("enabled", what);
     }
     let current = found.iter().find(|resolved| resolved.channel == Channel::Current).and_then(|it| it.answer);
     if let Some(place) = current.filter(|place| place.definition.every_s[2].is_none()) {
         let table = &place.definition.table;
         let what = format!(
-            "must be false, or {table} must have parked_every_s: without the current nothing says that the car drives"
+            "must be false, or {table} must have parked_every_s: without the current it is unknown whether the car drives"
         );
         keys.place.fault("enabled", &what);
     }

@@ -29,7 +29,7 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
         };
         if let Some(other) = inputs.iter().find(|input| input.message.id != first.message.id) {
             let what = format!(
-                "must be one message, is {} in {} and {} in {}",
+                "must be one message, but is {} in {} and {} in {}",
                 first.message.id, first.file, other.message.id, other.file
             );
             keys.place.fault("message", &what);
@@ -38,7 +38,7 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
         let guard = guard(keys, first, bus);
         if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
             let line = twin.place.line_of("message").beside(keys.place.line_of("message"));
-            keys.place.fault("message", format!("must be protected once, is also in {line}"));
+            keys.place.fault("message", format!("must be listed once, but is also in {line}"));
         }
         guards.push((guard, keys));
     }
@@ -56,8 +56,7 @@ fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[Guard
     let open = found.iter().find(|input| input.channel == Channel::PackIdentity && !is_protected(input));
     if let Some(input) = open {
         let what = format!(
-            "must be a signal of a message in [[input.protected]], or have accept_unprotected = true beside it: forged \
-             frames of {} would put aside everything learned",
+            "must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of {} would put aside all learned values",
             input.message.name
         );
         keys.place.fault("signal", &what);
@@ -98,7 +97,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     let length = usize::from(first.message.len_bytes);
     if !(shortest..=longest).contains(&length) {
         let what = format!(
-            "must have {shortest} to {longest} bytes with profile \"{}\", has {length} in {}",
+            "must have {shortest} to {longest} bytes with profile \"{}\", but has {length} in {}",
             profile.name(),
             first.file
         );
@@ -110,7 +109,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
             if signal.layout.touches(profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
                 noted.push(&signal.name);
                 let what = format!(
-                    "must not lie in {}, which profile \"{}\" writes: {}.{} does",
+                    "must not overlap {}, which profile \"{}\" writes: {}.{} does",
                     header_words(profile.header_mask()),
                     profile.name(),
                     input.message.name,

@@ -186,7 +186,7 @@ impl<'d> Search<'_, 'd> {
             [] => self.not_found(source),
             [hit] => self.add(channel, source, sign, hit),
             [first, .., last] => {
-                source.place.fault("signal", format!("must be in one place, is in {} and {}", first.file, last.file));
+                source.place.fault("signal", format!("must be unique, but is in {} and {}", first.file, last.file));
             }
         }
     }
@@ -207,7 +207,7 @@ impl<'d> Search<'_, 'd> {
             Err(what) => return source.place.fault("signal", &what),
         };
         if !pattern.has_cell() && cells > 1 {
-            return source.place.fault("signal", "must have {n} in place of the cell's number");
+            return source.place.fault("signal", "must contain {n} for the cell's number");
         }
         let mut hits: BTreeMap<u32, Vec<NamedSignal<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
@@ -224,14 +224,19 @@ impl<'d> Search<'_, 'd> {
                 None | Some([]) => missing.push(number),
                 Some([hit]) => self.add(channel(CellIndex(index)), source, 1.0, *hit),
                 Some([a, .., b]) => {
-                    let what =
-                        format!("must give each cell one signal, {number} is {} and {}", a.full_name(), b.full_name());
+                    let what = format!(
+                        "must match one signal per cell, but number {number} matches {} and {}",
+                        a.full_name(),
+                        b.full_name()
+                    );
                     source.place.fault("signal", &what);
                 }
             }
         }
         if !missing.is_empty() {
-            source.place.fault("signal", format!("must give every cell a signal, none for number {}", list(&missing)));
+            source
+                .place
+                .fault("signal", format!("must match a signal for every cell, but none has number {}", list(&missing)));
         }
     }
 
@@ -244,13 +249,15 @@ impl<'d> Search<'_, 'd> {
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
         if message.len_bytes > 8 && !fd && answer.is_none() {
             let what = format!(
-                "message {} has {} bytes, must have fd = true on its interface",
+                "message {} has {} bytes, requires fd = true on its interface",
                 message.name, message.len_bytes
             );
             source.place.fault("signal", &what);
         }
         if let Some(other) = self.found.iter().find(|f| f.bus == bus && std::ptr::eq(f.signal, signal)) {
-            source.place.fault("signal", format!("must not be used twice, is also {}", channel_words(other.channel)));
+            source
+                .place
+                .fault("signal", format!("must not be used twice, but is also {}", channel_words(other.channel)));
         }
         if channel == Channel::PackIdentity && signal.layout.length_bits > MAX_IDENTITY_BITS {
             let what =
@@ -291,7 +298,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
 /// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
 pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], found: &[ResolvedSignal<'_>]) {
     if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
-        place.fault("id", format!("must not be the identifier of an input, {} has {id}", input.message.name));
+        place.fault("id", format!("must not be the identifier of an input, but {} has {id}", input.message.name));
     }
 }
 

@@ -163,14 +163,14 @@ fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
     let mut words = vec![match sample.voltage_source {
         VoltageSource::Cells => format!("{} cells in series, each with its own voltage", sample.cells),
         VoltageSource::PackTotal { series } => format!(
-            "only the total voltage is known: {series} equal cells are assumed and estimated as one; a weak cell cannot be seen"
+            "only the total voltage is known: {series} equal cells are assumed and estimated as one; a weak cell cannot be detected"
         ),
     }];
     for module in &config.monitor.modules {
         let cells: Vec<u16> = module.cells.iter().map(|cell| cell.0 + 1).collect();
         let CellModel { name, rated_capacity_ah, capacity_ah, .. } = &module.model;
         words.push(format!(
-            "cells {}: another cell, {name}: rated {rated_capacity_ah} Ah, {capacity_ah} Ah when new; not compared with the others",
+            "cells {}: another type of cell, {name}: rated {rated_capacity_ah} Ah, {capacity_ah} Ah when new; not compared with the others",
             cell_list(&cells)
         ));
     }
@@ -193,7 +193,7 @@ fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
     }
     if rounding_v > 0.0 {
         words.push(format!(
-            "voltages come in steps of {} mV: their rounding counts as noise of {:.1} mV",
+            "voltage resolution is {} mV: rounding counts as noise of {:.1} mV",
             round(1000.0 * voltage_step_v),
             1000.0 * rounding_v
         ));

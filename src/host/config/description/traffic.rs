@@ -64,7 +64,7 @@ pub fn command_words(config: &Config) -> String {
         (Some(secoc), Some(key)) => {
             format!("commands of other ECUs are authenticated, {}, key in {key}", authentication_words(secoc))
         }
-        _ => "commands of other ECUs are unauthenticated: every node of the bus can make one".to_owned(),
+        _ => "commands of other ECUs are unauthenticated: every node on the bus can send them".to_owned(),
     }
 }
 
@@ -86,11 +86,11 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
         let interface = config.interface_name(guard.bus);
         let Protection { profile, data_id } = guard.check.protection;
         let missed = match guard.cycle_time_s {
-            Some(period_s) => format!("one missing is counted each {} ms", period_s * 1000.0),
-            None => "without a cycle time in the DBC missing ones are not counted".to_owned(),
+            Some(period_s) => format!("a missing frame is counted every {} ms", period_s * 1000.0),
+            None => "missing frames are not counted, because the DBC has no cycle time".to_owned(),
         };
         words.push(format!(
-            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, {} lost in a row allowed, {missed}",
+            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, up to {} lost in a row are allowed, {missed}",
             guard.id,
             profile.name(),
             guard.check.max_delta_counter_init,
@@ -113,7 +113,7 @@ pub(crate) fn polling(config: &Config) -> Vec<String> {
         config.monitor.supply.map(low_supply).unwrap_or_default()
     ));
     if config.monitor.supply.is_none() {
-        words.push("the vehicle's supply voltage is not watched ([input.supply_voltage])".to_owned());
+        words.push("the vehicle's supply voltage is not monitored ([input.supply_voltage])".to_owned());
     }
     words
 }

@@ -108,7 +108,7 @@ fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults)
     }
     if let Some(error) = errors.get(MAX_SYNTAX_FAULTS) {
         let more = errors.len() - MAX_SYNTAX_FAULTS;
-        faults.add(source.name(), line(error), format!("and {more} more faults of syntax from here"));
+        faults.add(source.name(), line(error), format!("and {more} more syntax faults from here on"));
     }
 }
 

@@ -28,7 +28,7 @@ pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool
     let keys = raw.authentication.as_ref()?;
     match (&keys.credential, &keys.key_file) {
         (Some(_), Some(_)) => {
-            keys.place.fault("key_file", "must not be given beside credential");
+            keys.place.fault("key_file", "must not be given together with credential");
             None
         }
         (Some(name), None) if !is_file_name(name) => {
@@ -39,7 +39,7 @@ pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool
         (None, Some(file)) => has_authenticated.then(|| KeySource::File(beside(config, file))),
         (None, None) => {
             if has_authenticated {
-                keys.place.fault("credential", "must be given, or key_file: secoc needs a key");
+                keys.place.fault("credential", "must be given if key_file is not: secoc requires a key");
             }
             None
         }

@@ -20,29 +20,27 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[[alarm]]\nrule = \"usable_capacity_low\"\nwarning = 1\n",
-            "pack.toml:16: alarm[1].rule = \"usable_capacity_low\", must have a table [usable] that states the load",
+            "pack.toml:16: alarm[1].rule = \"usable_capacity_low\", requires a table [usable], which states the load",
         ),
         (
             "[[alarm]]\nrule = \"input_missing\"\nwarning = \"80 %\"\n",
-            "pack.toml:17: alarm[1].warning = \"80 %\", must be a number: nothing is 100 % for this rule",
+            "pack.toml:17: alarm[1].warning = \"80 %\", must be a number: percentages are not defined for this rule",
         ),
         (
             "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\n[[alarm]]\nrule = \"input_missing\"\nwarning = 2\n",
-            "pack.toml:20: alarm[2].warning = 2, must be one per rule, alarm[1] in line 15 has one",
+            "pack.toml:20: alarm[2].warning = 2, must be given once per rule, but alarm[1] in line 15 also gives it",
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\nwarning = { set = 1.5, clear = \"74 %\" }\n",
-            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 or above it, on the \
-             healthy side, not at 1.48",
+            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 or above, not at 1.48",
         ),
         (
             "[[alarm]]\nrule = \"temperature_high\"\nsevere = { set = 60, clear = 61 }\n",
-            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 or below it, on the healthy \
-             side, not at 61",
+            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 or below, not at 61",
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1.4\nsevere = 1.5\n",
-            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4: it is the graver one",
+            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4: it is the more severe threshold",
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = 10\n",
@@ -60,8 +58,7 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[[alarm]]\nrule = \"recharge_period_low\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
-            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\" with recharge.alarm_on = \"raw\": that \
-             period has no standard deviation",
+            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\" with recharge.alarm_on = \"raw\": the raw period has no standard deviation",
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\nwhen = { probability = 1.5 }\n",
@@ -70,41 +67,39 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[[alarm]]\nrule = \"bms_disagrees\"\nwarning = 0.1\n",
-            "pack.toml:16: alarm[1].rule = \"bms_disagrees\", must have [input.reported_soc] or [input.reported_soh]",
+            "pack.toml:16: alarm[1].rule = \"bms_disagrees\", requires [input.reported_soc] or [input.reported_soh]",
         ),
         (
             "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
-            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: the outcome of a command \
-             is sent",
+            "pack.toml:16: commands.enabled = true, requires an enabled table [output]: every command is answered with a reply frame",
         ),
         (
             "[output]\n[commands]\nenabled = true\n",
-            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\", or have secoc beside it: commands are \
-             never taken unprotected",
+            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\" if secoc is not given: unprotected commands are not accepted",
         ),
         (
             "[output]\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\nid = 0x6B1\n",
-            "pack.toml:20: commands.id = 0x6B1, must not be that of a frame that is sent, 6B1",
+            "pack.toml:20: commands.id = 0x6B1, must not be the identifier of a sent frame, 6B1",
         ),
         (
             "[output.alarm]\ne2e = \"1A\"\ndata_id = 1\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
-            "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
+            "pack.toml:21: commands.data_id = 1, must differ from the data ids of the sent frames",
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[output.freshness]\ndata_id = 2\n",
-            "pack.toml:1: authentication.credential is not set, must be given, or key_file: secoc needs a key",
+            "pack.toml:1: authentication.credential is not set, must be given if key_file is not: secoc requires a key",
         ),
         (
             "[output]\n[commands]\nenabled = true\nsecoc = \"1\"\ndata_id = 1\n[authentication]\ncredential = \"k\"\n",
-            "pack.toml:15: output.freshness.data_id is not set, must be given, 0 to 0xFFFF, with commands.secoc",
+            "pack.toml:15: output.freshness.data_id is not set, must be 0 to 0xFFFF with commands.secoc",
         ),
         (
             "[output.digest]\nid = 0x6B2\n",
-            "pack.toml:16: output.digest.id = 0x6B2, digest and alarm frame would both be 6B2, must differ",
+            "pack.toml:16: output.digest.id = 0x6B2, must differ: the digest and alarm frames would both have identifier 6B2",
         ),
         (
             "[output.reply]\nperiod_ms = 100\n",
-            "pack.toml:16: output.reply.period_ms = 100, must not be given: a reply is sent on a command only",
+            "pack.toml:16: output.reply.period_ms = 100, must not be given: a reply is sent only after a command",
         ),
         (
             "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
@@ -117,16 +112,16 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clear = 15 }\n",
-            "pack.toml:17: alarm[1].warning = { set = 0.1, clear = 15 }, must leave a value that clears warning within 0 to \
-             1, not 15",
+            "pack.toml:17: alarm[1].warning = { set = 0.1, clear = 15 }, must clear warning at 0 to \
+             1, not at 15",
         ),
         (
             "[[alarm]]\nrule = \"soc_low\"\nwarning = 0.97\nhysteresis = 0.05\n",
-            "pack.toml:18: alarm[1].hysteresis = 0.05, must leave a value that clears warning within 0 to 1, not 1.02",
+            "pack.toml:18: alarm[1].hysteresis = 0.05, must clear warning at 0 to 1, not at 1.02",
         ),
         (
             "[[alarm]]\nrule = \"bus_fault\"\nwarning = 1\nhysteresis = 0.5\n",
-            "pack.toml:18: alarm[1].hysteresis = 0.5, must not be given: it is cleared at 0, when all is in order again",
+            "pack.toml:18: alarm[1].hysteresis = 0.5, must not be given: the alarm clears when the fault has ended",
         ),
     ];
     for (table, fault) in cases {

@@ -47,15 +47,15 @@ fn faults_of_the_bits() {
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.5\n"),
-            "pack.toml:17: input.balancing.bleed_a = 0.5, must be at most 0.4 A, a fifth of the pack's rated capacity in an hour",
+            "pack.toml:17: input.balancing.bleed_a = 0.5, must be at most 0.4 A (C/5 of the pack's rated capacity)",
         ),
         (
             pack("signal = \"Bleeding.Bleed1\"\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must have {n} in place of the cell's number",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed1\", must contain {n} for the cell's number",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nfirst = 2\nbleed_a = 0.1\n"),
-            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must give every cell a signal, none for number 5",
+            "pack.toml:16: input.balancing.signal = \"Bleeding.Bleed{n}\", must match a signal for every cell, but none has number 5",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n").replacen(
@@ -63,7 +63,7 @@ fn faults_of_the_bits() {
                 "cells = 4\nbalancing = false",
                 1,
             ),
-            "pack.toml:3: pack.balancing = false, must be true where there is [input.balancing]",
+            "pack.toml:3: pack.balancing = false, must be true if [input.balancing] is given",
         ),
         (
             pack("signal = \"Bleeding.Bleed{n}\"\nbleed_a = 0.1\n").replacen(
@@ -71,7 +71,7 @@ fn faults_of_the_bits() {
                 "[input.pack_voltage]\nsignal = \"Cells.CellVoltage1\"\nscale = 4.0",
                 1,
             ),
-            "pack.toml:16: input.balancing stands beside [input.pack_voltage], must be without it: the pack is estimated as one cell",
+            "pack.toml:16: input.balancing must not be given together with [input.pack_voltage]: the pack is then estimated as one cell",
         ),
     ];
     for (pack, fault) in table {

@@ -95,7 +95,7 @@ fn electrodes_say_how_the_curve_ages() {
         ),
         (
             "positive_content = [0.4, 0.39]\nnegative_content = [0.0, 0.01]",
-            "cell.toml:10: electrodes.positive_content: these electrodes do not say how the cell ages",
+            "cell.toml:10: electrodes.positive_content: the ageing of the open-circuit curve cannot be computed from these contents",
         ),
     ];
     for (contents, fault) in faults {

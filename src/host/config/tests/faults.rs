@@ -44,13 +44,13 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         (
             "\"can0\"",
             "\"a name too long to be one\"",
-            "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without blank or /",
+            "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without spaces or /",
         ),
         ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
         (
             "dbc = [\"pack.dbc\"]",
             "dbc = []",
-            "pack.toml:7: input.dbc = [], must be a list of DBC files where there is no [[input.diagnostic]]",
+            "pack.toml:7: input.dbc = [], must be a list of DBC files if there is no [[input.diagnostic]]",
         ),
         ("dbc = [\"pack.dbc\"]", "dbc = [\"pack.dbc\", 7]", "pack.toml:7: input.dbc = 7, must be a list of texts"),
     ];
@@ -85,27 +85,27 @@ fn single_faults_of_signals_name_what_the_dbc_has() {
         (
             "Status.Current",
             "Long.Current",
-            "pack.toml:9: input.current.signal = \"Long.Current\", message Long has 12 bytes, must have fd = true on its interface",
+            "pack.toml:9: input.current.signal = \"Long.Current\", message Long has 12 bytes, requires fd = true on its interface",
         ),
         (
             "Status.Temperature\"",
             "Status.Current\"\nscale = 1.0",
-            "pack.toml:14: input.temperature[1].signal = \"Status.Current\", must not be used twice, is also pack current",
+            "pack.toml:14: input.temperature[1].signal = \"Status.Current\", must not be used twice, but is also pack current",
         ),
         (
             "CellVoltage{n}",
             "CellVoltage1",
-            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must have {n} in place of the cell's number",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must contain {n} for the cell's number",
         ),
         (
             "CellVoltage{n}",
             "CellVoltage{x}",
-            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{x}\", must have {n} (cell's number) and {m} (any number) as its only braces",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{x}\", must use braces only for {n} (the cell's number) and {m} (any number)",
         ),
         (
             "CellVoltage{n}",
             "CellVoltage{n}\"\nfirst = 3\ninterface = \"can0",
-            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give every cell a signal, none for number 5, 6",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must match a signal for every cell, but none has number 5, 6",
         ),
         (
             "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"\n",
@@ -137,7 +137,7 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[limits.voltage]\nmin_v = 4\nmax_v = 3\n",
-            "pack.toml:17: limits.voltage.max_v = 3, must be above 4, the smallest",
+            "pack.toml:17: limits.voltage.max_v = 3, must be above 4, the lower limit",
         ),
         ("[limits.amps]\n", "pack.toml:15: limits.amps is not a known key"),
         (
@@ -150,27 +150,27 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[output.status]\nid = 1\n[output.alarm]\nid = 1\n",
-            "pack.toml:18: output.alarm.id = 1, alarm and status frame would both be 001, must differ",
+            "pack.toml:18: output.alarm.id = 1, must differ: the alarm and status frames would both have identifier 001",
         ),
         (
             "[output]\n[output.alarm]\nid = 0x6B0\n",
-            "pack.toml:17: output.alarm.id = 0x6B0, alarm and status frame would both be 6B0, must differ",
+            "pack.toml:17: output.alarm.id = 0x6B0, must differ: the alarm and status frames would both have identifier 6B0",
         ),
-        ("[output.alarm]\nextended = true\n", "pack.toml:16: output.alarm.extended = true, must have an id beside it"),
+        ("[output.alarm]\nextended = true\n", "pack.toml:16: output.alarm.extended = true, requires the key id"),
         ("[output.alarm]\nperiod_ms = 9\n", "pack.toml:16: output.alarm.period_ms = 9, must be 10 to 3600000"),
         ("[output.alarm]\ne2e = \"2\"\n", "pack.toml:16: output.alarm.e2e = \"2\", must be off or 1A or 1C or 5"),
         (
             "[output.alarm]\ne2e = \"1A\"\n",
-            "pack.toml:15: output.alarm.data_id is not set, must be given, 0 to 0xFFFF, with e2e = \"1A\"",
+            "pack.toml:15: output.alarm.data_id is not set, must be 0 to 0xFFFF with e2e = \"1A\"",
         ),
-        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, must have e2e or secoc beside it"),
+        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, requires e2e or secoc"),
         (
             "[output.alarm]\ne2e = \"1C\"\ndata_id = 0x1000\n",
             "pack.toml:17: output.alarm.data_id = 0x1000, must be 0 to 0xFFF with profile 1C",
         ),
         (
             "[output.status]\ne2e = \"1C\"\ndata_id = 7\n[output.alarm]\ne2e = \"1A\"\ndata_id = 7\n",
-            "pack.toml:20: output.alarm.data_id = 7, alarm and status frame would both have 0x7, must differ",
+            "pack.toml:20: output.alarm.data_id = 7, must differ: the alarm and status frames would both have data id 0x7",
         ),
         (
             "[output.health]\ne2e = \"5\"\ndata_id = 7\n",
@@ -192,11 +192,11 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[output.health]\nid = 0x110\n",
-            "pack.toml:16: output.health.id = 0x110, must not be the identifier of an input, Cells has 110",
+            "pack.toml:16: output.health.id = 0x110, must not be the identifier of an input, but Cells has 110",
         ),
         (
             "[[interface]]\nname = \"can0\"\n",
-            "pack.toml:16: interface[2].name = \"can0\", must be unique, is also the name in line 5",
+            "pack.toml:16: interface[2].name = \"can0\", must be unique, but is also the name in line 5",
         ),
     ];
     for (text, fault) in table {

@@ -123,7 +123,7 @@ fn of_several_interfaces_one_must_be_named() {
 
 #[test]
 fn a_number_without_a_node_is_a_fault() {
-    let fault = "pack.toml:21: alarm[2].spn = 7000, must have a table [j1939], without it nothing is sent on J1939";
+    let fault = "pack.toml:21: alarm[2].spn = 7000, requires a table [j1939]; without it nothing is sent on J1939";
     assert_eq!(faults(&with("")), [fault]);
 }
 
@@ -132,7 +132,7 @@ fn two_rules_must_not_share_a_code() {
     let shared = with(TABLE).replace("spn = 7000\n", "").replace("info = 1000\n", "info = 1000\nspn = 520196\n");
     good(&shared); // another failure mode of the same parameter
     let shared = shared.replace("info = 1000", "warning = 1000").replace("spn = 520196", "spn = 520193");
-    let what = "must not give two rules one code, alarm[1] in line 19 has it with FMI 18 (warning)";
+    let what = "must be unique per rule, but alarm[1] in line 19 has the same code with FMI 18 (warning)";
     assert_eq!(faults(&shared), [format!("pack.toml:28: alarm[3].spn = 520193, {what}")]);
 }
 
@@ -141,10 +141,10 @@ fn what_the_node_sends_must_not_be_an_input_or_a_frame_of_ours() {
     let dbc = DBC
         .replace("BO_ 256 Status", &format!("BO_ {} Status", 0x8000_0000_u32 | 0x18FE_CAF9))
         .replace("VAL_ 256 Current", &format!("VAL_ {} Current", 0x8000_0000_u32 | 0x18FE_CAF9));
-    let fault = "pack.toml:16: j1939.address = 249, must not be the address of an input, Status has 18FECAF9";
+    let fault =
+        "pack.toml:16: j1939.address = 249, must not be the source address of an input, but Status has 18FECAF9";
     assert_eq!(read_texts(&with(TABLE), CELL, &dbc).unwrap_err(), [fault]);
     let output = format!("[output]\n[output.status]\nextended = true\nid = 0x18EEFFF9\n{TABLE}");
-    let fault =
-        "pack.toml:20: j1939.address = 249, must not be the address in the identifier of a frame of [output], 18EEFFF9";
+    let fault = "pack.toml:20: j1939.address = 249, must not be the source address of a frame of [output], 18EEFFF9";
     assert_eq!(faults(&with(&output)), [fault]);
 }

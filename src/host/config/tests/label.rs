@@ -41,13 +41,13 @@ fn what_is_missing_or_does_not_fit_is_named() {
     assert_eq!(
         of("strings = 1"),
         [
-            "pack.toml:1: pack.cell_model is not set, must be a cell model file; or chemistry and rated_capacity_ah must be given"
+            "pack.toml:1: pack.cell_model is not set, must be a cell model file if chemistry and rated_capacity_ah are not given"
         ]
     );
     assert_eq!(
         of("chemistry = \"nca-graphite\""),
         [
-            "pack.toml:3: pack.chemistry = \"nca-graphite\", needs rated_capacity_ah, the capacity on the label of one cell"
+            "pack.toml:3: pack.chemistry = \"nca-graphite\", requires rated_capacity_ah, the capacity on the label of one cell"
         ]
     );
     assert_eq!(

@@ -39,7 +39,7 @@ fn cells_of_another_size_are_doubted() {
     let (config, _) = read_texts(&with_modules(&LFP.replace("2.5", "50")), CELL, DBC).unwrap();
     let line = PACK.lines().count() + 2;
     let expected = format!(
-        "pack.toml:{line}: pack.module[1].cells = \"2, 4\", are cells of 25 times the 2 Ah of the pack's own, which carry the same current"
+        "pack.toml:{line}: pack.module[1].cells = \"2, 4\", have 25 times the 2 Ah of the pack's own cells, which carry the same current"
     );
     assert!(config.warnings.contains(&expected), "{:?}", config.warnings);
     assert!(!good(&with_modules(LFP)).warnings.iter().any(|warning| warning.contains("pack's own")));
@@ -49,7 +49,7 @@ fn cells_of_another_size_are_doubted() {
 fn check_says_which_cells_are_of_another_kind() {
     let (_, description) = read_texts(&with_modules(LFP), CELL, DBC).unwrap();
     let words = description.pack.join("\n");
-    assert!(words.contains("cells 2, 4: another cell, lfp-graphite"), "{words}");
+    assert!(words.contains("cells 2, 4: another type of cell, lfp-graphite"), "{words}");
 }
 
 #[test]
@@ -60,12 +60,12 @@ fn what_is_missing_or_does_not_fit_is_named() {
         (
             "cells = \"2\"",
             0,
-            "pack.module[1].cell_model is not set, must be a cell model file; or chemistry and rated_capacity_ah must be given",
+            "pack.module[1].cell_model is not set, must be a cell model file if chemistry and rated_capacity_ah are not given",
         ),
         (
             "cells = \"2\"\nchemistry = \"lfp-graphite\"",
             2,
-            "pack.module[1].chemistry = \"lfp-graphite\", needs rated_capacity_ah, the capacity on the label of one cell",
+            "pack.module[1].chemistry = \"lfp-graphite\", requires rated_capacity_ah, the capacity on the label of one cell",
         ),
         (
             "cells = \"2\"\ncell_model = \"cell.toml\"\nchemistry = \"lfp-graphite\"",
@@ -80,17 +80,17 @@ fn what_is_missing_or_does_not_fit_is_named() {
         (
             "cells = \"1-4\"\ncell_model = \"cell.toml\"",
             1,
-            "pack.module[1].cells = \"1-4\", must leave cells that are of [pack]'s own kind",
+            "pack.module[1].cells = \"1-4\", must leave at least one cell of the pack's own type",
         ),
         (
             "cells = \"1\"\ncell_model = \"cell.toml\"\ninitial_capacity_ah = 20",
             3,
-            "pack.module[1].initial_capacity_ah = 20, must be that of a cell of \"test\", 0.095 to 5.7 Ah",
+            "pack.module[1].initial_capacity_ah = 20, must be plausible for a cell of \"test\", 0.095 to 5.7 Ah",
         ),
         (
             "cells = \"1\"\ncell_model = \"cell.toml\"\nrated_capacity_ah = 200",
             3,
-            "pack.module[1].rated_capacity_ah = 200, must be that of one cell of \"test\", which has 1.9 Ah",
+            "pack.module[1].rated_capacity_ah = 200, must be the capacity of one cell of \"test\", which has 1.9 Ah",
         ),
     ] {
         assert_eq!(of(module), [format!("pack.toml:{}: {expected}", line + at)]);

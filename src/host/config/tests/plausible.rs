@@ -62,17 +62,17 @@ fn the_file_as_it_stands_is_good() {
 #[test]
 fn a_signal_that_ends_behind_its_message_is_a_fault() {
     let fault = "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", Status.Temperature ends in byte 7 of \
-                 its message, must end within the 6 that pack.dbc gives it";
+                 its message, must end within the 6 bytes stated in pack.dbc";
     assert_eq!(faults(&[], &[("32|8@1+ (1,-40)", "41|8@1+ (1,-40)")]), [fault]);
     let selector = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Page ends in byte 9 of its message, \
-                    must end within the 8 that pack.dbc gives it";
+                    must end within the 8 bytes stated in pack.dbc";
     assert_eq!(faults(&[], &[("Page M : 0|8", "Page M : 64|8")]), [selector]);
 }
 
 #[test]
 fn many_signals_behind_their_message_are_one_fault_that_names_the_byte_order() {
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell2 and 1 other end in byte 9 of \
-                 their message, must end within the 8 that pack.dbc gives it; with the other byte order (@1) they would";
+                 their message, must end within the 8 bytes stated in pack.dbc; with the other byte order (@1) they would";
     assert_eq!(faults(&[], &[("24|16@1+", "48|16@0+")]), [fault]);
 }
 
@@ -87,24 +87,18 @@ fn an_empty_range_is_a_fault_wherever_it_comes_from() {
     };
     assert_eq!(
         limits("[limits.voltage]\nmax_v = 0.1\n"),
-        [
-            "pack.toml:16: limits.voltage.max_v = 0.1, allows nothing: the smallest plausible value is 1.25 V (of the DBC or \
-          the cell model), must be above it"
-        ]
+        ["pack.toml:16: limits.voltage.max_v = 0.1, must be above 1.25 V, the smallest plausible value of the DBC or \
+          the cell model"]
     );
     assert_eq!(
         limits("[limits.voltage]\nmin_v = 6\n"),
-        [
-            "pack.toml:16: limits.voltage.min_v = 6, allows nothing: the largest plausible value is 4.7 V (of the DBC or the \
-          cell model), must be below it"
-        ]
+        ["pack.toml:16: limits.voltage.min_v = 6, must be below 4.7 V, the largest plausible value of the DBC or the \
+          cell model"]
     );
     assert_eq!(
         limits("[limits.temperature]\nmax_c = -50\n"),
-        [
-            "pack.toml:16: limits.temperature.max_c = -50, allows nothing: the smallest plausible value is -40 degrees C (of \
-          the DBC), must be above it"
-        ]
+        ["pack.toml:16: limits.temperature.max_c = -50, must be above -40 degrees C, the smallest plausible value of \
+          the DBC"]
     );
 }
 
@@ -112,15 +106,15 @@ fn an_empty_range_is_a_fault_wherever_it_comes_from() {
 fn a_range_of_the_dbc_that_is_empty_after_scale_is_a_fault() {
     let mv = [("(0.001,0) [0|5] \"V\"", "(0.1,0) [0|5] \"mV\"")];
     let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the DBC's range is 0 to 0.005 V after scale, \
-                 must have values a pack can have; [limits.voltage] overrides it";
+                 must contain plausible values (set [limits.voltage] to override it)";
     assert_eq!(faults(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.001\n")], &mv), [fault]);
 }
 
 #[test]
 fn limits_without_any_voltage_of_the_cell_model_are_a_fault() {
     let keys = "Status.Temperature\"\n[limits.voltage]\nmin_v = 0.1\nmax_v = 1.35\n";
-    let fault = "pack.toml:17: limits.voltage.max_v = 1.35, allows 0.1 to 1.35 V, must allow some of the 2.5 to 4.2 V of \
-                 the cell model";
+    let fault =
+        "pack.toml:17: limits.voltage.max_v = 1.35, allows 0.1 to 1.35 V, must overlap the cell model's 2.5 to 4.2 V";
     assert_eq!(faults(&[("Status.Temperature\"\n", keys)], &[]), [fault]);
 }
 
@@ -131,16 +125,14 @@ fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
             "(0.001,0) [0|5] \"V\"",
             "(1,0) [0|0] \"mV\"",
             &[
-                "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Cells.Cell1 is \"mV\" (1.0 if \
-               the DBC is wrong and it is V)",
+                "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Cells.Cell1 is \"mV\" (set 1.0 if the DBC is wrong and the unit is V)",
             ],
         ),
         (
             "\"A\"",
             "\"mA\"",
             &[
-                "pack.toml:8: input.current.scale is not set, must be 0.001: the unit of Status.Current is \"mA\" (1.0 if \
-               the DBC is wrong and it is A)",
+                "pack.toml:8: input.current.scale is not set, must be 0.001: the unit of Status.Current is \"mA\" (set 1.0 if the DBC is wrong and the unit is A)",
             ],
         ),
         (
@@ -148,7 +140,7 @@ fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
             "(1.5,0) [0|0] \"K\"",
             &[
                 "pack.toml:13: input.temperature[1].offset is not set, must be -273.15: the unit of Status.Temperature is \
-               \"K\" (0.0 if the DBC is wrong and it is degrees C)",
+               \"K\" (set 0.0 if the DBC is wrong and the unit is degrees C)",
             ],
         ),
         (
@@ -156,21 +148,21 @@ fn a_unit_that_is_not_converted_is_a_fault_with_the_scale_that_fits() {
             "\"F\"",
             &[
                 "pack.toml:13: input.temperature[1].scale is not set, must be 0.5555555556, with offset = -17.77777778: the \
-               unit of Status.Temperature is \"F\" (1.0 if the DBC is wrong and it is degrees C)",
+               unit of Status.Temperature is \"F\" (set 1.0 if the DBC is wrong and the unit is degrees C)",
             ],
         ),
         (
             "\"degC\"",
             "\"Deg\"",
             &["pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", the unit of Status.Temperature is \
-               \"Deg\", an angle, must be degrees C (scale = 1.0 if the DBC is wrong)"],
+               \"Deg\", an angle, must be degrees C (set scale = 1.0 if the DBC is wrong)"],
         ),
         (
             "[0|5] \"V\"",
             "[0|5] \"A\"",
             &[
                 "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the unit of Cells.Cell1 is \"A\", a current, \
-               must be V (scale = 1.0 if the DBC is wrong)",
+               must be V (set scale = 1.0 if the DBC is wrong)",
             ],
         ),
     ];
@@ -187,7 +179,7 @@ fn a_reported_state_must_be_a_share() {
     assert_eq!(warnings(&[with_soc], &[(&from, &percent)]), [""; 0]);
     let (from, volt) = spare("V");
     let fault = "pack.toml:14: input.reported_soc.signal = \"Status.Spare\", the unit of Status.Spare is \"V\", a voltage, must \
-                 be % or a fraction (scale = 1.0 if the DBC is wrong)";
+                 be % or a fraction (set scale = 1.0 if the DBC is wrong)";
     assert_eq!(faults(&[with_soc], &[(&from, &volt)]), [fault]);
 }
 
@@ -195,7 +187,8 @@ fn a_reported_state_must_be_a_share() {
 fn a_written_scale_overrules_the_unit_with_a_warning() {
     let mv = [("(0.001,0) [0|5] \"V\"", "(1,0) [0|0] \"mV\"")];
     assert_eq!(warnings(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.001\n")], &mv), [""; 0]);
-    let warning = "pack.toml:13: input.cell_voltage.scale = 0.01, would be 0.001 by the unit \"mV\" of Cells.Cell1";
+    let warning =
+        "pack.toml:13: input.cell_voltage.scale = 0.01, should be 0.001 according to the unit \"mV\" of Cells.Cell1";
     assert_eq!(warnings(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.01\n")], &mv), [warning]);
     let kelvin = [("(1,-40) [-40|100] \"degC\"", "(1.5,0) [0|0] \"K\"")];
     let offset = |offset: &str| {
@@ -211,25 +204,22 @@ fn a_written_scale_overrules_the_unit_with_a_warning() {
 #[test]
 fn a_unit_in_which_the_bits_hold_no_value_is_taken_for_wrong() {
     let mislabelled = [("[0|5] \"V\"", "[0|0] \"mV\"")];
-    let warning = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the unit of Cells.Cell1 is \"mV\", in which \
-                   its bits hold no pack's value: taken as V";
+    let warning = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", the unit of Cells.Cell1 is \"mV\", but its bits cannot carry a plausible value in that unit: read as V";
     assert_eq!(warnings(&[], &mislabelled), [warning]);
-    let fault = "pack.toml:13: input.cell_voltage.scale = 0.001, the bits of Cells.Cell1 hold 0 to 0.06553 V after factor \
-                 and scale, must reach 2.5 to 4.2 V";
+    let fault = "pack.toml:13: input.cell_voltage.scale = 0.001, Cells.Cell1 can carry only 0 to 0.06553 V after factor and scale, must overlap 2.5 to 4.2 V";
     assert_eq!(faults(&[("Cell{n}\"\n", "Cell{n}\"\nscale = 0.001\n")], &mislabelled), [fault]);
 }
 
 #[test]
 fn inputs_that_share_bits_are_a_fault_unless_they_are_on_other_pages() {
-    let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and Cells.Cell2 share bits of one \
-                 message, must be apart";
+    let fault = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Cell1 and Cells.Cell2 share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 16|16")]), [fault]);
     assert_eq!(faults(&[], &[("Cell2 m0 : 24|16", "Cell2 m0 : 8|16")]), [fault], "the same bits");
     let across = "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", Status.Current and \
-                  Status.Temperature share bits of one message, must be apart";
+                  Status.Temperature share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("32|8@1+ (1,-40)", "15|8@0+ (1,-40)")]), [across]);
     let page = "pack.toml:12: input.cell_voltage.signal = \"Cells.Cell{n}\", Cells.Page and Cells.Cell1 (and 1 other pair) \
-                share bits of one message, must be apart";
+                share bits of one message, must not overlap";
     assert_eq!(faults(&[], &[("8|16@1+ (0.001", "4|16@1+ (0.001")]), [page]);
 }
 
@@ -243,24 +233,27 @@ fn a_rated_capacity_unlike_the_cell_model_is_a_fault_and_a_smaller_difference_a_
         let edits: Vec<(&str, &str)> = edits.iter().map(|(from, to)| (from.as_str(), to.as_str())).collect();
         read(&edits, &[]).map(|(config, _)| config.warnings)
     };
-    let fault = "pack.toml:4: pack.rated_capacity_ah = 60, is 30 times the 2 Ah of the cell model \"test\", must be that of \
-                 one cell of this model, 0.6667 to 6 Ah";
+    let fault = "pack.toml:4: pack.rated_capacity_ah = 60, is 30 times the 2 Ah of the cell model \"test\", must be the capacity of one cell of this model, 0.6667 to 6 Ah";
     assert_eq!(
         read_rated("60", "1").unwrap_err(),
-        [format!("{fault}; 30 cells in parallel are strings = 30 without this key")]
+        [format!("{fault}; for 30 cells in parallel set strings = 30 and remove this key")]
     );
     assert_eq!(
         read_rated("7", "1").unwrap_err(),
-        ["pack.toml:4: pack.rated_capacity_ah = 7, is 3.5 times the 2 Ah of the cell model \"test\", must be that of \
-          one cell of this model, 0.6667 to 6 Ah; no number of cells in parallel gives it"]
+        [
+            "pack.toml:4: pack.rated_capacity_ah = 7, is 3.5 times the 2 Ah of the cell model \"test\", must be the capacity of one cell of this model, 0.6667 to 6 Ah; no number of parallel cells explains it"
+        ]
     );
-    assert_eq!(read_rated("60", "30").unwrap_err(), [format!("{fault}; it is that of all 30 strings together")]);
+    assert_eq!(
+        read_rated("60", "30").unwrap_err(),
+        [format!("{fault}; it seems to be the capacity of all 30 strings together")]
+    );
     assert_eq!(read_rated("0.5", "1").unwrap_err().len(), 1);
     assert_eq!(
         read_rated("4", "1").unwrap(),
         [
-            "pack.toml:4: pack.rated_capacity_ah = 4, is 2 times the 2 Ah of the cell model \"test\": SOH begins at 47.5 %, \
-          and resistances are those of a cell of 2 Ah; 2 cells in parallel are strings = 2 without this key"
+            "pack.toml:4: pack.rated_capacity_ah = 4, is 2 times the 2 Ah of the cell model \"test\": SOH starts at 47.5 %, \
+          and the resistances are for a cell of 2 Ah; for 2 cells in parallel set strings = 2 and remove this key"
         ]
     );
     assert_eq!(read_rated("2.1", "1").unwrap(), [""; 0]);
@@ -321,11 +314,9 @@ fn signals_of_an_answer_share_bits_where_the_answer_has_them() {
         )
     };
     assert!(read_texts(&answer(""), CELL, DBC).is_ok(), "each begins at the first bit of its own byte");
-    let fault = "pack.toml:12: input.cell_voltage.signal = \"Car.Cell{n}\", Car.Cell1 and Car.Cell2 (and 2 other pairs) share \
-                 bits of one message, must be apart";
+    let fault = "pack.toml:12: input.cell_voltage.signal = \"Car.Cell{n}\", Car.Cell1 and Car.Cell2 (and 2 other pairs) share bits of one message, must not overlap";
     assert_eq!(read_texts(&answer(", step = 4"), CELL, DBC).unwrap_err(), [fault]);
-    let unit = "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Car.Cell1 is \"mV\" (1.0 if the \
-                DBC is wrong and it is V)";
+    let unit = "pack.toml:11: input.cell_voltage.scale is not set, must be 0.001: the unit of Car.Cell1 is \"mV\" (set 1.0 if the DBC is wrong and the unit is V)";
     let all = read_texts(&answer(", unit = \"mV\"").replace("0.02", "20.0"), CELL, DBC).unwrap_err();
     assert_eq!(all, [unit]);
 }

@@ -83,8 +83,7 @@ fn check_says_what_is_protected() {
         [
             "at most 2000 frames a second of one identifier, a tenth of them at once",
             "commands of other ECUs are not executed",
-            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, 1 lost in a row allowed, \
-             one missing is counted each 100 ms"
+            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, up to 1 lost in a row are allowed, a missing frame is counted every 100 ms"
         ]
     );
     let (_, description) = read(PACK).unwrap();
@@ -128,15 +127,15 @@ fn faults_name_file_line_key_found_and_allowed() {
         ),
         (
             "message = \"Status\"\nprofile = \"5\"\ndata_id = 1\n",
-            "pack.toml:18: input.protected[1].profile = \"5\", inputs must not lie in bytes 0 to 2, which profile \"5\" writes: Status.Current does",
+            "pack.toml:18: input.protected[1].profile = \"5\", inputs must not overlap bytes 0 to 2, which profile \"5\" writes: Status.Current does",
         ),
         (
             "message = \"Cells\"\nprofile = \"1C\"\ndata_id = 1\n",
-            "pack.toml:18: input.protected[1].profile = \"1C\", inputs must not lie in bytes 0 and 1, which profile \"1C\" writes: Cells.Page does",
+            "pack.toml:18: input.protected[1].profile = \"1C\", inputs must not overlap bytes 0 and 1, which profile \"1C\" writes: Cells.Page does",
         ),
         (
             "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n[[input.protected]]\nmessage = \"Status\"\nprofile = \"1A\"\ndata_id = 2\n",
-            "pack.toml:21: input.protected[2].message = \"Status\", must be protected once, is also in line 17",
+            "pack.toml:21: input.protected[2].message = \"Status\", must be listed once, but is also in line 17",
         ),
     ];
     for (text, fault) in table {
@@ -161,13 +160,13 @@ fn a_message_too_short_or_too_long_for_the_profile_is_refused() {
     let all = faults(&pack.replace("Status.Temperature", "Short.Temperature"));
     assert_eq!(
         all[0],
-        "pack.toml:17: input.protected[1].message = \"Short\", must have 3 to 64 bytes with profile \"5\", has 2 in pack.dbc"
+        "pack.toml:17: input.protected[1].message = \"Short\", must have 3 to 64 bytes with profile \"5\", but has 2 in pack.dbc"
     );
     let pack = protected("message = \"Long\"\nprofile = \"1A\"\ndata_id = 1\n");
     assert_eq!(
         faults(&pack.replace("Status.Current", "Long.Current")),
         [
-            "pack.toml:17: input.protected[1].message = \"Long\", must have 2 to 30 bytes with profile \"1A\", has 48 in pack.dbc"
+            "pack.toml:17: input.protected[1].message = \"Long\", must have 2 to 30 bytes with profile \"1A\", but has 48 in pack.dbc"
         ]
     );
 }
@@ -204,8 +203,7 @@ fn an_identity_of_the_pack_must_be_protected_or_accepted() {
     assert_eq!(
         faults(&open),
         [
-            "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be a signal of a message in [[input.protected]], \
-             or have accept_unprotected = true beside it: forged frames of Status would put aside everything learned"
+            "pack.toml:17: input.pack_identity.signal = \"Status.Low\", must be in a message of [[input.protected]] if accept_unprotected is not true: forged frames of Status would put aside all learned values"
         ]
     );
     assert!(read(&format!("{open}accept_unprotected = true\n")).is_ok());

@@ -68,7 +68,7 @@ fn coarse_steps_of_the_voltages_count_as_noise() {
     // Steps of 20 mV: 5.8 mV rms beside the sensor's 5 mV.
     assert!((coarse - 0.005_f64.hypot(0.020 / 12.0_f64.sqrt())).abs() < 1e-12, "{coarse}");
     let (_, description) = read_texts(&pack(), CELL, DBC).unwrap();
-    let words = "voltages come in steps of 20 mV: their rounding counts as noise of 5.8 mV";
+    let words = "voltage resolution is 20 mV: rounding counts as noise of 5.8 mV";
     assert!(description.pack.contains(&words.to_owned()), "{:?}", description.pack);
 }
 
@@ -91,8 +91,7 @@ fn little_endian_and_extended_addresses() {
 #[test]
 fn without_a_dbc_the_answers_must_be_there() {
     let all = faults(&pack_with("dbc = [\"pack.dbc\"]\n", ""));
-    let missing =
-        "pack.toml:6: input.dbc is not set, must be a list of DBC files where there is no [[input.diagnostic]]";
+    let missing = "pack.toml:6: input.dbc is not set, must be a list of DBC files if there is no [[input.diagnostic]]";
     assert_eq!(all, [missing]);
     let alone = pack()
         .replace("dbc = [\"pack.dbc\"]\n", "")
@@ -128,12 +127,12 @@ fn single_faults_of_answers() {
         (
             "numbers = \"1-3\", ",
             "",
-            "pack.toml:23: input.diagnostic[1].signals[1].name = \"Cell{n}\", has {n}, must have `numbers` that it counts through",
+            "pack.toml:23: input.diagnostic[1].signals[1].name = \"Cell{n}\", contains {n}, requires the key numbers",
         ),
         (
             "Cell{n}\", numbers = \"1-3\"",
             "Cell\", numbers = \"1-3\"",
-            "pack.toml:23: input.diagnostic[1].signals[1].name = \"Cell\", must have {n} in place of the number",
+            "pack.toml:23: input.diagnostic[1].signals[1].name = \"Cell\", must contain {n} for the number",
         ),
         (
             "numbers = \"1-3\"",
@@ -149,12 +148,12 @@ fn single_faults_of_answers() {
         (
             "bit = 32",
             "bit = 33, byte_order = \"little\"",
-            "pack.toml:23: input.diagnostic[1].signals[1].byte_order = \"little\", must be \"big\" for a signal that is not of whole bytes",
+            "pack.toml:23: input.diagnostic[1].signals[1].byte_order = \"little\", must be \"big\" for a signal that does not consist of whole bytes",
         ),
         (
             "\"Unused\"",
             "\"Cell1\"",
-            "pack.toml:24: input.diagnostic[1].signals[2].name = \"Cell1\", must be unique in its answer, Cell1 is there already",
+            "pack.toml:24: input.diagnostic[1].signals[2].name = \"Cell1\", must be unique in its answer, but Cell1 already exists",
         ),
         (
             "[0x3FF]",
@@ -193,7 +192,7 @@ fn requests_are_sent_only_when_asked_for_and_check_says_which() {
         "can0: asks 7E4 for 22 01 02 every 2 s while driving, every 10 s while charging",
         "at most 10 requests a second, one at a time; nothing else can be sent to a controller",
         "silent for 60 s after another tester's request, while the bus sleeps, and on standby",
-        "the vehicle's supply voltage is not watched ([input.supply_voltage])",
+        "the vehicle's supply voltage is not monitored ([input.supply_voltage])",
     ];
     assert_eq!(description.polling, words);
     let supplied = on.clone() + "[input.supply_voltage]\nsignal = \"Status.Total\"\nminimum_v = 12\n";
@@ -209,7 +208,7 @@ fn requests_are_sent_only_when_asked_for_and_check_says_which() {
 #[test]
 fn faults_of_polling() {
     let none = pack() + "[poll]\nenabled = true\n";
-    let fault = "pack.toml:34: poll.enabled = true, must be false: no answer that is read has drive_every_s, charge_every_s or \
+    let fault = "pack.toml:34: poll.enabled = true, must be false: no answer in use has drive_every_s, charge_every_s or \
                  parked_every_s";
     assert_eq!(faults(&none), [fault]);
     let polled = pack().replace("Status.Current", "Car.Unused").replacen(
@@ -217,7 +216,6 @@ fn faults_of_polling() {
         "identifier = 0x0102\ndrive_every_s = 2",
         1,
     );
-    let fault = "pack.toml:35: poll.enabled = true, must be false, or input.diagnostic[1] must have parked_every_s: without the \
-                 current nothing says that the car drives";
+    let fault = "pack.toml:35: poll.enabled = true, must be false, or input.diagnostic[1] must have parked_every_s: without the current it is unknown whether the car drives";
     assert_eq!(faults(&(polled + "[poll]\nenabled = true\n")), [fault]);
 }
