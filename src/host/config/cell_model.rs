@@ -1,17 +1,17 @@
-//! Cell model files: TOML to a checked [`CellModel`](crate::cell::CellModel), with every fault at once.
+//! Cell model files: reads TOML into a checked [`CellModel`](crate::cell::CellModel) and reports every fault at once.
 //!
-//! A model is refused unless breakpoints rise strictly, SOC runs from 0 to 1, the open-circuit voltage rises
-//! strictly with SOC at every temperature, tables have no hole, and resistances, capacitances and capacities
-//! are positive.
+//! A model is accepted only if breakpoints increase strictly, SOC runs from 0 to 1, the open-circuit voltage increases
+//! strictly with SOC at every temperature, tables are complete, and resistances, capacitances and capacities are
+//! positive.
 //!
 //! | file | content |
 //! | --- | --- |
 //! | `keys` | every key of the file |
-//! | `read` | the file read and checked |
-//! | `source` | where a model comes from |
-//! | `label` | the model of a label, and what was learned from it |
-//! | `write` | a model as a file |
-//! | `library` | the files in the usual folders |
+//! | `read` | reads and checks the file |
+//! | `source` | the origin of a model |
+//! | `label` | the model from a label, and what was learned from it |
+//! | `write` | writes a model as a file |
+//! | `library` | the model files in the usual folders |
 
 mod keys;
 mod label;

@@ -1,10 +1,10 @@
-//! The model of a cell without a file: that of its label, and what was learned on board from it.
+//! The model of a cell without a model file: made from its label, or learned on board from that.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, Label};
 use crate::monitor::{ModelState, ModelView};
 
-/// The model of a cell of which only the label is known; `None` = no cell of this chemistry has these voltages.
+/// The model of a cell from its label; `None` = the voltages are not plausible for the chemistry.
 pub fn of_label(label: &Label) -> Option<SourcedModel> {
     let source = ModelSource {
         state: ModelState::Prior,
@@ -16,7 +16,7 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
-/// The model in force of a pack that learns it; `None` = it is of a model file.
+/// The current model of a pack that learns its model; `None` = the model comes from a file.
 pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     let label = view.label?;
     let SourcedModel { model: prior, source } = of_label(&label)?;
@@ -39,7 +39,7 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     Some(SourcedModel { model: own.unwrap_or(prior), source })
 }
 
-/// From the lowest to the highest that was seen.
+/// The range from the lowest to the highest observed value.
 fn seen_range(seen: &Coverage) -> MeasuredRange {
     let whole = |ranges: Vec<[f64; 2]>| Some([ranges.first()?[0], ranges.last()?[1]]);
     MeasuredRange {

@@ -1,4 +1,4 @@
-//! The cell models that are there: files in the usual folders or in folders that are named.
+//! The available cell models: files in the usual folders or in named folders.
 
 use std::path::{Path, PathBuf};
 
@@ -6,10 +6,10 @@ use super::read::load_sourced;
 use super::source::SourcedModel;
 use crate::config::document::ConfigFaults;
 
-/// Most models of a folder.
+/// Most model files in a folder.
 const MOST: usize = 1000;
 
-/// A file of a folder.
+/// A model file in a folder.
 #[derive(Debug)]
 pub struct LibraryEntry {
     /// The file.
@@ -21,7 +21,7 @@ pub struct LibraryEntry {
 /// The usual folders that exist; `program` is the program's own file.
 pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
     let shipped = program.and_then(Path::parent).map(|folder| folder.join("../share/packwatch/cells"));
-    // Without "..", as people write it.
+    // Without "..".
     let shipped = shipped.and_then(|folder| folder.canonicalize().ok());
     ["config/cells", "cells", "/etc/packwatch/cells"]
         .iter()
@@ -31,7 +31,7 @@ pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
         .collect()
 }
 
-/// The models of a folder, `*.toml` by name.
+/// The models of a folder: its files `*.toml`, sorted by name.
 ///
 /// # Errors
 /// When the folder cannot be listed, or has too many files.

@@ -1,4 +1,4 @@
-//! A cell model file to a checked [`CellModel`], with every fault at once.
+//! Reads a cell model file into a checked [`CellModel`] and reports every fault at once.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
     load_sourced(path).map(|sourced| sourced.model)
 }
 
-/// As [`load`], with where the model comes from.
+/// Like [`load`], and also returns the origin of the model.
 ///
 /// # Errors
 /// Every fault found, one line each.
@@ -27,7 +27,7 @@ pub fn load_sourced(path: &Path) -> Result<SourcedModel, ConfigFaults> {
     model.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
-/// As [`load_sourced`], through `read`; faults are noted with those of other files.
+/// Like [`load_sourced`], but reads with `read` and adds to a shared list of faults.
 pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<SourcedModel> {
     let sources = Sources::read(&ConfigFiles::alone(path), read, faults)?;
     let document = Document::parse(&sources, faults);
@@ -86,7 +86,7 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Opt
     Some(SourcedModel { model, source })
 }
 
-/// The notes for people; empty when there are none. The file has been parsed before, so that its faults are noted.
+/// The notes for readers; empty if there are none. Faults were noted when the file was parsed.
 fn provenance(path: &Path, read: ReadFile<'_>) -> toml::Table {
     let text = read(path).ok().and_then(|bytes| String::from_utf8(bytes).ok()).unwrap_or_default();
     let notes = text.parse::<toml::Table>().ok().and_then(|mut table| table.remove("provenance"));
@@ -104,7 +104,7 @@ impl Measured {
     }
 }
 
-/// How the open-circuit curve ages; notes what no cell can have. Only sound tables are used.
+/// How the open-circuit curve ages; notes impossible values. Called only if the tables have no fault.
 fn ageing(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &Faults) -> AgedOcv {
     if !faults.is_empty() {
         return AgedOcv::default();
@@ -183,7 +183,7 @@ fn check_spread(spread: &SpreadKeys, tables: &Tables) {
     }
 }
 
-/// No hole: as many rows as temperatures, as many columns as SOC breakpoints.
+/// Checks that there is one row per temperature and one column per SOC breakpoint.
 fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables) {
     let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
     if rows.len() != temperatures {
@@ -196,7 +196,7 @@ fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables
     }
 }
 
-/// The first neighbours that do not rise.
+/// The first pair of neighbours that does not increase.
 fn first_not_rising(values: &[f64]) -> Option<(f64, f64)> {
     values.windows(2).find(|pair| pair[1] <= pair[0]).map(|pair| (pair[0], pair[1]))
 }

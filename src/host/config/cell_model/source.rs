@@ -1,4 +1,4 @@
-//! Where a cell model comes from: file, label or the vehicle's own data, and where it was measured.
+//! The origin of a cell model (file, label or the vehicle's own data), and the conditions in which the cell was measured.
 
 use toml::{Table, Value};
 
@@ -6,10 +6,10 @@ use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, Chemistry, Coverage, ModelBands};
 use crate::monitor::{ModelChange, ModelState};
 
-/// Most that the end of a measured range is rounded.
+/// Largest rounding error of the ends of a measured range.
 const ROUNDED: f64 = 0.01;
 
-/// A state of the model in words.
+/// A model state in words.
 pub fn state_words(state: ModelState) -> &'static str {
     match state {
         ModelState::Given => "cell model file",
@@ -20,7 +20,7 @@ pub fn state_words(state: ModelState) -> &'static str {
     }
 }
 
-/// Where a cell was measured, lowest and highest; `None` = not known.
+/// The measured conditions, lowest and highest; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct MeasuredRange {
     /// Degrees C.
@@ -31,31 +31,31 @@ pub struct MeasuredRange {
     pub soc: Option<[f64; 2]>,
 }
 
-/// Where a cell model comes from.
+/// The origin of a cell model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelSource {
     /// How well it is known.
     pub state: ModelState,
-    /// Chemistry, for people.
+    /// Chemistry, for readers.
     pub chemistry: Option<String>,
-    /// Where it was measured.
+    /// The measured conditions.
     pub measured: MeasuredRange,
-    /// `[provenance]` of its file; empty without one.
+    /// `[provenance]` of the file; empty if there is none.
     pub provenance: Table,
-    /// Of a learned model: that of the label, and what the data have seen.
+    /// For a learned model: the label's model, and what the data covered.
     pub learned: Option<LearnedFrom>,
 }
 
-/// What a learned model is learned from.
+/// The data behind a learned model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedFrom {
-    /// The model of the label.
+    /// The model made from the label.
     pub prior: Box<CellModel>,
-    /// What the rows in the notebook have seen.
+    /// The conditions covered by the rows in the notebook.
     pub seen: Coverage,
     /// Root mean square of the residuals, V; `None` = nothing is learned yet.
     pub residual_v: Option<f64>,
-    /// The chemistry that explains the voltages better than that on the label.
+    /// The chemistry that explains the voltages better than the one on the label.
     pub chemistry: Option<Chemistry>,
     /// Fits so far.
     pub fits: u32,
@@ -64,7 +64,7 @@ pub struct LearnedFrom {
 }
 
 impl ModelSource {
-    /// A text of `[provenance]`; `None` = not stated.
+    /// A string of `[provenance]`; `None` = absent.
     fn text(&self, keys: &[&str]) -> Option<&str> {
         keys.iter().find_map(|key| self.provenance.get(*key)?.as_str())
     }
@@ -91,7 +91,7 @@ impl ModelSource {
     }
 }
 
-/// A cell model with where it comes from.
+/// A cell model and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SourcedModel {
     /// The model.
@@ -100,15 +100,15 @@ pub struct SourcedModel {
     pub source: ModelSource,
 }
 
-/// Why a part of a model is as it is.
+/// The basis of one part of a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KnownBy {
-    /// Within what was measured.
+    /// Within the measured range.
     Measured,
-    /// Beyond what was measured: continued.
+    /// Beyond the measured range.
     Extrapolated,
-    /// The file does not state where it was measured.
+    /// The file does not state the measured range.
     NotStated,
     /// What all cells of the chemistry have in common.
     Prior,
@@ -117,7 +117,7 @@ pub enum KnownBy {
 }
 
 impl KnownBy {
-    /// In words.
+    /// The basis in words.
     pub fn words(self) -> &'static str {
         match self {
             Self::Measured => "measured",
@@ -130,27 +130,27 @@ impl KnownBy {
 }
 
 impl SourcedModel {
-    /// How the open-circuit curve is known at a SOC.
+    /// The basis of the open-circuit curve at a SOC.
     pub fn curve_known_by(&self, soc: f64) -> KnownBy {
         let std_v = |model: &CellModel| ModelBands::new(model).curve_std_v(soc);
         self.by_prior(&std_v).unwrap_or_else(|| self.source.by_range(self.source.measured.soc, soc))
     }
 
-    /// How the resistances are known at a temperature.
+    /// The basis of the resistances at a temperature.
     pub fn resistances_known_by(&self, temperature_c: f64) -> KnownBy {
         let std = |model: &CellModel| Some(ModelBands::new(model).resistance(0.5, temperature_c).std());
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// Of a label: by data where these have made a deviation clearly smaller than that of the label.
+    /// For a model from a label: data, if they have reduced the standard deviation clearly below the label's.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);
-        // A deviation of 0.7 of the label's is left where data say as much as the label.
+        // A ratio of 0.7 means that the data carry as much information as the label.
         Some(if left <= 0.7 * before { KnownBy::Data } else { KnownBy::Prior })
     }
 
-    /// Error of the model's voltage, V, as root mean square over SOC at the temperature of its curve; `None` = not stated.
+    /// Root mean square of the model's voltage error over SOC at the temperature of its curve, V; `None` = not stated.
     pub fn error_v(&self) -> Option<f64> {
         let errors =
             self.model.soc.iter().map(|&soc| self.model.voltage_error_v(&self.model.grid_position(soc, CURVE_C)));

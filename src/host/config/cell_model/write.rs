@@ -1,11 +1,11 @@
-//! Writes a cell model as the file that [`load`](super::load) reads: the same model, number for number. It holds no date.
+//! Writes a cell model as a file that [`load`](super::load) reads back with identical numbers. The file contains no date.
 
 use toml::{Table as TomlTable, Value};
 
 use super::source::SourcedModel;
 use crate::cell::{AgeingLaw, CellModel, Electrodes, ModelSpread, Table};
 
-/// Returns the whole file. `head` is its first comment, without line breaks.
+/// Returns the whole file. `head` is its first comment and must not contain line breaks.
 pub fn text(sourced: &SourcedModel, head: &str) -> String {
     let SourcedModel { model, source } = sourced;
     let mut out = format!("# {head}\nformat = 1\nname = {}\n", quoted(&model.name));
@@ -92,7 +92,7 @@ fn spread(out: &mut String, spread: &ModelSpread, modes_v: &[Vec<f64>; 2]) {
     out.push_str("]\n");
 }
 
-/// The shortest digits that give the same number.
+/// The shortest decimal notation that parses to the same number.
 fn number(value: f64) -> String {
     format!("{value:?}")
 }

@@ -1,4 +1,4 @@
-//! The keys of `[[alarm]]`: what must fit together, and the rules they make.
+//! The keys of `[[alarm]]`: checks them against each other, and builds the rules.
 
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
@@ -10,21 +10,21 @@ use crate::health::RechargeAlarm;
 /// The values of a new cell that relative thresholds refer to.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RatedCell {
-    /// Capacity on the label, Ah.
+    /// Rated capacity, Ah.
     pub capacity_ah: f64,
-    /// Time the reference charger needs for the recharge window of a cell with that capacity, s.
+    /// Time that the reference charger needs for the recharge window of a cell with the rated capacity, s.
     pub recharge_period_s: f64,
 }
 
 impl RatedCell {
-    /// Makes it of the rated capacity and the recharge window.
+    /// From the rated capacity and the recharge window.
     pub(crate) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
         let recharge = recharge.config(capacity_ah);
         let window = recharge.to_soc - recharge.from_soc;
         Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
     }
 
-    /// The value that is 100 % for a rule; `None` where none is.
+    /// The value that is 100 % for a rule; `None` if percentages are not defined for it.
     fn whole(&self, rule: Rule) -> Option<f64> {
         match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
@@ -43,7 +43,7 @@ impl RatedCell {
 }
 
 impl Alarm {
-    /// The thresholds that are written, by severity, with their keys.
+    /// The configured thresholds with their keys and severities.
     pub(crate) fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
         let all = [
             ("info", Severity::Info, self.info),
@@ -53,11 +53,11 @@ impl Alarm {
         all.into_iter().filter_map(|(key, severity, threshold)| Some((key, severity, threshold?)))
     }
 
-    /// The value back at which an alarm clears.
+    /// The value at which an alarm clears.
     fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
-            // A fault that has just begun does not end the one before.
+            // These values are durations of a fault: they are 0 only after the fault has ended.
             None if lasts_only_while_there(self.rule) => Some(0.0),
             None => {
                 let hysteresis = self.hysteresis.unwrap_or(0.02 * set.abs());
@@ -66,7 +66,7 @@ impl Alarm {
         }
     }
 
-    /// The rules it makes; relative thresholds of a rule that has no whole were noted by [`check`].
+    /// The configured rules. Relative thresholds of rules without a 100 % value were noted by [`check`].
     pub(crate) fn rules(&self, rated: &RatedCell) -> Vec<RuleConfig> {
         let rule = |(_, severity, threshold): (_, _, Threshold)| {
             let set = rated.value(self.rule, threshold.set)?;
@@ -85,12 +85,12 @@ impl Alarm {
     }
 }
 
-/// Whether the value of a rule is the duration of a fault: then only 0 means that there is none.
+/// Whether the rule's value is the duration of a fault, so that only 0 means "no fault".
 fn lasts_only_while_there(rule: Rule) -> bool {
     matches!(rule, Rule::BusFault | Rule::StoreFailed)
 }
 
-/// 1 where larger values are worse, -1 where smaller ones are.
+/// 1 if larger values are worse, -1 if smaller values are worse.
 fn beyond_sign(rule: Rule) -> f64 {
     match rule.spec().direction {
         Direction::Below => -1.0,
@@ -98,7 +98,7 @@ fn beyond_sign(rule: Rule) -> f64 {
     }
 }
 
-/// Notes keys of the alarms that do not fit together.
+/// Notes keys of the alarms that contradict each other.
 pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
@@ -122,7 +122,7 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Notes what a rule needs from the rest of the file and is missing.
+/// Notes what a rule requires and the file lacks.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
@@ -151,7 +151,7 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
     }
 }
 
-/// Each clear threshold on the healthy side, each more severe threshold further out.
+/// Checks that each clear threshold is on the healthy side and that more severe thresholds are further out.
 fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };
@@ -178,7 +178,7 @@ fn check_thresholds(alarm: &Alarm, rated: &RatedCell) {
     }
 }
 
-/// Notes an alarm that no value can clear: it would stay for ever.
+/// Notes an alarm that no value can clear; it would stay raised for ever.
 fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if lasts_only_while_there(alarm.rule) {
@@ -193,14 +193,14 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
     };
-    let is_within = (0.0..=high).contains(&set); // otherwise there is a fault already, or it is never raised
+    let is_within = (0.0..=high).contains(&set); // otherwise the threshold is already faulty or never reached
     if is_within && !(low..=high).contains(&clear) {
         let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
         alarm.place.fault(written, format!("must clear {key} at {range}, not at {clear}"));
     }
 }
 
-/// Notes a percent written without its sign: such a threshold is always or never passed.
+/// Notes a percentage written without its sign; such a threshold is always or never exceeded.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

@@ -1,7 +1,7 @@
-//! `[[input.diagnostic]]`: where a controller is asked, and where the signals are in its answers.
+//! `[[input.diagnostic]]`: the controllers that are asked, and the signals in their answers.
 //!
-//! In: the tables of the file. Out: one [`AnswerDefinition`] per table, with its signals as a DBC would describe them, so
-//! that `[input.*]` names them as it names those of a DBC; and the [`Answer`]s that the core reads.
+//! In: the tables of the file. Out: one [`AnswerDefinition`] per table. Its signals look like those of a DBC, so that
+//! `[input.*]` can name them in the same way. Also the [`Answer`]s that the core decodes.
 
 use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
@@ -13,7 +13,7 @@ use crate::config::schema::keys::{AnswerSignalKeys, DiagnosticInput, WireOrder};
 use crate::quantity::BusIndex;
 use crate::wiring::AnswerSource;
 
-/// One answer as it is configured.
+/// One configured answer.
 #[derive(Debug)]
 pub(crate) struct AnswerDefinition {
     /// Its table, `input.diagnostic[2]`.
@@ -24,11 +24,11 @@ pub(crate) struct AnswerDefinition {
     response: (CanId, Option<u8>),
     service: Service,
     identifier: u16,
-    /// How often it is asked for, by [`CarState`](crate::can::poll::CarState), s.
+    /// Time between requests in each [`CarState`](crate::can::poll::CarState), s.
     pub every_s: [Option<f64>; 3],
     /// Its signals; each layout begins at the signal's first byte.
     pub message: Message,
-    /// Of each signal: its first byte behind the echoed service and identifier.
+    /// The first byte of each signal, counted after the echoed service and identifier.
     first_bytes: Vec<usize>,
 }
 
@@ -37,12 +37,12 @@ pub(crate) struct AnswerDefinition {
 pub(crate) struct AnswerPlace<'d> {
     /// The answer.
     pub definition: &'d AnswerDefinition,
-    /// First byte behind the echoed service and identifier.
+    /// First byte, counted after the echoed service and identifier.
     pub first_byte: usize,
 }
 
 impl AnswerDefinition {
-    /// What it answers on an interface.
+    /// The question that it answers on an interface.
     pub(crate) fn question(&self, bus: BusIndex) -> Question {
         let (request, request_extension) = self.request;
         let (response, response_extension) = self.response;
@@ -50,7 +50,7 @@ impl AnswerDefinition {
         Question { controller, service: self.service, identifier: self.identifier }
     }
 
-    /// The signals with their places.
+    /// The signals and their positions.
     pub(crate) fn signals(&self) -> impl Iterator<Item = (&Signal, AnswerPlace<'_>)> {
         let places = self.first_bytes.iter().map(|&first_byte| AnswerPlace { definition: self, first_byte });
         self.message.signals.iter().zip(places)
@@ -65,12 +65,12 @@ impl AnswerPlace<'_> {
         format!("answer of {} to {}", self.definition.response.0, bytes.join(" "))
     }
 
-    /// The signal's source for the doctor.
+    /// The signal's source, for `packwatch doctor`.
     pub(crate) fn source(&self, bus: BusIndex) -> AnswerSource {
         AnswerSource { question: self.definition.question(bus), first_byte: self.first_byte }
     }
 
-    /// Position of the signal's first bit in the answer, as the file counts it.
+    /// Position of the signal's first bit in the answer, counted as in the file.
     pub(crate) fn bit(&self, layout: &SignalLayout) -> usize {
         let in_byte = match layout.byte_order {
             ByteOrder::BigEndian => 7 - layout.start_bit,
@@ -80,7 +80,7 @@ impl AnswerPlace<'_> {
     }
 }
 
-/// The answers of all tables; those with a fault are noted and left out.
+/// The answers of all tables; faulty ones are noted and left out.
 pub(crate) fn definitions(raw: &RawTables) -> Vec<AnswerDefinition> {
     raw.diagnostics.iter().filter_map(definition).collect()
 }
@@ -140,7 +140,7 @@ fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {
     })
 }
 
-/// An identifier of 11 bits, or of 29 where it needs them.
+/// An 11-bit identifier if it fits, else a 29-bit identifier.
 fn can_id(raw: u32) -> CanId {
     match u16::try_from(raw) {
         Ok(standard @ 0..=0x7FF) => CanId::Standard(standard),
@@ -148,7 +148,7 @@ fn can_id(raw: u32) -> CanId {
     }
 }
 
-/// Name and first bit of each signal that a line stands for.
+/// Name and first bit of each signal that a table declares.
 fn numbered(keys: &AnswerSignalKeys) -> Vec<(String, u64)> {
     let first = u64::from(keys.bit);
     let has_number = keys.name.contains("{n}");
@@ -188,7 +188,7 @@ fn check_numbers(keys: &AnswerSignalKeys) {
     }
 }
 
-/// The signal with a layout that begins at its first byte.
+/// The signal as a DBC would declare it, with a layout that begins at its first byte.
 fn as_in_a_dbc(keys: &AnswerSignalKeys, name: String, bit: usize) -> Signal {
     let in_byte = u16::try_from(bit % 8).unwrap_or_default();
     let (byte_order, start_bit) = match keys.byte_order {

@@ -1,7 +1,7 @@
-//! Which cells the pack has: its own kind, by a model file or a label, and modules of other cells (`[[pack.module]]`).
+//! The cells of the pack: its own type, given by a model file or a label, and modules of other cells (`[[pack.module]]`).
 //!
-//! In: the tables and the cell model files they name. Out: the models; faults where keys are missing or do not fit together,
-//! and where cells of a module are not there, in two modules, or of no known kind.
+//! In: the tables and the cell model files they name. Out: the models. Notes missing or contradicting keys, and cells of a
+//! module that do not exist, belong to two modules, or have no known type.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::config::schema::RawTables;
 use crate::config::schema::keys::{Pack, PackModule};
 use crate::quantity::CellIndex;
 
-/// A module's cells and what they are.
+/// A module: its cells and their model.
 #[derive(Debug)]
 pub(crate) struct Module<'a> {
     pub keys: &'a PackModule,
@@ -20,7 +20,7 @@ pub(crate) struct Module<'a> {
     pub model: CellModel,
 }
 
-/// What is on the label of the pack's own cells, where no file is named and nothing is missing.
+/// The label of the pack's own cells; `None` if a model file is named or a key is missing.
 pub(crate) fn label(pack: &Pack) -> Option<Label> {
     let (chemistry, rated_ah) = (pack.chemistry.filter(|_| pack.cell_model.is_none())?, pack.rated_capacity_ah?);
     let usual = Label::usual(chemistry, rated_ah);
@@ -31,7 +31,7 @@ pub(crate) fn label(pack: &Pack) -> Option<Label> {
     })
 }
 
-/// The model of the pack's own cells: of the file `named`, else by `chemistry`.
+/// The model of the pack's own cells: from the file `named`, else from `chemistry`.
 pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read: ReadFile<'_>) -> Option<SourcedModel> {
     if let Some(named) = named {
         return cell_model::load_with(&beside(path, named), read, &raw.faults);
@@ -54,7 +54,7 @@ pub(crate) fn own_model(path: &Path, named: Option<&str>, raw: &RawTables, read:
     model
 }
 
-/// Chemistry and rated capacity of a cell without a model file; what is missing is noted.
+/// Chemistry and rated capacity of a cell without a model file; missing keys are noted.
 fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Option<f64>) -> Option<(Chemistry, f64)> {
     match (chemistry, rated_ah) {
         (Some(chemistry), Some(rated_ah)) => return Some((chemistry, rated_ah)),
@@ -68,7 +68,7 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
     None
 }
 
-/// Notes keys of a label beside a model file, which has them; returns whether there are any.
+/// Notes label keys given together with a model file, which states the same values; returns whether there are any.
 fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     let of_label = ["chemistry", "voltage_min_v", "voltage_max_v"].into_iter();
     let given: Vec<&str> = of_label.filter(|key| cell_model.is_some() && place.has(key)).collect();
@@ -78,12 +78,12 @@ fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     !given.is_empty()
 }
 
-/// Notes keys of the pack's label beside a model file.
+/// Notes label keys of the pack given together with a model file.
 pub(crate) fn check(pack: &Pack) {
     check_file(&pack.place, pack.cell_model.as_ref());
 }
 
-/// Reads all modules; those with a fault are left out.
+/// Reads all modules; faulty ones are left out.
 pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -> Vec<Module<'a>> {
     let Some(pack) = &raw.pack else { return Vec::new() };
     if raw.is_pack_total() {
@@ -113,7 +113,7 @@ pub(crate) fn modules<'a>(path: &Path, raw: &'a RawTables, file: ReadFile<'_>) -
     raw.modules.iter().filter_map(of_keys).collect()
 }
 
-/// Notes, at the key `cells`, cells that are not there, and cells of an earlier table.
+/// Notes, at the key `cells`, cells that do not exist and cells of an earlier table.
 pub(crate) fn check_cells<'a>(
     place: &TablePlace,
     cells: &[u16],
@@ -146,7 +146,7 @@ fn model(path: &Path, keys: &PackModule, file: ReadFile<'_>) -> Option<CellModel
     Some(CellModel { rated_capacity_ah: keys.rated_capacity_ah.unwrap_or(model.rated_capacity_ah), ..model })
 }
 
-/// The pack's own model with the voltages of all its cells, for limits that hold for every cell.
+/// The pack's own model with the voltage range of all cells, for limits that apply to every cell.
 pub(crate) fn with_voltages_of(model: &CellModel, modules: &[Module<'_>]) -> CellModel {
     let lowest = modules.iter().map(|module| module.model.voltage_min_v).fold(model.voltage_min_v, f64::min);
     let highest = modules.iter().map(|module| module.model.voltage_max_v).fold(model.voltage_max_v, f64::max);

@@ -1,4 +1,4 @@
-//! Commands from the bus: `[commands]` to the plan that reads them and the guard that checks them.
+//! Commands from the bus: turns `[commands]` into the plan that decodes them and the guard that checks them.
 
 use super::signals::{ResolvedSignal, check_no_input};
 use crate::can::dbc::{Database, FrameFormat};
@@ -9,8 +9,8 @@ use crate::config::schema::RawTables;
 use crate::config::schema::keys::Output;
 use crate::monitor::{CommandConfig, OutputConfig};
 
-/// The plan that reads commands, and the guard that checks them where they are not authenticated; `None` = commands are off,
-/// or faults are noted.
+/// The plan that decodes commands, and the guard that checks them if they are not authenticated; `None` = commands are
+/// off, or faults are noted.
 pub(crate) fn commands(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],

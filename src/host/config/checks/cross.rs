@@ -1,4 +1,4 @@
-//! Checks that concern several keys, or a key and the cell model. Nothing here stops at the first fault.
+//! Checks that involve several keys, or a key and the cell model. Checking continues after a fault.
 
 use super::alarm::{self, RatedCell};
 use super::cells;
@@ -9,14 +9,14 @@ use crate::config::schema::keys::{
     CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
 };
 
-/// Interfaces one daemon may watch: more than any vehicle computer has, few enough for one byte in journals.
+/// Most interfaces of one daemon; more than any vehicle computer has, and fits one byte in journals.
 const MAX_INTERFACES: usize = 16;
-/// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
+/// Longest kernel name of an interface (IFNAMSIZ without the closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
-/// Longest name of a vehicle or pack, characters: a line of the status shows all three.
+/// Longest name of a vehicle or pack, characters; one status line shows all three.
 const MAX_VEHICLE_TEXT: usize = 64;
 
-/// Notes keys that do not fit together.
+/// Notes keys that contradict each other.
 pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     vehicle(raw);
     interfaces(raw);
@@ -35,7 +35,7 @@ pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     output(raw);
 }
 
-/// Texts that fit a label, a title and a line.
+/// Checks that the texts fit a label, a title and a line.
 fn vehicle(raw: &RawTables) {
     let Some(keys) = &raw.vehicle else { return };
     for (key, text) in [("name", &keys.name), ("id", &keys.id), ("pack", &keys.pack)] {
@@ -87,7 +87,7 @@ fn voltages(raw: &RawTables) {
     }
 }
 
-/// Bits of single cells, of a BMS that balances, and a current that a resistor can take.
+/// Checks that balancing signals belong to cells of a pack that balances, and that the bleed current is plausible.
 fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(keys), Some(pack)) = (&raw.balancing, &raw.pack) else { return };
     if raw.is_pack_total() {
@@ -98,7 +98,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     if !pack.balancing {
         pack.place.fault("balancing", "must be true if [input.balancing] is given");
     }
-    // Passive resistors take a few hundredths.
+    // Passive balancing uses a few hundredths of the rated capacity per hour.
     let most_a = raw.rated_ah(model).map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
         let what = format!("must be at most {most_a:?} A (C/5 of the pack's rated capacity)");
@@ -106,7 +106,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Signals are looked up somewhere.
+/// Checks that there is a file or answer in which to look up signals.
 fn sources(raw: &RawTables) {
     let Some(input) = raw.input.as_ref().filter(|input| input.dbc.is_empty()) else { return };
     if !raw.broken && !raw.is_written::<DiagnosticInput>() {
@@ -114,7 +114,7 @@ fn sources(raw: &RawTables) {
     }
 }
 
-/// Every cell has at most one sensor, and every numbered cell exists.
+/// Checks that every cell has at most one sensor, and that every numbered cell exists.
 fn temperatures(pack: &Pack, raw: &RawTables) {
     if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {
@@ -169,7 +169,7 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
         recharge.place.fault(key, if key == "to_soc" { &what } else { &other });
     }
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
-        // The paper's filter holds the capacity between half-cycles, ours carries it: half of each is neither.
+        // The paper's filter holds the capacity between half-cycles; ours estimates it. Mixing them is not supported.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
             (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
             (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),

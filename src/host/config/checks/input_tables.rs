@@ -1,7 +1,7 @@
-//! Checks of the input tables that need no whole table: their interfaces, and signal names where another key is faulty.
+//! Checks of the input tables that work even on a faulty table: interface names and signal names.
 //!
-//! In: the document, so that a table that cannot be read as a whole is checked all the same and every fault is reported at
-//! once.
+//! In: the document, because a faulty table is not in [`RawTables`] but must still be checked, so that every fault is
+//! reported at once.
 
 use toml::de::{DeTable, DeValue};
 
@@ -11,7 +11,7 @@ use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
 use crate::config::schema::{RawTables, SECTIONS};
 use crate::config::schema::{Section as _, SectionInfo};
 
-/// Notes interfaces that are not there, and missing ones where there are several.
+/// Notes unknown interfaces, and missing ones if there are several interfaces.
 pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     if raw.broken {
         return;
@@ -30,7 +30,7 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
             Some(Some(name)) => {
                 raw.has_all_interfaces() && count > 0 && !raw.interfaces.iter().any(|interface| interface.name == name)
             }
-            Some(None) => false, // not a text: noted when it was read
+            Some(None) => false, // not a string: noted when it was read
             None => count > 1,
         };
         if is_fault {
@@ -39,7 +39,7 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     }
 }
 
-/// Notes signals that are not in the DBC files, of tables with another fault.
+/// Notes unknown signals in tables that have another fault.
 pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases) {
     let read: Vec<&str> = raw.places().map(|place| place.path.as_str()).collect();
     for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {
@@ -59,7 +59,7 @@ fn with_key(key: &str) -> impl Iterator<Item = &'static SectionInfo> {
     SECTIONS.iter().filter(|info| info.path.starts_with("input.")).filter(has)
 }
 
-/// The tables of a section as they are written, with their places.
+/// The tables of a section in the document, with their positions.
 fn tables<'d>(document: &'d Document<'d>, info: &SectionInfo) -> Vec<(TablePlace, &'d DeTable<'d>)> {
     let Some(value) = document.find(info.path) else { return Vec::new() };
     match value.get_ref() {

@@ -1,6 +1,6 @@
-//! `[j1939]` and the `spn` of each alarm to a node's settings: its NAME, and each alarm as a trouble code.
+//! Builds the node's settings from `[j1939]` and `[[alarm]]`: its NAME, and each alarm as a trouble code.
 //!
-//! Nothing the node sends may be mistaken for an input or for a frame of `[output]`, and no two rules may share a code.
+//! The node's identifiers must differ from those of inputs and of `[output]`, and no two rules may share a code.
 
 use super::signals::ResolvedSignal;
 use crate::alarm::{Direction, Rule, Severity};
@@ -10,7 +10,7 @@ use crate::config::schema::keys::{Alarm, J1939};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
 use crate::quantity::BusIndex;
 
-/// The node; `None` = there is none (not configured, silenced, or faults noted).
+/// The node; `None` = not configured, disabled, or faults noted.
 pub(crate) fn node(
     raw: &RawTables,
     found: &[ResolvedSignal<'_>],
@@ -58,7 +58,7 @@ fn name(keys: &J1939) -> Option<Name> {
     Name::new(&fields).map_err(|error| keys.place.fault(error.field, error)).ok()
 }
 
-/// The code of every threshold; `None` when one is faulty (noted).
+/// The code of every threshold; `None` if one is faulty (noted).
 fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
     let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
     let mut is_good = true;
@@ -84,8 +84,8 @@ fn codes(alarms: &[Alarm]) -> Option<Vec<AlarmCode>> {
 }
 
 fn code(alarm: &Alarm, severity: Severity) -> Option<AlarmCode> {
-    // The rule's number as in alarm frames.
-    // The first number left to makers is unverified: from memory of J1939-73.
+    // The rule has the same number in alarm frames.
+    // Unverified (from memory of J1939-73): 520192 is the first manufacturer-assignable number.
     let spn = alarm.spn.unwrap_or(520_192 + u32::from(alarm.rule as u8));
     let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
@@ -126,7 +126,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     }
 }
 
-/// Never the malfunction lamp: that one is about emissions.
+/// The lamp of a severity. The malfunction lamp is not used because it concerns emissions.
 fn lamp(severity: Severity) -> Lamp {
     match severity {
         Severity::Info => Lamp::Protect,
@@ -135,7 +135,7 @@ fn lamp(severity: Severity) -> Lamp {
     }
 }
 
-/// No identifier of the node is one of an input or of a frame of `[output]` on its interface.
+/// Notes node identifiers that an input or a frame of `[output]` uses on the node's interface.
 fn check_ids(
     keys: &J1939,
     node: &NodeConfig,

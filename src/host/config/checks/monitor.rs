@@ -1,4 +1,4 @@
-//! The settings the other modules take, from the tables of a checked file.
+//! Builds the settings of the core from the tables of a checked file.
 
 use std::num::NonZeroU32;
 use std::path::Path;
@@ -20,8 +20,8 @@ use crate::monitor::{MonitorConfig, SupplyConfig};
 use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
-/// The settings of the core and the layout of the sent frames; `None` when a table is missing or faulty (and noted).
-/// `inputs_whole`: every configured signal was found.
+/// The settings of the core and the layout of the sent frames; `None` if a table is missing or faulty (noted).
+/// `inputs_whole`: whether every configured signal was found.
 pub(crate) fn monitor(
     raw: &RawTables,
     signals: &[ResolvedSignal<'_>],
@@ -31,7 +31,7 @@ pub(crate) fn monitor(
     path: &Path,
     read: ReadFile<'_>,
 ) -> Option<(MonitorConfig, Option<Database>)> {
-    // Every part is made before one is missed, so that each fault is noted.
+    // Builds every part before returning, so that each fault is noted.
     let mut guards = protect::guards(raw, signals, inputs_whole);
     let laid_out = output::output(raw, signals, path, model.as_ref(), read);
     let (commands, guard) = commands::commands(raw, signals, laid_out.as_ref()).unzip();
@@ -104,7 +104,7 @@ fn health(raw: &RawTables, pack: &Pack, rated_ah: f64) -> Option<HealthConfig> {
     })
 }
 
-/// Cycle times that the DBC files give the input messages, s.
+/// Cycle times of the input messages as stated by the DBC files, s.
 fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let times = in_frames.filter_map(|resolved| {
@@ -141,12 +141,12 @@ fn sample(raw: &RawTables, pack: &Pack, model: &CellModel, found: &DbcRanges) ->
     })
 }
 
-/// A fraction; packs that count above 100 % exist.
+/// Limits of a reported fraction. Some packs report more than 100 %.
 fn reported_limits(max_age_s: f64) -> Limits {
     Limits { min: -0.1, max: 1.5, max_rate_per_s: None, stuck_after_s: None, max_age_s }
 }
 
-/// The sensor of each cell; a sensor without `cells` serves all.
+/// The sensor of each cell; a sensor without `cells` serves all cells.
 fn sensors(temperatures: &[TemperatureInput], cells: u16) -> Vec<Option<SensorIndex>> {
     let mut sensor_of_cell = vec![None; usize::from(cells)];
     for (index, temperature) in (0..).zip(temperatures) {

@@ -1,4 +1,4 @@
-//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may be mistaken for an input.
+//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may have the identifier of an input.
 
 use std::path::Path;
 
@@ -66,7 +66,7 @@ pub(crate) fn output(
         Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
         None => None,
     };
-    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
+    // A missing cell model is already a fault. Any capacity then serves to find further faults of the layout.
     let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let refuse = |fault: &SettingFault| {
@@ -149,14 +149,14 @@ fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
 
-/// Notes a profile that only commands may have: its few bits of freshness do not reach beyond a restart of the sender.
+/// Notes SecOC profiles that only commands may use: their few bits of freshness do not survive a restart of the sender.
 fn check_sent_secoc(keys: &FrameKeys<'_>) {
     if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
         keys.place.fault("secoc", "must be \"fd\" for a frame that is sent");
     }
 }
 
-/// The settings of the announcement of freshness; `None` = faults noted.
+/// The settings of the freshness announcement; `None` = faults noted.
 fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -> Option<MessageSettings> {
     let is_sent = command.is_some_and(|command| command.secoc.is_some());
     let unused = [
@@ -187,13 +187,13 @@ fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -
     is_good.then_some(settings)
 }
 
-/// The keys of a message's table.
+/// The keys of the table that configures a message.
 fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: LayoutMessage) -> Option<&'k FrameKeys<'a>> {
     frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
 }
 
-/// Notes an identifier or data id that is used twice, for one frame could be accepted as another, and an identifier that an
-/// input has on the same interface.
+/// Notes identifiers and data ids that two frames share, because receivers could mistake one frame for the other, and
+/// identifiers of inputs on the same interface.
 fn check_ids(
     frames: &[(LayoutMessage, FrameKeys<'_>)],
     plan: &OutputPlan,

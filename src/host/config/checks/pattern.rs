@@ -15,7 +15,7 @@ enum PatternPiece {
 pub(crate) struct Pattern(Vec<PatternPiece>);
 
 impl Pattern {
-    /// Parses; `Err` says what must be otherwise.
+    /// Parses a pattern. The error says what it must be.
     pub(crate) fn parse(text: &str) -> Result<Self, String> {
         let mut pieces = Vec::new();
         let mut rest = text;
@@ -35,12 +35,12 @@ impl Pattern {
         Ok(Self(pieces))
     }
 
-    /// Whether the cell's number is in it.
+    /// Whether the pattern contains the cell's number.
     pub(crate) fn has_cell(&self) -> bool {
         self.0.contains(&PatternPiece::Cell)
     }
 
-    /// The cell's number when `name` fits; `Some(None)` when it fits and carries no number.
+    /// The cell's number if `name` matches; `Some(None)` if it matches a pattern without a cell number.
     pub(crate) fn fits(&self, name: &str) -> Option<Option<u32>> {
         fits(&self.0, name, None)
     }
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cells_number_is_taken_from_the_name() {
+    fn cell_number_comes_from_matching_name() {
         assert_eq!(fit("Cells.CellVoltage{n}", "Cells.CellVoltage12"), Some(Some(12)));
         assert_eq!(fit("Cells.CellVoltage{n}", "Cells.CellVoltage012"), Some(Some(12)));
         assert_eq!(fit("Cells{m}.V{n}_mV", "Cells3.V7_mV"), Some(Some(7)));
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn other_names_do_not_fit() {
+    fn other_names_do_not_match() {
         for name in ["Cells.CellVoltage", "Cells.CellVoltage1Max", "Cells.Voltage1", "", "Cells.CellVoltage-1"] {
             assert_eq!(fit("Cells.CellVoltage{n}", name), None, "{name}");
         }
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn other_braces_are_refused() {
+    fn unknown_braces_are_rejected() {
         for text in ["A.B{", "A.B{x}", "A.{n}{"] {
             assert!(Pattern::parse(text).is_err(), "{text}");
         }

@@ -1,8 +1,8 @@
-//! Checks of what is written correctly and cannot be meant: signals beyond their message, shared bits, units, empty ranges,
+//! Checks for settings that parse but cannot be intended: signals beyond their message, shared bits, units, empty ranges,
 //! the capacity of another cell.
 //!
-//! In: the tables, the signals found, the cell model. Out: faults where it is certainly wrong, warnings where it is only
-//! unlikely. A `scale` (or `offset`) that is written overrules the unit of the DBC.
+//! In: the tables, the signals found, the cell model. Out: faults for what is certainly wrong, warnings for what is only
+//! unlikely. A configured `scale` or `offset` overrides the DBC's unit.
 
 use super::cells::Module;
 use super::signals::{self, ResolvedSignal};
@@ -15,11 +15,11 @@ use crate::config::schema::RawTables;
 use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
-/// The rated capacity over the cell model's, or its reciprocal, from which they are of different cells: the estimator learns a
-/// resistance of at most this many times the model's.
+/// Ratio of rated capacities (or its reciprocal) from which the cells count as different: the estimator learns a
+/// resistance up to this many times the model's.
 const OTHER_CELL: f64 = 3.0;
 
-/// Notes what cannot be meant about the signals found.
+/// Notes implausible signals.
 pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
     for (place, signals) in by_table(raw, found) {
@@ -34,9 +34,9 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
     overlaps(raw, found);
 }
 
-/// Values of which a channel must be able to report some, in its unit; `None` = any.
+/// Range of values, in the channel's unit, that the channel must be able to report at least in part; `None` = any.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
-    // Without a model: the voltages of any lithium cell.
+    // Without a model: the voltages of any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
     match channel {
         Channel::CellVoltage(_) => Some((low, high)),
@@ -46,13 +46,13 @@ fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -
     }
 }
 
-/// What the bits of a signal hold after a conversion.
+/// The values that a signal's bits can carry after a conversion.
 fn held(resolved: &ResolvedSignal<'_>, scale: f64, offset: f64) -> (f64, f64) {
     let (low, high) = resolved.signal.layout.extent();
     (low * scale + offset, high * scale + offset)
 }
 
-/// Signals whose bits cannot hold a value that the pack has: the first of the table.
+/// Notes the first signal of a table whose bits cannot carry any value that the pack has.
 fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let beyond = signals.iter().filter(|resolved| resolved.binding().is_ok()).find_map(|resolved| {
         let needed = needed_values(resolved.channel, pack)?;
@@ -86,12 +86,12 @@ fn by_table<'r, 'd>(
     tables
 }
 
-/// The signal's name, and that of its table's message.
+/// `Message.Signal` of a signal in the resolved signal's message.
 fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
 }
 
-/// Signals with a layout or range that is no layout or range: one fault per table and reason.
+/// Notes signals with an invalid layout or range: one fault per table and reason.
 fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     let mut reasons: Vec<(String, &ResolvedSignal<'_>, usize)> = Vec::new();
     for resolved in signals {
@@ -113,9 +113,9 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     }
 }
 
-/// Signals, and the multiplexors they depend on, that reach beyond their message: one fault per table.
+/// Notes signals, and multiplexors they depend on, that extend beyond their message: one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
-    // An answer has no length that is known before it comes.
+    // The length of an answer is unknown until it arrives.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
     let parts = in_frames.flat_map(|resolved| {
         let selectors = selectors(resolved).map(|(_, selector)| selector);
@@ -147,7 +147,7 @@ fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     place.fault("signal", &what);
 }
 
-/// The layout with the byte order's character in the DBC exchanged; `None` for a signal within a byte.
+/// The layout with the other byte order and its DBC notation; `None` for a one-bit signal.
 fn other_order(layout: &SignalLayout) -> Option<(&'static str, SignalLayout)> {
     let (order, byte_order) = match layout.byte_order {
         ByteOrder::LittleEndian => ("@0", ByteOrder::BigEndian),
@@ -162,7 +162,7 @@ fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r 
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
 }
 
-/// Inputs of one message that share bits, or have bits of a multiplexor: one fault per pair of tables.
+/// Notes inputs of one message that share bits with each other or with a multiplexor: one fault per table.
 fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     for (place, signals) in by_table(raw, found) {
         let mut pairs: Vec<(String, String)> = Vec::new();
@@ -184,7 +184,7 @@ fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     }
 }
 
-/// Whether two inputs are different signals of one message that a payload can carry together.
+/// Whether two inputs are different signals that one payload of the same message can carry.
 fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let is_other_page = |condition: &MuxCondition| {
         let same = b.signal.conditions.iter().find(|other| other.selector == condition.selector);
@@ -196,7 +196,7 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
-/// Whether two inputs of one message share bits; the layouts of an answer's signals begin at their own first bytes.
+/// Whether two inputs of one message share bits. The layouts of an answer's signals begin at their own first bytes.
 fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let bits = |resolved: &ResolvedSignal<'_>| {
         let first = resolved.answer?.bit(&resolved.signal.layout);
@@ -208,7 +208,7 @@ fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     }
 }
 
-/// Whether two ranges, ends included, have a code in common.
+/// Whether two inclusive ranges overlap.
 fn is_met(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
 }
@@ -224,7 +224,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     }
 }
 
-/// Units of the DBC that are not those of the input, each once.
+/// Notes DBC units that differ from the unit of the input, each unit once.
 fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&CellModel>, u16)) {
     let mut seen: Vec<&str> = Vec::new();
     for resolved in signals {
@@ -238,7 +238,7 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
         seen.push(text);
         let name = name(resolved, resolved.signal);
         if unit.quantity == Quantity::PERCENTAGE && quantity == unit.quantity {
-            continue; // its scale is 0.01 where none is written
+            continue; // its scale defaults to 0.01
         }
         if unit.quantity == quantity {
             let is_held = needed_values(resolved.channel, pack).is_none_or(|(low, high)| {
@@ -252,7 +252,7 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
     }
 }
 
-/// Whether the configuration says how the DBC's values are converted.
+/// Whether the configuration sets a conversion of the DBC's values.
 fn is_converted(place: &TablePlace) -> bool {
     place.has("scale") || place.has("offset")
 }
@@ -274,14 +274,14 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
     }
 }
 
-/// `is_held`: the bits can hold a pack's value in that unit; if not, the DBC's unit is wrong.
+/// `is_held`: the bits can carry a plausible value in that unit; otherwise the DBC's unit is wrong.
 fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
     (name, wanted): (&str, &str),
 ) {
     let (scale, offset) = (resolved.scale.abs(), resolved.offset);
-    // Smaller differences are a calibration.
+    // Smaller differences are calibration.
     let is_scale = (scale / unit.factor - 1.0).abs() <= 0.1;
     let is_offset = unit.quantity != Quantity::Temperature || (offset - unit.offset).abs() <= 20.0;
     if is_scale && is_offset {
@@ -307,29 +307,29 @@ fn conversion(
     }
 }
 
-/// A float as TOML writes it, of ten digits.
+/// A float in TOML notation, rounded to ten digits.
 fn toml(value: f64) -> String {
     format!("{:?}", digits(value, 9))
 }
 
-/// Rounded to `decimals` digits behind the first.
+/// Rounds to `decimals` digits after the first.
 fn digits(value: f64, decimals: usize) -> f64 {
     format!("{value:.decimals$e}").parse().unwrap_or(value)
 }
 
-/// What readings of one kind may be, and where the limits are written.
+/// The allowed range of one kind of reading, and where its limits are configured.
 struct AllowedRange<'a> {
     place: &'a TablePlace,
     keys: [&'static str; 2],
     limits: Limits,
-    /// Limits of the DBC after scale.
+    /// Limits of the DBC after `scale`.
     dbc: (f64, f64),
     unit: &'static str,
-    /// Input whose DBC gives the range.
+    /// Input whose DBC states the range.
     input: Option<&'a TablePlace>,
 }
 
-/// Notes ranges of plausible readings that allow none.
+/// Notes ranges of plausible readings that are empty.
 pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let Some(pack) = &raw.pack else { return };
     let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
@@ -360,7 +360,7 @@ pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Optio
 }
 
 impl AllowedRange<'_> {
-    /// Whether the range allows anything; a fault if not.
+    /// Whether the range allows anything; notes a fault if not.
     fn check(&self) -> bool {
         let AllowedRange { place, keys: [low_key, high_key], limits, dbc, unit, input } = self;
         let origin = if *unit == "V" { "of the DBC or the cell model" } else { "of the DBC" };
@@ -393,7 +393,7 @@ impl AllowedRange<'_> {
     }
 }
 
-/// Notes limits without any voltage that the cell model has.
+/// Notes limits that exclude every voltage of the cell model.
 fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     let Limits { min, max, .. } = range.limits;
     let (low, high) = (model.voltage_min_v, model.voltage_max_v);
@@ -409,14 +409,14 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     }
 }
 
-/// Notes an initial capacity that no cell of the model can have.
+/// Notes an initial capacity that is impossible for the cell model.
 pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
-/// Notes a module's initial capacity that no cell of its model has, a rated one that is not of a cell like it, and cells of
-/// another size than the pack's own, which have `own_ah`.
+/// Notes a module's implausible initial or rated capacity, and cells of a very different size than the pack's own cells,
+/// which have `own_ah`.
 pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
@@ -448,7 +448,7 @@ fn initial_of(place: &TablePlace, initial_ah: Option<f64>, model: &CellModel) {
     }
 }
 
-/// Notes a rated capacity that is not of a cell like the model's.
+/// Notes a rated capacity that does not fit the cell model.
 pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     let Some(rated_ah) = pack.rated_capacity_ah else { return };
@@ -471,9 +471,9 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// What may be meant by a capacity of `ratio` cells.
+/// A hint what a capacity of `ratio` cells may mean.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
-    // Labels of one cell differ by less than 5 %.
+    // The stated capacities of one cell differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;
     let whole = ratio.round();
     if strings > 1 && is_about(f64::from(strings)) {

@@ -7,7 +7,7 @@ use crate::can::uds::{Answer, AnswerSignal};
 use crate::config::schema::RawTables;
 use crate::quantity::Channel;
 
-/// The answers that are read: those with a signal that an input uses.
+/// The answers to decode: those with a signal that an input uses.
 pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, LayoutFault> {
     let mut answers: Vec<Answer> = Vec::new();
     for (resolved, place) in found.iter().filter_map(|resolved| Some((resolved, resolved.answer?))) {
@@ -21,7 +21,7 @@ pub(crate) fn answers(found: &[ResolvedSignal<'_>]) -> Result<Vec<Answer>, Layou
     Ok(answers)
 }
 
-/// The requests that are sent; `None` = none. Notes what they need and do not have.
+/// The requests to send; `None` = polling is off. Notes missing requirements.
 pub(crate) fn poll(raw: &RawTables, found: &[ResolvedSignal<'_>]) -> Option<PollConfig> {
     let keys = raw.poll.as_ref().filter(|keys| keys.enabled)?;
     let mut requests: Vec<PollRequest> = Vec::new();

@@ -1,4 +1,4 @@
-//! End-to-end protection of inputs: `[[input.protected]]` to the guards of the core.
+//! End-to-end protection of inputs: builds the core's guards from `[[input.protected]]`.
 
 use super::signals::ResolvedSignal;
 use crate::can::dbc::{Message, Signal};
@@ -9,8 +9,8 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
-/// is not there is the fault of its name and not of another key.
+/// The guards of the protected messages; faults are noted. `inputs_whole`: whether every configured signal was found. If
+/// so, a message that is not found has a wrong name.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
@@ -47,8 +47,8 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
     guards
 }
 
-/// A new identity of the pack discards everything learned: its message must be protected, unless the configuration accepts
-/// another.
+/// A new pack identity puts all learned values aside, so its message must be protected unless the configuration accepts
+/// an unprotected one.
 fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
     let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =
@@ -90,7 +90,7 @@ fn check_profile(keys: &ProtectedInput) {
     }
 }
 
-/// The header must fit into the message, and no input, nor what decides whether an input is there, may lie in it.
+/// Checks that the header fits into the message and that no input, nor a multiplexor of an input, overlaps it.
 fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>]) {
     let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
     let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());

@@ -1,7 +1,7 @@
-//! Configured signal names to signals of the DBC files.
+//! Looks up the configured signal names in the DBC files.
 //!
-//! Every name must be found in exactly one of the files, every cell exactly once, and a signal longer than a
-//! classic frame only on an interface with `fd = true`. All faults are noted, none ends the search.
+//! Every name must be in exactly one of the files, and every cell must have exactly one signal. A signal of a message
+//! longer than 8 bytes requires an interface with `fd = true`. Checking continues after a fault.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,7 +21,7 @@ use crate::quantity::{BusIndex, CellIndex, Channel};
 /// Most cell numbers named in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
-/// Longest identity, bits: the whole numbers a reading represents exactly.
+/// Longest identity, bits: the largest integers that a reading represents exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
 /// The DBC files and diagnostic answers of a configuration.
@@ -40,7 +40,7 @@ pub(crate) struct NamedSignal<'d> {
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Its position, where it is in a diagnostic answer.
+    /// Its position, if it is in a diagnostic answer.
     pub answer: Option<AnswerPlace<'d>>,
 }
 
@@ -56,30 +56,30 @@ impl NamedSignal<'_> {
     }
 }
 
-/// A configured signal, found.
+/// A configured signal that was found.
 #[derive(Debug, Clone)]
 pub(crate) struct ResolvedSignal<'d> {
     /// Input that it feeds.
     pub channel: Channel,
     /// Interface that carries it.
     pub bus: BusIndex,
-    /// DBC it was found in.
+    /// DBC file or table of the answer.
     pub file: &'d str,
     /// Its message.
     pub message: &'d Message,
     /// The signal.
     pub signal: &'d Signal,
-    /// Its position, where it is in a diagnostic answer.
+    /// Its position, if it is in a diagnostic answer.
     pub answer: Option<AnswerPlace<'d>>,
-    /// Factor from the DBC's unit and sign to ours; negative when the bus counts charge positive.
+    /// Factor from the DBC's unit and sign to ours; negative if the bus counts charge positive.
     pub scale: f64,
-    /// Added after it, in our unit and sign.
+    /// Offset in our unit and sign, added after the scale.
     pub offset: f64,
     /// Raw codes that mean "not available", the configuration's and the DBC's.
     pub not_available: Vec<u64>,
 }
 
-/// Ranges and steps the DBC gives, in our units and sign; infinite where it gives none.
+/// Ranges and resolution stated by the DBC, in our units and sign; infinite if not stated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct DbcRanges {
     /// Pack current, A, positive = discharge.
@@ -88,15 +88,15 @@ pub(crate) struct DbcRanges {
     pub voltage_v: (f64, f64),
     /// Temperature, degrees C.
     pub temperature_c: (f64, f64),
-    /// Coarsest step of a cell's voltage, V; 0 where it is unknown.
+    /// Coarsest resolution of a cell's voltage, V; 0 = unknown.
     pub voltage_step_v: f64,
 }
 
-/// A range that refuses nothing.
+/// A range that accepts every value.
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the files and answers; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
+    /// Reads the files and answers; `None` if there are none or one is unusable (noted): names cannot be looked up then.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for name in raw.input.as_ref().map_or(&[][..], |input| &input.dbc) {
@@ -129,7 +129,7 @@ impl Databases {
     }
 }
 
-/// Reads one DBC, or notes why not.
+/// Reads one DBC file; `None` = it cannot be read (noted).
 pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
@@ -178,7 +178,7 @@ struct Search<'s, 'd> {
 }
 
 impl<'d> Search<'_, 'd> {
-    /// A signal with a name of its own.
+    /// Looks up one signal by name.
     fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
         let name = source.signal;
         let hits: Vec<NamedSignal<'d>> = self.databases.signals().filter(|signal| signal.is_named(name)).collect();
@@ -198,7 +198,7 @@ impl<'d> Search<'_, 'd> {
         source.place.fault("signal", &(what + &hint));
     }
 
-    /// The signals of all cells, by their pattern; `first`: the first cell's number in it.
+    /// Looks up the signals of all cells by a pattern; `first` is the first cell's number in it.
     fn cells(&mut self, source: &SignalSource<'_>, first: u16, channel: fn(CellIndex) -> Channel) {
         let Some(pack) = &self.raw.pack else { return };
         let cells = pack.cells;
@@ -243,7 +243,7 @@ impl<'d> Search<'_, 'd> {
     fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, named: NamedSignal<'d>) {
         let NamedSignal { file, message, signal, answer } = named;
         let Some(bus) = self.raw.bus_of(source.interface) else {
-            return; // an interface that is not there was noted by the cross checks
+            return; // the cross checks note unknown interfaces
         };
         let full_name = named.full_name();
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
@@ -279,7 +279,7 @@ impl<'d> Search<'_, 'd> {
     }
 }
 
-/// Name of a channel, for people (cells and sensors from 1).
+/// Name of a channel for users (cells and sensors are counted from 1).
 pub(crate) fn channel_words(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
@@ -295,7 +295,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
     }
 }
 
-/// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
+/// Notes, at the key `id` of a frame's table, an identifier that an input uses on one of these interfaces.
 pub(crate) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], found: &[ResolvedSignal<'_>]) {
     if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
         place.fault("id", format!("must not be the identifier of an input, but {} has {id}", input.message.name));
@@ -311,7 +311,7 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl ResolvedSignal<'_> {
-    /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
+    /// The signal's binding for the decoder. Its range stays open: the sample stage checks plausibility.
     pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
@@ -320,7 +320,7 @@ impl ResolvedSignal<'_> {
         Ok(binding)
     }
 
-    /// Distance of two neighbouring values, in our unit; 0 for IEEE floats.
+    /// Distance between neighbouring values, in our unit; 0 for IEEE floats.
     fn step(&self) -> f64 {
         match self.signal.layout.value_type {
             ValueType::Unsigned | ValueType::Signed => (self.signal.layout.factor * self.scale).abs(),
@@ -328,7 +328,7 @@ impl ResolvedSignal<'_> {
         }
     }
 
-    /// The DBC's range in our unit and sign; infinite when it gives none.
+    /// The DBC's range in our unit and sign; infinite if the DBC states none.
     pub(crate) fn range(&self) -> (f64, f64) {
         let layout = &self.signal.layout;
         if !layout.has_range() {
@@ -339,14 +339,14 @@ impl ResolvedSignal<'_> {
     }
 }
 
-/// The decoder's map, without the diagnostic answers; `None` when a layout cannot be read (noted when it was found).
+/// The decoder's map, without the diagnostic answers; `None` if a layout cannot be decoded (noted when it was found).
 pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();
     bindings.ok().map(InputMap::new)
 }
 
-/// The widest range the DBC gives each kind of value; a total voltage counts per cell.
+/// The widest range that the DBC states for each kind of value; a total voltage is converted to volts per cell.
 pub(crate) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
         let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(ResolvedSignal::range);

@@ -1,4 +1,4 @@
-//! The meaning of a configuration in words and numbers, for `packwatch check`.
+//! Describes the meaning of a configuration in words and numbers, for `packwatch check`.
 
 use std::path::Path;
 
@@ -19,14 +19,14 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
-/// Meaning of a good configuration.
+/// Meaning of a valid configuration.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Description {
     /// The configuration file.
     pub file: String,
-    /// What is allowed and unlikely, one line each.
+    /// Values that are allowed but unlikely, one line each.
     pub warnings: Vec<String>,
-    /// Its drop-ins, in the order in which they are merged.
+    /// Its drop-ins, in merge order.
     pub drop_ins: Vec<String>,
     /// The vehicle.
     pub vehicle: VehicleIdentity,
@@ -34,21 +34,21 @@ pub struct Description {
     pub cell: String,
     /// Assumptions about the pack, in sentences.
     pub pack: Vec<String>,
-    /// Interfaces and the identifiers the kernel is asked to let through.
+    /// Interfaces and their kernel filters.
     pub interfaces: Vec<InterfaceUse>,
-    /// Every configured signal as found in its DBC file.
+    /// Every configured signal, as found in its DBC file.
     pub signals: Vec<SignalUse>,
     /// Ranges of plausible readings.
     pub limits: Vec<String>,
-    /// Checks of a frame before it is read: limit on frames, end-to-end protection; in sentences.
+    /// Checks of a frame before it is decoded (rate limit, end-to-end protection), in sentences.
     pub intake: Vec<String>,
-    /// Frames that are sent.
+    /// The sent frames.
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
     /// The diagnostic requests that are sent, in sentences; empty = none.
     pub polling: Vec<String>,
-    /// The J1939 node and its codes, in sentences; empty = there is none.
+    /// The J1939 node and its codes, in sentences; empty = no node.
     pub j1939: Vec<String>,
 }
 
@@ -59,9 +59,9 @@ pub struct InterfaceUse {
     pub name: String,
     /// Whether FD frames are accepted.
     pub fd: bool,
-    /// Identifiers of inputs that are let through, as candump writes them.
+    /// Identifiers of inputs that pass the kernel filter, in candump notation.
     pub filter_ids: Vec<String>,
-    /// Those let through because they are this program's: no other node may send them.
+    /// The program's own identifiers, which pass the filter so that foreign senders are detected.
     pub own_ids: Vec<String>,
 }
 
@@ -72,7 +72,7 @@ pub struct SignalUse {
     pub channel: String,
     /// Interface that carries it.
     pub interface: String,
-    /// Identifier as candump writes it.
+    /// Identifier in candump notation.
     pub id: String,
     /// DBC file.
     pub dbc: String,
@@ -80,9 +80,9 @@ pub struct SignalUse {
     pub message: String,
     /// Signal name.
     pub signal: String,
-    /// Where the signal is: `Page = 3` of a multiplexed frame, `answer of 7EC to 22 01 01`; empty = in every frame.
+    /// Where the signal is: `Page = 3` in a multiplexed frame, `answer of 7EC to 22 01 01` in an answer; empty = in every frame.
     pub multiplex: String,
-    /// DBC start bit; in an answer its first bit, counted behind the echoed service and identifier.
+    /// DBC start bit; in an answer the first bit, counted after the echoed service and identifier.
     pub start_bit: usize,
     /// Length, bits.
     pub length_bits: u16,
@@ -96,15 +96,15 @@ pub struct SignalUse {
     pub offset: f64,
     /// DBC unit.
     pub unit: String,
-    /// From the DBC's unit and sign to ours (positive = discharge); negative when the bus counts charge positive.
+    /// Factor from the DBC's unit and sign to ours (positive = discharge); negative if the bus counts charge positive.
     pub scale: f64,
-    /// Added after the scale, in our unit and sign.
+    /// Offset in our unit and sign, added after the scale.
     pub added: f64,
-    /// Smallest and largest value the DBC gives, in our unit and sign.
+    /// Smallest and largest value stated by the DBC, in our unit and sign.
     pub range: Option<[f64; 2]>,
     /// Raw codes that mean "not available", hex.
     pub not_available: Vec<String>,
-    /// Cells a temperature sensor serves.
+    /// Cells served by a temperature sensor.
     pub serves: Option<String>,
 }
 
@@ -116,7 +116,7 @@ pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
     describe_with(&ConfigFiles::find(path)?, &read_file).map(|(_, description)| description)
 }
 
-/// As [`describe`], with files read by `read`, and with the configuration.
+/// Like [`describe`], but reads files with `read` and also returns the configuration.
 ///
 /// # Errors
 /// Every fault found, not only the first.
@@ -265,7 +265,7 @@ fn serves(sensor: &TemperatureInput) -> String {
     }
 }
 
-/// `1-3, 7` from rising numbers.
+/// `1-3, 7` from increasing numbers.
 fn cell_list(cells: &[u16]) -> String {
     let mut runs: Vec<(u16, u16)> = Vec::new();
     for &cell in cells {
@@ -277,7 +277,7 @@ fn cell_list(cells: &[u16]) -> String {
     runs.iter().map(|(first, last)| span(first, last)).collect::<Vec<_>>().join(", ")
 }
 
-/// `1-3`, or `7` where both ends are one.
+/// `1-3`, or `7` if both ends are equal.
 fn span<T: PartialEq + std::fmt::Display>(first: &T, last: &T) -> String {
     if first == last { format!("{first}") } else { format!("{first}-{last}") }
 }
@@ -355,7 +355,7 @@ fn amount(value: f64, unit: Unit) -> String {
     }
 }
 
-/// Without the digits a float adds to a decimal number.
+/// Removes the digits that binary floating point adds to a decimal number.
 fn round(value: f64) -> f64 {
     (value * 1e6).round() / 1e6
 }

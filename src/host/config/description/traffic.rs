@@ -1,4 +1,4 @@
-//! The frames that are received, checked, asked for and sent, in words.
+//! Describes the frames that are received, checked, requested and sent.
 
 use serde::Serialize;
 
@@ -17,7 +17,7 @@ use crate::monitor::{AlarmCode, SupplyConfig};
 pub struct OutputUse {
     /// `status`, `health`, `alarm`, `digest`, `reply`, `freshness`.
     pub frame: &'static str,
-    /// Identifier as candump writes it.
+    /// Identifier in candump notation.
     pub id: String,
     /// Interfaces.
     pub interfaces: Vec<String>,
@@ -68,7 +68,7 @@ pub fn command_words(config: &Config) -> String {
     }
 }
 
-/// Describes how frames are checked before they are read.
+/// Describes how frames are checked before they are decoded.
 pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<String> {
     let monitor = &config.monitor;
     let rate = monitor.flood.max_frames_per_s;
@@ -98,7 +98,7 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
     }
     words
 }
-/// What will be sent, in sentences.
+/// Describes what polling sends.
 pub(crate) fn polling(config: &Config) -> Vec<String> {
     let Some(poll) = &config.monitor.poll else { return Vec::new() };
     let mut words: Vec<String> = poll.requests.iter().map(|request| request_words(config, request)).collect();
@@ -129,7 +129,7 @@ fn request_words(config: &Config, request: &PollRequest) -> String {
     format!("{interface}: asks {id} for {} {}", bytes.join(" "), periods.join(", "))
 }
 
-/// Describes the node and its codes.
+/// Describes the J1939 node and its codes.
 pub(crate) fn j1939(config: &Config) -> Vec<String> {
     let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
     let interface = config.interface_name(j1939.bus);

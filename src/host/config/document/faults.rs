@@ -1,6 +1,6 @@
 //! Everything found wrong in the files of a configuration, with file and line.
 //!
-//! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`; nothing here stops at the first one.
+//! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`. Checking continues after a fault, so all faults are found.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -15,14 +15,14 @@ pub struct ConfigFaults(pub Vec<String>);
 /// A line of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SourceLine {
-    /// File as people named it.
+    /// File, as the user named it.
     pub file: String,
     /// Line, from 1; 0 = the file as a whole.
     pub line: usize,
 }
 
 impl SourceLine {
-    /// The line for a text about `other`: without the file where it is the same.
+    /// Refers to this line in a fault at `other`; the file name is left out if both are in the same file.
     pub(crate) fn beside(&self, other: &Self) -> String {
         if self.file == other.file { format!("line {}", self.line) } else { self.to_string() }
     }
@@ -37,7 +37,7 @@ impl fmt::Display for SourceLine {
     }
 }
 
-/// Faults and warnings found so far, in files of any kind; a clone notes into the same list.
+/// Faults and warnings found so far, in files of any kind. Clones share one list.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Faults(Rc<RefCell<Notes>>);
 
@@ -58,7 +58,7 @@ impl Faults {
         note(&mut self.0.borrow_mut().faults, at, text);
     }
 
-    /// Notes what is unlikely and may be meant; it does not make the configuration bad.
+    /// Notes a value that is allowed but unlikely; it does not make the configuration bad.
     fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
         note(&mut self.0.borrow_mut().warnings, at, text);
     }
@@ -68,12 +68,12 @@ impl Faults {
         self.0.borrow().faults.len()
     }
 
-    /// Whether nothing was found.
+    /// Whether there are no faults.
     pub(crate) fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The faults, one line each: the files in the order in which they first failed, each by line.
+    /// The faults, one line each. Files are in the order in which they first failed; faults of a file are sorted by line.
     pub(crate) fn lines(&self) -> ConfigFaults {
         ConfigFaults(lines(&self.0.borrow().faults))
     }
@@ -94,18 +94,18 @@ fn note(list: &mut Vec<(SourceLine, String)>, at: &SourceLine, text: impl fmt::D
 fn lines(list: &[(SourceLine, String)]) -> Vec<String> {
     let mut sorted: Vec<_> = list.iter().collect();
     sorted.sort_by_key(|(at, _)| (list.iter().position(|(first, _)| first.file == at.file), at.line));
-    // A name in the file may hold a line break; a fault is one line all the same.
+    // A name in the file may contain a line break, but a fault must stay on one line.
     sorted.iter().map(|(at, text)| format!("{at}: {text}").replace('\n', "\\n")).collect()
 }
 
-/// Place of a key and the text of its value.
+/// Position of a key and the text of its value.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct KeyPlace {
     pub at: SourceLine,
     pub found: String,
 }
 
-/// Place of a table in its file, with which a later check can name file, line, key and found.
+/// Position of a table in its file, so that later checks can name file, line, key and found value.
 #[derive(Debug, Clone)]
 pub(crate) struct TablePlace {
     /// File and line of the table's header.
@@ -123,17 +123,17 @@ impl TablePlace {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
-    /// Whether the key is written in the file.
+    /// Whether the file sets the key.
     pub(crate) fn has(&self, key: &str) -> bool {
         self.spots.contains_key(key)
     }
 
-    /// The text of a key's value, cut to one short line.
+    /// The text of a key's value, shortened to one line.
     pub(crate) fn found(&self, key: &str) -> Option<&str> {
         self.spots.get(key).map(|spot| spot.found.as_str())
     }
 
-    /// File and line of a key; of the table when the key is not written.
+    /// File and line of a key, or of its table if the key is not set.
     pub(crate) fn line_of(&self, key: &str) -> &SourceLine {
         self.spots.get(key).map_or(&self.at, |spot| &spot.at)
     }
@@ -156,12 +156,12 @@ impl TablePlace {
         }
     }
 
-    /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.
+    /// Notes `KEY: WHAT`, for values that are too long to quote.
     pub(crate) fn note(&self, key: &str, what: impl fmt::Display) {
         self.faults.add_at(self.line_of(key), format!("{}: {what}", self.key(key)));
     }
 
-    /// Notes `TABLE WHAT` about the table as a whole.
+    /// Notes `TABLE WHAT`, a fault of the whole table.
     pub(crate) fn table_fault(&self, what: impl fmt::Display) {
         self.faults.add_at(&self.at, format!("{} {what}", self.path));
     }

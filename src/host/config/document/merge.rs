@@ -1,4 +1,4 @@
-//! The TOML texts of a configuration merged, with the lines their values stand on.
+//! Parses and merges the TOML texts of a configuration, and keeps the lines of their values.
 
 use std::ops::Range;
 
@@ -8,17 +8,17 @@ use toml::de::{DeTable, DeValue};
 use super::faults::{Faults, KeyPlace, SourceLine, TablePlace};
 use super::source::{SourceFile, Sources};
 
-/// Longest piece of the file quoted in a fault, characters: enough to recognise it, short enough for one line.
+/// Longest quotation in a fault, characters: enough to recognise the text, short enough for one line.
 const MAX_QUOTE: usize = 48;
-/// Faults of syntax listed one by one; a file with more is of another kind.
+/// Most syntax faults that are listed one by one; a file with more is probably not TOML.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
-/// The tables of a configuration: of one file, or of a file and its drop-ins merged.
+/// The tables of a configuration: one file, or a file and its drop-ins merged.
 #[derive(Debug)]
 pub(crate) struct Document<'t> {
-    /// The file, as people named it; of several the one that the drop-ins belong to.
+    /// The main file, as the user named it.
     pub file: String,
-    /// Whether the syntax is broken somewhere: a missing key may then stand in the broken part.
+    /// Whether the syntax is broken somewhere. A missing key may then be in the broken part.
     pub broken: bool,
     /// Where faults are noted.
     pub faults: Faults,
@@ -27,8 +27,8 @@ pub(crate) struct Document<'t> {
 }
 
 impl<'t> Document<'t> {
-    /// Parses every file of `sources` and merges them in order. Syntax faults go to `faults`; the readable rest is kept
-    /// and checked.
+    /// Parses every file of `sources` and merges them in order. Syntax faults are noted; the readable rest is kept and
+    /// checked.
     pub(crate) fn parse(sources: &'t Sources, faults: &Faults) -> Self {
         let (mut root, mut broken) = (DeTable::new(), false);
         for source in sources.files() {
@@ -40,7 +40,7 @@ impl<'t> Document<'t> {
         Self { file: sources.main_file().to_owned(), broken, faults: faults.clone(), sources, root }
     }
 
-    /// The whole as a table.
+    /// The root table.
     pub(crate) fn root(&self) -> &DeTable<'t> {
         &self.root
     }
@@ -56,7 +56,7 @@ impl<'t> Document<'t> {
         Some(value)
     }
 
-    /// The text at a dotted path, also where another key of its table is faulty.
+    /// The string at a dotted path, even if another key of its table is faulty.
     pub(crate) fn text(&self, path: &str) -> Option<&str> {
         self.find(path)?.get_ref().as_str()
     }
@@ -71,12 +71,12 @@ impl<'t> Document<'t> {
         self.sources.line(span)
     }
 
-    /// The text at `span`, as it is written.
+    /// The source text at `span`.
     pub(crate) fn written(&self, span: &Range<usize>) -> &'t str {
         self.sources.written(span)
     }
 
-    /// The text at `span`, cut to one short line.
+    /// The source text at `span`, shortened to one line.
     pub(crate) fn quote(&self, span: &Range<usize>) -> String {
         let words: Vec<&str> = self.written(span).split_whitespace().collect();
         shorten(&words.join(" "))
@@ -88,7 +88,7 @@ impl<'t> Document<'t> {
         if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
     }
 
-    /// The place of a table: its path for people, its line, and where its keys stand.
+    /// The position of a table: its path as shown to users, its line, and the positions of its keys.
     pub(crate) fn place(&self, path: &str, at: SourceLine, table: &DeTable<'_>) -> TablePlace {
         let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
             let key: &Spanned<std::borrow::Cow<'_, str>> = key;
@@ -112,8 +112,8 @@ fn note_syntax(source: &SourceFile, errors: &[toml::de::Error], faults: &Faults)
     }
 }
 
-/// Merges `over` into `under`: tables by key, lists of tables one after the other; anything else replaces. An empty list
-/// replaces too, so that a drop-in can remove the tables before it.
+/// Merges `over` into `under`: tables are merged key by key, lists of tables are appended, any other value replaces. An
+/// empty list also replaces, so that a drop-in can remove the tables before it.
 fn merge<'t>(under: &mut DeTable<'t>, over: DeTable<'t>) {
     for (key, new) in over {
         let Some((old_key, mut old)) = under.remove_entry(&key) else {
@@ -136,13 +136,13 @@ fn merge<'t>(under: &mut DeTable<'t>, over: DeTable<'t>) {
     }
 }
 
-/// Whether a value is a list of at least one table, and of nothing else.
+/// Whether a value is a non-empty list that contains only tables.
 pub(crate) fn is_list_of_tables(value: &Spanned<DeValue<'_>>) -> bool {
     let items = value.get_ref().as_array();
     items.is_some_and(|items| !items.is_empty() && items.iter().all(|item| item.get_ref().is_table()))
 }
 
-/// `text` cut to the length of a quotation.
+/// `text`, shortened to the length of a quotation.
 pub(crate) fn shorten(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTE) {
         Some((end, _)) => format!("{}...", &text[..end]),

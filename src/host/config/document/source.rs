@@ -1,7 +1,7 @@
-//! The files a configuration is written in: the file itself and its drop-ins, and their texts.
+//! The configuration file, its drop-ins, and their texts.
 //!
-//! The drop-ins of `FILE` are the files `FILE.d/*.toml`, in the order of their names. In: paths. Out: the texts in order, in
-//! which a position stands for file and line.
+//! The drop-ins of `FILE` are the files `FILE.d/*.toml`, sorted by name. In: paths. Out: the texts in this order. A byte
+//! position in the texts identifies a file and a line.
 
 use std::ffi::OsString;
 use std::io;
@@ -10,10 +10,10 @@ use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
 
-/// Most drop-ins of one file: each changes a part of a file that has some 30 tables.
+/// Most drop-ins of one file; each changes part of a file of about 30 tables.
 const MAX_DROP_INS: usize = 100;
 
-/// Reads the bytes of a file: from the disk, or (demo, tests) from memory.
+/// Reads the bytes of a file: from disk or, in the demo and in tests, from memory.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 
 /// A configuration file and its drop-ins.
@@ -26,10 +26,10 @@ pub struct ConfigFiles {
 }
 
 impl ConfigFiles {
-    /// Finds the drop-ins of `main`: the files `main.d/*.toml` by name, without those whose name begins with a dot.
+    /// Finds the drop-ins of `main`: the files `main.d/*.toml`, sorted by name, except those whose name begins with a dot.
     ///
     /// # Errors
-    /// When the folder cannot be listed or holds too many.
+    /// When the folder cannot be listed or has too many drop-ins.
     pub fn find(main: &Path) -> Result<Self, ConfigFaults> {
         let folder = drop_in_folder(main);
         let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", folder.display())]);
@@ -51,14 +51,14 @@ impl ConfigFiles {
     }
 }
 
-/// The folder of the drop-ins: `packwatch.toml.d` beside `packwatch.toml`.
+/// The folder of the drop-ins: `packwatch.toml.d` for `packwatch.toml`.
 fn drop_in_folder(main: &Path) -> PathBuf {
     let mut name = OsString::from(main);
     name.push(".d");
     PathBuf::from(name)
 }
 
-/// The drop-ins in a folder, by name; none where there is no such folder.
+/// The drop-ins in a folder, sorted by name; none if the folder does not exist.
 fn list(folder: &Path) -> io::Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -76,19 +76,19 @@ fn list(folder: &Path) -> io::Result<Vec<PathBuf>> {
 #[derive(Debug)]
 pub(crate) struct SourceFile {
     name: String,
-    /// Position of its first byte among all texts.
+    /// Position of its first byte in the sequence of all texts.
     start: usize,
-    /// As many blanks as there are bytes before it, and the text: a position in it is one among all texts.
+    /// The text, preceded by `start` blanks, so that positions in it are positions in the sequence of all texts.
     placed: String,
 }
 
 impl SourceFile {
-    /// Name as people gave it.
+    /// Name, as the user gave it.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
 
-    /// The text to be parsed, whose positions are those among all texts.
+    /// The text to parse. Its positions are positions in the sequence of all texts.
     pub(crate) fn placed_text(&self) -> &str {
         &self.placed
     }
@@ -110,7 +110,7 @@ impl Sources {
     /// Reads all files; `None` = one of them cannot be read (noted).
     pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &Faults) -> Option<Self> {
         let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
-        // Every one is read, so that each fault is noted.
+        // Reads every file before returning, so that each fault is noted.
         let texts: Vec<_> = files.all().map(text).collect();
         Some(Self::new(texts.into_iter().collect::<Option<Vec<_>>>()?))
     }
@@ -118,7 +118,7 @@ impl Sources {
     fn new(texts: Vec<(String, String)>) -> Self {
         let (mut files, mut start) = (Vec::new(), 0);
         for (name, text) in texts {
-            // A byte order mark may only be at the very beginning, where the blanks are.
+            // A byte order mark is allowed only at the very beginning, where the blanks are.
             let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
             let placed = " ".repeat(start) + text;
             let end = placed.len();
@@ -132,7 +132,7 @@ impl Sources {
         &self.files
     }
 
-    /// Name of the first file, to which the others are drop-ins.
+    /// Name of the main file.
     pub(crate) fn main_file(&self) -> &str {
         self.files.first().map_or("", |file| &file.name)
     }
@@ -145,7 +145,7 @@ impl Sources {
         }
     }
 
-    /// The text at `span`, as it is written.
+    /// The source text at `span`.
     pub(crate) fn written(&self, span: &Range<usize>) -> &str {
         self.at(span).and_then(|file| file.placed.get(span.clone())).unwrap_or("")
     }
@@ -164,7 +164,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     std::fs::read(path)
 }
 
-/// The file as UTF-8 text, or `None` with a fault noted.
+/// The file as UTF-8 text; `None` = it cannot be read (noted).
 pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
@@ -184,7 +184,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn drop_ins_are_the_toml_files_beside_the_file_in_order_of_name() {
+    fn drop_ins_are_toml_files_sorted_by_name() {
         let folder = tempfile::tempdir().expect("a folder");
         let main = folder.path().join("pack.toml");
         assert_eq!(ConfigFiles::find(&main), Ok(ConfigFiles::alone(&main)), "no folder, no drop-ins");
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_is_none_or_holds_too_many_is_refused() {
+    fn unlistable_or_overfull_drop_in_folder_is_rejected() {
         let folder = tempfile::tempdir().expect("a folder");
         let main = folder.path().join("pack.toml");
         std::fs::write(folder.path().join("pack.toml.d"), "").expect("written");
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn a_position_stands_for_file_and_line() {
+    fn position_identifies_file_and_line() {
         let texts = [("a", "x = 1\ny = 2\n"), ("b", "\u{feff}"), ("c", "z = 3\n\nw = 4")];
         let sources = Sources::new(texts.map(|(name, text)| (name.to_owned(), text.to_owned())).into());
         for (written, line) in [("y = 2", "a:2"), ("z", "c:1"), ("w = 4", "c:3")] {

@@ -1,4 +1,4 @@
-//! The merged tables of a configuration as one TOML text, for people: each part with the file and line it comes from.
+//! The merged tables of a configuration as one TOML text for readers, each part with its file and line.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -10,19 +10,19 @@ use super::faults::{ConfigFaults, Faults};
 use super::merge::{Document, is_list_of_tables};
 use super::source::{ConfigFiles, ReadFile, Sources, read_file};
 
-/// The configuration file and its drop-ins as one TOML text, each part with the file and line it comes from. Keys and
-/// values are not checked.
+/// The configuration file and its drop-ins as one TOML text, each part with its file and line. Keys and values are not
+/// checked.
 ///
 /// # Errors
-/// When a file cannot be read or is no TOML: every such fault.
+/// When a file cannot be read or is not TOML: every such fault.
 pub fn merged(path: &Path) -> Result<String, ConfigFaults> {
     merged_with(&ConfigFiles::find(path)?, &read_file)
 }
 
-/// As [`merged`], with files read by `read`.
+/// Like [`merged`], but reads files with `read`.
 ///
 /// # Errors
-/// When a file cannot be read or is no TOML: every such fault.
+/// When a file cannot be read or is not TOML: every such fault.
 pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, ConfigFaults> {
     let faults = Faults::default();
     let sources = Sources::read(files, read, &faults);
@@ -30,7 +30,7 @@ pub fn merged_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<String, Co
     text.filter(|_| faults.is_empty()).ok_or_else(|| faults.lines())
 }
 
-/// The text, in the order of the files. Reading it gives the same tables.
+/// The text, in the order of the files. Parsing it gives the same tables.
 fn text(document: &Document<'_>) -> String {
     let mut page = String::new();
     table(document, "", document.root(), &mut page);
@@ -40,7 +40,7 @@ fn text(document: &Document<'_>) -> String {
 fn table(document: &Document<'_>, path: &str, table: &DeTable<'_>, page: &mut String) {
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(key, _)| key.span().start);
-    // Behind the header of another table they would belong to that one.
+    // Values come first: after the header of a subtable they would belong to that subtable.
     let (tables, values): (Vec<_>, Vec<_>) = entries.into_iter().partition(|(_, value)| has_header(document, value));
     for (key, value) in values {
         let (name, text) = (document.written(&key.span()), document.written(&value.span()));
@@ -67,12 +67,12 @@ fn tables_at(document: &Document<'_>, path: &str, value: &Spanned<DeValue<'_>>, 
     }
 }
 
-/// Whether a value is shown below a header: tables are, except those that stand whole in one line.
+/// Whether a value gets a header: all tables do, except inline tables.
 fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
 }
 
-/// Whether a value is written as a value, `{ ... }` or `[ ... ]`, and no other file adds to it.
+/// Whether a value is written inline, `{ ... }` or `[ ... ]`, and no other file adds to it.
 fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     let (span, written) = (value.span(), document.written(&value.span()));
     let is_within = |part: std::ops::Range<usize>| span.start <= part.start && part.end <= span.end;
@@ -93,7 +93,7 @@ mod tests {
 
     use crate::config::{ConfigFiles, merged_with};
 
-    /// The merged text of these files, the first of which the others are drop-ins of.
+    /// The merged text of these files; the first is the main file, the others are its drop-ins.
     fn merged(texts: &[(&str, &str)]) -> String {
         let texts: BTreeMap<PathBuf, &str> = texts.iter().map(|(name, text)| (PathBuf::from(name), *text)).collect();
         let mut names = texts.keys().cloned();
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn tables_are_merged_keys_replace_lists_of_tables_are_appended() {
+    fn tables_merge_keys_replace_lists_append() {
         let page = merged(&[
             ("a", "top = 1\n[pack]\ncells = 4 # as built\nlist = [1, 2]\n[[alarm]]\nrule = \"x\"\n"),
             ("b", "pack.cells = 5\npack.strings = 2\n[[alarm]]\nrule = \"y\"\nwarning = { set = 1,\n clear = 2 }\n"),
@@ -116,14 +116,14 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_list_removes_the_tables_before_it() {
+    fn empty_list_removes_earlier_tables() {
         let page =
             merged(&[("a", "[[alarm]]\nrule = \"x\"\n"), ("b", "alarm = []\n"), ("c", "[[alarm]]\nrule = \"y\"\n")]);
         assert_eq!(page.parse::<toml::Table>(), "[[alarm]]\nrule = \"y\"\n".parse());
     }
 
     #[test]
-    fn the_page_reads_as_the_tables_it_shows() {
+    fn merged_text_parses_to_same_tables() {
         let one = "t = { x = 1, y = { z = 2 } }\nl = [{ a = 1 }, { a = 2 }]\n[deep.er]\ns = \"\"\"\nmany # no comment\n\"\"\"\n\
                    [[deep.list]]\nk = 1\n[[deep.list.below]]\nm = [\n 1, # one\n 2,\n]\n";
         assert_eq!(merged(&[("a", one)]).parse::<toml::Table>(), one.parse());
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shipped_configuration_is_what_it_was() {
+    fn shipped_configuration_is_unchanged_by_merging() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/example.toml");
         let text = std::fs::read_to_string(&path).expect("shipped");
         assert_eq!(merged(&[("example.toml", &text)]).parse::<toml::Table>(), text.parse());

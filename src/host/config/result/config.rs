@@ -9,7 +9,7 @@ use crate::config::cell_model::ModelSource;
 use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 
-/// A configuration that cannot be wrong.
+/// A checked configuration.
 #[derive(Debug, Clone)]
 pub struct Config {
     /// The configuration file.
@@ -18,17 +18,17 @@ pub struct Config {
     pub interfaces: Vec<InterfaceConfig>,
     /// Settings of the core.
     pub monitor: MonitorConfig,
-    /// Where the cell model in them comes from.
+    /// The origin of the cell model in these settings.
     pub model_source: ModelSource,
     /// Layout of the sent frames, for receivers; `None` = nothing is sent.
     pub output_layout: Option<Database>,
     /// How state and history are kept.
     pub store: StoreConfig,
-    /// What is allowed and unlikely, one line each, in the form of the faults.
+    /// Values that are allowed but unlikely, one line each, formatted like faults.
     pub warnings: Vec<String>,
-    /// Which vehicle and pack this is.
+    /// The vehicle and pack.
     pub vehicle: VehicleIdentity,
-    /// Where the key of authenticated frames is; `None` = no frame is authenticated.
+    /// Location of the key for authenticated frames; `None` = no frame is authenticated.
     pub key: Option<KeySource>,
 }
 
@@ -38,7 +38,7 @@ impl Config {
         self.interfaces.get(bus.index()).map_or("?", |interface| &interface.name)
     }
 
-    /// Names of the interfaces, in the order in which they are numbered.
+    /// Names of the interfaces in the order of their numbers.
     pub fn interface_names(&self) -> Vec<String> {
         self.interfaces.iter().map(|interface| interface.name.clone()).collect()
     }
@@ -47,11 +47,11 @@ impl Config {
 /// How state and history are kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoreConfig {
-    /// Least period of the state's checkpoints, s.
+    /// Shortest time between checkpoints of the state, s.
     pub checkpoint_s: f64,
-    /// Rows of the history kept; beyond, the oldest segments are deleted.
+    /// Most rows kept in the history; above this number the oldest segments are deleted.
     pub max_rows: u32,
-    /// Rows older than this are deleted, years; `None` = whatever their age, they are kept.
+    /// Longest age of rows, years; `None` = unlimited.
     pub keep_years: Option<f64>,
 }
 

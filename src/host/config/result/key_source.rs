@@ -1,14 +1,14 @@
-//! Where the key of authenticated frames is: `[authentication]`.
+//! The location of the key for authenticated frames: `[authentication]`.
 
 use std::path::{Path, PathBuf};
 
 use crate::config::document::beside;
 use crate::config::schema::RawTables;
 
-/// Where the key of authenticated frames is.
+/// Location of the key for authenticated frames.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum KeySource {
-    /// The credential of this name that the service manager passes.
+    /// Name of a credential passed by the service manager.
     Credential(String),
     /// A file.
     File(PathBuf),
@@ -23,7 +23,7 @@ impl std::fmt::Display for KeySource {
     }
 }
 
-/// Where the key of authenticated frames is; `None` = no frame is authenticated, or faults are noted.
+/// Location of the key for authenticated frames; `None` = no frame is authenticated, or faults are noted.
 pub(crate) fn key_source(raw: &RawTables, config: &Path, has_authenticated: bool) -> Option<KeySource> {
     let keys = raw.authentication.as_ref()?;
     match (&keys.credential, &keys.key_file) {

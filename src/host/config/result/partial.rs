@@ -13,9 +13,9 @@ use crate::config::schema::RawTables;
 /// The readable part of a configuration.
 #[derive(Debug)]
 pub(crate) struct PartialConfig {
-    /// The whole, when it is good.
+    /// The whole configuration, if it has no faults.
     pub config: Option<Config>,
-    /// Every fault; empty when it is good.
+    /// Every fault; empty if there are none.
     pub faults: Vec<String>,
     /// The tables of the file and its drop-ins.
     pub raw: RawTables,

@@ -1,4 +1,4 @@
-//! The steps from the files of a configuration to the checked [`Config`].
+//! The steps that turn the files of a configuration into the checked [`Config`].
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use crate::config::checks::{Databases, ResolvedSignal, cells, cross, input_table
 use crate::config::document::{ConfigFaults, ConfigFiles, Document, Faults, ReadFile, Sources, read_file};
 use crate::config::schema::RawTables;
 
-/// Reads and checks a configuration, its drop-ins and everything they name (DBC files, cell model; paths are relative to
+/// Reads and checks a configuration, its drop-ins and the files they name (DBC files, cell models; paths are relative to
 /// the configuration file).
 ///
 /// # Errors
@@ -19,7 +19,7 @@ pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
     load_with(&ConfigFiles::find(path)?, &read_file)
 }
 
-/// As [`load`], with files read by `read`.
+/// Like [`load`], but reads files with `read`.
 ///
 /// # Errors
 /// Every fault found, not only the first.
@@ -27,7 +27,7 @@ pub fn load_with(files: &ConfigFiles, read: ReadFile<'_>) -> Result<Config, Conf
     read_and(files, read, |_, _, _| ()).map(|(config, ())| config)
 }
 
-/// As [`load_with`], with what `then` makes of the tables, the configuration and the signals found for it.
+/// Like [`load_with`], and also returns the result of `then` for the tables, the configuration and the signals found.
 ///
 /// # Errors
 /// Every fault found, not only the first.
@@ -39,7 +39,7 @@ pub(crate) fn read_and<T>(
     let faults = Faults::default();
     match read_config(files, read, &faults, then) {
         Some(good) if faults.is_empty() => Ok(good),
-        // A part that cannot be made and has no fault is an error of this program, which is reported too.
+        // If a part is missing without a fault, packwatch itself has a bug; that must not be silent.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", files.main.display())])),
         _ => Err(faults.lines()),
     }

@@ -1,10 +1,10 @@
-//! Which vehicle and which of its packs this is: `[vehicle]`.
+//! The vehicle and the pack: `[vehicle]`.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The vehicle and the pack as their users name them. `None` = not stated.
+/// The vehicle and the pack, as their users name them. `None` = not given.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct VehicleIdentity {
     /// Name of the vehicle.
@@ -19,19 +19,19 @@ pub struct VehicleIdentity {
 }
 
 impl VehicleIdentity {
-    /// Whether anything is stated.
+    /// Whether anything is given.
     pub fn is_stated(&self) -> bool {
         *self != Self::default()
     }
 
-    /// What is stated: `name`, `id`, `pack` and their texts.
+    /// The given fields: `name`, `id`, `pack` and their texts.
     pub fn labels(&self) -> Vec<(&'static str, String)> {
         let all = [("name", &self.name), ("id", &self.id), ("pack", &self.pack)];
         all.into_iter().filter_map(|(key, text)| Some((key, text.clone()?))).collect()
     }
 }
 
-/// `Bus 12 (WDB9634031L123456), pack front`; empty when nothing is stated.
+/// `Bus 12 (WDB9634031L123456), pack front`; empty if nothing is given.
 impl fmt::Display for VehicleIdentity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let vehicle = match (&self.name, &self.id) {
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_stated_is_shown_in_one_line() {
+    fn given_fields_are_shown_on_one_line() {
         let text = |text: &str| (!text.is_empty()).then(|| text.to_owned());
         let shown = |name, id, pack| VehicleIdentity { name: text(name), id: text(id), pack: text(pack) }.to_string();
         assert_eq!(shown("Bus 12", "WDB1", "front"), "Bus 12 (WDB1), pack front");
