@@ -1,6 +1,6 @@
-//! Reads files that the settings name: settings, passwords, tokens, certificates.
+//! Reads files named by the settings: settings, passwords, tokens, certificates.
 //!
-//! Promises: nothing but a file of bounded size is read. A pipe or a device, which would hold up the program or never end, is a fault.
+//! Reads only regular files of bounded size. A pipe or a device, which could block the program, is an error.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -8,18 +8,18 @@ use std::path::{Path, PathBuf};
 
 /// Folder of the unit's credentials (`LoadCredential=`).
 const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
-/// Longest file, bytes: a hundred times what a person writes, and ten times the certificates of all authorities.
+/// Largest file, bytes: ten times the certificates of all public authorities.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// Reads a file.
 ///
 /// # Errors
-/// With its name: when it is none, cannot be read, or is too long.
+/// Not a regular file, unreadable, or too long; the message names the file.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     let at = path.display();
     let fault = |error: std::io::Error| format!("{at}: {error}");
     if !std::fs::metadata(path).map_err(fault)?.is_file() {
-        return Err(format!("{at}: must be a file"));
+        return Err(format!("{at}: must be a regular file"));
     }
     let mut bytes = Vec::new();
     File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes)).map_err(fault)?;
@@ -29,7 +29,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Reads a secret or a certificate; a relative path is below the unit's credentials, if there are any.
+/// Reads a secret or a certificate. A relative path is relative to the unit's credentials folder, if it has one.
 ///
 /// # Errors
 /// As [`read`].
@@ -43,14 +43,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_files_of_bounded_size_are_read() {
+    fn pipe_folder_missing_and_long_file_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let fault = |path: &Path| read(path).unwrap_err();
         for endless in ["/dev/zero", "/dev/tty", "/dev/stdin"] {
             let fault = fault(Path::new(endless));
-            assert!(fault.contains("must be a file") || fault.contains("os error"), "{fault}");
+            assert!(fault.contains("must be a regular file") || fault.contains("os error"), "{fault}");
         }
-        assert!(fault(folder.path()).ends_with("must be a file"));
+        assert!(fault(folder.path()).ends_with("must be a regular file"));
         assert!(fault(&folder.path().join("gone")).ends_with("(os error 2)"));
         let long = folder.path().join("long");
         std::fs::write(&long, vec![b'#'; 1 + (1 << 20)]).unwrap();

@@ -1,19 +1,20 @@
-//! `kuksa`: provides the daemon's values to a KUKSA databroker (protocol `kuksa.val.v2`), for ever.
+//! `kuksa`: provides the daemon's values to a KUKSA databroker (protocol `kuksa.val.v2`) until stopped.
 //!
-//! In: settings, documents of the daemon. Out: values in the databroker, one batch a second. A broker that is gone is tried again, with
-//! pauses from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`]; meanwhile documents are dropped, never queued. `SIGTERM` withdraws the values.
+//! Input: settings, documents of the daemon. Output: values in the databroker, one batch a second. After a lost connection it
+//! reconnects, with pauses from [`FIRST_PAUSE`] to [`LONGEST_PAUSE`]; documents received without a connection are dropped, never
+//! queued. `SIGTERM` withdraws the values.
 //!
 //! | module | what lives there |
 //! | --- | --- |
 //! | `settings` | the table `[kuksa]` |
-//! | `signals` | paths, datatypes and units; how each value follows from a document |
+//! | `signals` | paths, datatypes and units; derivation of each value from a document |
 //! | `value` | datatypes, limits |
 //! | `messages` | the protocol |
-//! | `routes` | ids of one connection |
-//! | `outgoing` | what waits to be sent: the newest only |
-//! | `questions` | values that the broker asks for, and when not to answer |
+//! | `routes` | signal ids of one connection |
+//! | `outgoing` | pending messages; only the newest batch is kept |
+//! | `questions` | requests of the broker for values, and when not to answer |
 //! | `session` | one connection |
-//! | `journal` | counts and log lines |
+//! | `journal` | counters and log lines |
 
 mod journal;
 mod messages;
@@ -36,15 +37,15 @@ use crate::status_stream;
 use crate::{Failure, Options};
 use journal::Journal;
 
-/// Pause after the first failure; it doubles with each further one.
+/// Pause after the first failure; doubles with each further failure.
 pub(crate) const FIRST_PAUSE: Duration = Duration::from_millis(500);
-/// Longest pause: a broker that is back is used within ten seconds.
+/// Longest pause, so that a restarted broker is used within ten seconds.
 pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
-/// Runs the command until it is asked to stop.
+/// Runs the command until it is stopped.
 ///
 /// # Errors
-/// When the settings are not usable, or the runtime cannot be started.
+/// The settings are invalid, or the runtime cannot be started.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
@@ -59,7 +60,7 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     let (mut pause, mut latest_error) = (FIRST_PAUSE, String::new());
     loop {
         let connections = journal.counts.connections;
-        // The first batch of a connection is for the document that is there, or says that there is none.
+        // Publish the present document, or its absence, with the first batch of a connection.
         documents.mark_changed();
         let Err(error) = session::run(&settings.kuksa, &mut documents, &mut stop, &mut journal).await else { break };
         let was_connected = journal.counts.connections > connections;
@@ -80,7 +81,7 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Becomes true with `SIGTERM` or `SIGINT`.
+/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first.
 fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (sender, receiver) = watch::channel(false);
@@ -90,7 +91,7 @@ fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
             _ = interrupt.recv() => {}
         }
         sender.send_replace(true);
-        // Without a sender every wait would end.
+        // Keep the sender alive: without it every wait would end.
         sender.closed().await;
     });
     Ok(receiver)

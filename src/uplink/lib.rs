@@ -1,17 +1,16 @@
-//! What the daemon knows, for other software of the vehicle and outside: MQTT brokers (`mqtt`) and KUKSA (`kuksa`).
+//! Sends the daemon's status to other software in and outside the vehicle: MQTT brokers (`mqtt`) and KUKSA databrokers (`kuksa`).
 //!
-//! A program of its own, which reads the daemon's status stream like the exporter: a broker that is slow, gone or hostile does
-//! not delay an estimate, and the vehicle program has no network library. `packwatch mqtt`, `packwatch kuksa` and
-//! `packwatch vss` start it.
+//! A separate program that reads the daemon's status stream, like the exporter. So a slow, missing or hostile broker does not delay an
+//! estimate, and the vehicle program has no network library. `packwatch mqtt`, `packwatch kuksa` and `packwatch vss` start it.
 //!
 //! | module | what lives there |
 //! | --- | --- |
-//! | `files` | files that the settings name, read within bounds |
+//! | `files` | bounded reads of files named by the settings |
 //! | `kuksa` | provider of a KUKSA databroker |
 //! | `mqtt` | the MQTT broker: current values, discovery, the queue for a lost link |
-//! | `options` | options of the commands that run for ever |
-//! | `settings` | the file of `-c`: TOML to checked settings |
-//! | `status_stream` | documents of the daemon, one a second; `None` while there is none |
+//! | `options` | options of the commands that run until stopped |
+//! | `settings` | the settings file (`-c`): TOML to validated settings |
+//! | `status_stream` | documents of the daemon, one a second; `None` while there are none |
 //! | `vss` | the overlay of the vehicle signal specification |
 
 mod files;

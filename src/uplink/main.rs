@@ -1,12 +1,12 @@
 //! The binary: parse, dispatch, exit code.
-#![expect(clippy::print_stderr, reason = "talking to the terminal is this program's work")]
+#![expect(clippy::print_stderr, reason = "this program writes to the terminal")]
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use packwatch_uplink::{Options, kuksa, mqtt, vss};
 
-/// What packwatch knows, for other software.
+/// Send the status of the packwatch daemon to MQTT brokers and KUKSA databrokers.
 #[derive(Debug, Parser)]
 #[command(name = "packwatch-uplink", version, about, propagate_version = true)]
 struct Cli {
@@ -20,7 +20,7 @@ enum Command {
     Mqtt(Options),
     /// Provide the status of the running daemon to a KUKSA databroker
     Kuksa(Options),
-    /// Write the overlay of the vehicle signal specification for KUKSA
+    /// Write the overlay of the Vehicle Signal Specification (VSS) for KUKSA
     Vss(vss::Args),
 }
 

@@ -1,4 +1,4 @@
-//! The options that the commands which run for ever share.
+//! Options shared by the commands that run until stopped.
 
 use std::path::PathBuf;
 
@@ -10,19 +10,19 @@ use crate::settings::Settings;
 /// Options of `mqtt` and `kuksa`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// Settings of the uplink
+    /// Settings file of the uplink
     #[arg(short, long, value_name = "FILE", default_value = "/etc/packwatch/uplink.toml")]
     pub(crate) config: PathBuf,
-    /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
+    /// Log level or filter: error, warn, info, debug, trace [default: $PACKWATCH_LOG, else info]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
 }
 
 impl Options {
-    /// Starts the log and reads the settings.
+    /// Starts logging and reads the settings.
     ///
     /// # Errors
-    /// When the filter of the log or the settings cannot be read.
+    /// The log filter or the settings are invalid.
     pub(crate) fn start(&self) -> Result<Settings, Failure> {
         logging::start(self.log.as_deref()).map_err(Failure::new)?;
         Settings::read(&self.config).map_err(Failure::config)

@@ -1,7 +1,7 @@
-//! The uplink's settings: one TOML file, apart from the daemon's configuration, so that another broker changes neither the
-//! daemon nor the digest of its configuration.
+//! The uplink's settings: a TOML file separate from the daemon's configuration, so that changing the broker changes neither the daemon
+//! nor the hash of its configuration.
 //!
-//! In: the file of `-c`. Out: checked settings. A fault names file, key and what is allowed, and the line where one key alone is wrong.
+//! Input: the file of `-c`. Output: validated settings. An error names file, key and allowed values, and for a single key its line.
 
 use std::path::{Path, PathBuf};
 
@@ -12,13 +12,13 @@ use crate::files;
 use crate::kuksa::settings::KuksaSettings;
 use crate::mqtt::settings::MqttSettings;
 
-/// What the file may hold.
+/// Contents of the file.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Where the daemon's status comes from.
+    /// Source of the daemon's status.
     pub status: StatusSettings,
-    /// The MQTT broker; `None` = `packwatch mqtt` has nothing to do.
+    /// The MQTT broker; `None` = `packwatch mqtt` cannot run.
     pub mqtt: Option<MqttSettings>,
     /// The KUKSA databroker.
     pub kuksa: KuksaSettings,
@@ -42,7 +42,7 @@ impl Settings {
     /// Reads the file at `path`.
     ///
     /// # Errors
-    /// When it cannot be read, or with file, line and reason what is wrong in it.
+    /// The file cannot be read, or is invalid; the message names file, line and reason.
     pub fn read(path: &Path) -> Result<Self, String> {
         let at = path.display();
         let text = String::from_utf8(files::read(path)?).map_err(|error| format!("{at}: {error}"))?;
@@ -52,14 +52,14 @@ impl Settings {
         Ok(settings)
     }
 
-    /// Parses the text of a file; a fault begins with its line.
+    /// Parses the text of a file; an error begins with its line.
     fn parse(text: &str) -> Result<Self, String> {
         toml::from_str(text).map_err(|error| {
             let start = error.span().map_or(0, |span| span.start);
             let line = 1 + text.as_bytes().iter().take(start).filter(|byte| **byte == b'\n').count();
             let found = text.lines().nth(line - 1).unwrap_or_default().trim();
             let message = error.message().replace('\n', ", ");
-            // A value outside its range: the line shows its key and what was found.
+            // A value outside its range: the line shows the key and the value found.
             if message.starts_with("must ") {
                 format!("{line}: {found}, {message}")
             } else {
@@ -74,12 +74,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_empty_file_is_the_standard_daemon() {
+    fn empty_file_gives_defaults() {
         assert_eq!(Settings::parse("").unwrap(), Settings::default());
     }
 
     #[test]
-    fn a_value_outside_its_range_is_shown_with_its_key() {
+    fn fault_shows_key_and_value() {
         let fault = |text: &str| Settings::parse(text).unwrap_err();
         assert_eq!(fault("[mqtt]\nperiod_s = 0\n"), "2: period_s = 0, must be 1 to 3600");
         assert_eq!(fault("[mqtt.history]\nmax_bytes = -1"), "2: max_bytes = -1, must be 100000 to 100000000000");
@@ -88,11 +88,11 @@ mod tests {
     }
 
     #[test]
-    fn the_example_shows_every_key_with_its_default() {
+    fn example_lists_every_key_with_default() {
         let example = include_str!("../../config/uplink.toml");
         let shown = Settings { mqtt: Some(MqttSettings::default()), ..Settings::default() };
         assert_eq!(Settings::parse(example).unwrap(), shown);
-        // The keys that are comments exist too.
+        // Commented keys must exist too.
         let is_key =
             |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
         let uncomment = |line| match str::strip_prefix(line, "# ") {
@@ -100,7 +100,7 @@ mod tests {
             _ => line,
         };
         let all: Vec<&str> = example.lines().map(uncomment).collect();
-        // A certificate is for an encrypted connection only.
+        // Certificates are allowed on encrypted connections only.
         let Settings { mqtt, kuksa, .. } = Settings::parse(&all.join("\n").replace("http://", "https://")).unwrap();
         let mqtt = mqtt.unwrap();
         assert!(kuksa.ca_file.is_some() && kuksa.server_name.is_some() && kuksa.token_file.is_some());
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_its_line_and_what_is_allowed() {
+    fn fault_names_line_and_allowed_keys() {
         let fault = Settings::parse("[status]\nsocket = \"/run/a.sock\"\nsokcet = 1\n").unwrap_err();
         assert_eq!(fault, "3: unknown field `sokcet`, expected `socket`");
         let file = tempfile::NamedTempFile::new().unwrap();

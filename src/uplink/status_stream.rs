@@ -1,8 +1,8 @@
 //! The daemon's status, one document a second.
 //!
-//! In: the daemon's stream socket. Out: [`StatusDocument`]s, and `None` once when the daemon stops sending: nothing for
-//! [`SILENCE`], the end of the stream, or a document that this program cannot read. Connects again every [`RETRY`], for ever.
-//! A reader that is slower than the daemon gets the newest document; older ones are dropped, never queued.
+//! Input: the daemon's stream socket. Output: [`StatusDocument`]s, and `None` once when the daemon stops sending: nothing for
+//! [`SILENCE`], the end of the stream, or an unreadable document. Reconnects every [`RETRY`] until stopped. A reader slower than the
+//! daemon gets the newest document; older ones are dropped.
 
 use std::io;
 use std::path::Path;
@@ -16,15 +16,15 @@ use tokio::net::UnixStream;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-/// Longest time without a document before the daemon counts as silent: the daemon itself serves none older than 3 s.
+/// Longest time without a document before the daemon counts as silent. The daemon itself sends none older than 3 s.
 pub const SILENCE: Duration = Duration::from_secs(5);
-/// Pause before the next attempt to connect.
+/// Pause before reconnecting.
 pub const RETRY: Duration = Duration::from_secs(1);
 
-/// The newest document, as a value that changes; `None` = the daemon is silent.
+/// The newest document, as a watched value; `None` = the daemon is silent.
 pub type Documents = watch::Receiver<Option<Box<StatusDocument>>>;
 
-/// Reads the stream next to the status socket `socket`, in a task of the current runtime, until the last receiver is dropped.
+/// Reads the stream next to the status socket `socket` in a task of the current runtime, until the last receiver is dropped.
 pub fn follow(socket: &Path) -> Documents {
     let (sender, receiver) = watch::channel(None);
     let path = stream_path(socket);
@@ -53,7 +53,7 @@ async fn read_for_ever(path: &Path, sender: &watch::Sender<Option<Box<StatusDocu
     }
 }
 
-/// Reads one connection until its end.
+/// Reads one connection until it ends.
 async fn read(
     path: &Path,
     sender: &watch::Sender<Option<Box<StatusDocument>>>,

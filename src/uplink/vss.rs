@@ -1,8 +1,8 @@
-//! `vss`: writes the overlay of the vehicle signal specification: the signals that VSS does not have.
+//! `vss`: writes the overlay of the Vehicle Signal Specification (VSS): the signals that VSS does not have.
 //!
-//! In: the settings' branch. Out: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and `packwatch.json`,
-//! which a databroker reads beside VSS's own file (`--vss vss.json,packwatch.json`). `--reference` prints every signal as Markdown:
-//! the manual's page.
+//! Input: the settings' branch. Output: `packwatch.vspec`, which vss-tools merge into VSS (`vspec export json -l`), and
+//! `packwatch.json`, which a databroker reads in addition to VSS's own file (`--vss vss.json,packwatch.json`). `--reference` prints
+//! every signal as Markdown, for the manual.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -16,19 +16,19 @@ use crate::kuksa::settings::KuksaSettings;
 use crate::kuksa::signals::{self, Origin, STANDARD_BRANCH, Signal};
 use crate::settings::Settings;
 
-/// Name of both files, before the ending.
+/// Name of both files without extension.
 const FILE_NAME: &str = "packwatch";
 
 /// Arguments of `vss`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Settings of the uplink
+    /// Settings file of the uplink
     #[arg(short, long, value_name = "FILE", required_unless_present = "reference")]
     config: Option<PathBuf>,
-    /// Folder for packwatch.vspec and packwatch.json
+    /// Folder to write packwatch.vspec and packwatch.json to
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
-    /// Print every signal, those of VSS too, as a page of the manual, and write no file
+    /// Print all signals, including those of VSS, as a page of the manual; write no files
     #[arg(long)]
     reference: bool,
 }
@@ -36,7 +36,7 @@ pub struct Args {
 /// Runs the command.
 ///
 /// # Errors
-/// When the settings are not usable, or a file cannot be written.
+/// The settings are invalid, or a file cannot be written.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let Some(config) = args.config.as_ref().filter(|_| !args.reference) else {
         return std::io::stdout()
@@ -51,7 +51,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What the branches below the configured one hold.
+/// Description of a branch below the configured one.
 fn description(branch: &str) -> &'static str {
     match branch {
         "Alarms" => "Alarms.",
@@ -71,7 +71,7 @@ fn description(branch: &str) -> &'static str {
     }
 }
 
-/// Branches that the overlay must define, parents first, with their descriptions.
+/// Branches that the overlay must define, parents first, with descriptions.
 fn branches(branch: &str) -> Vec<(String, &'static str)> {
     let is_known = |path: &str| STANDARD_BRANCH == path || STANDARD_BRANCH.starts_with(&format!("{path}."));
     let parents = branch.match_indices('.').map(|(end, _)| &branch[..end]);
@@ -81,7 +81,7 @@ fn branches(branch: &str) -> Vec<(String, &'static str)> {
     own.chain(inner.into_iter().map(|name| (format!("{branch}.{name}"), description(name)))).collect()
 }
 
-/// The overlay as vspec: YAML with full paths. A text in JSON's quotes is one of YAML too.
+/// The overlay as vspec: YAML with full paths. JSON strings are valid YAML strings.
 fn vspec(branch: &str) -> String {
     let mut text = format!("# Overlay of packwatch {}, written by \"packwatch vss\".\n", env!("CARGO_PKG_VERSION"));
     for (path, description) in branches(branch) {
@@ -101,7 +101,7 @@ fn comment(signal: &Signal) -> String {
     format!("Of packwatch's status document: {}.", signal.fields)
 }
 
-/// The overlay as the databroker reads it: a tree from `Vehicle` down.
+/// The overlay as the databroker reads it: a tree starting at `Vehicle`.
 fn json_text(branch: &str) -> String {
     let mut root = Map::new();
     for (path, description) in branches(branch) {
@@ -126,7 +126,7 @@ fn leaf(signal: &Signal) -> Value {
     leaf
 }
 
-/// The place of `path` in the tree; branches of VSS itself are made on the way.
+/// Returns the node of `path` in the tree; creates missing VSS branches.
 fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
     match path.rsplit_once('.') {
         None => {
@@ -142,7 +142,7 @@ fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
     }
 }
 
-/// The page: a table of VSS's signals and one of the overlay's.
+/// The manual page: a table of VSS signals and one of overlay signals.
 fn reference() -> String {
     let mut page = "# VSS signals\n\nA page of `packwatch vss --reference`: the signals beside those of the [quantities](quantities.md). A signal has no value while the daemon is silent, while one of its fields \
                     in the [status document](status.md) is unknown, or where a column says so. Cells count from 0; an array has a value only \

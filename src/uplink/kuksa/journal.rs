@@ -1,10 +1,10 @@
-//! What is counted and logged: changes once, counts at the end of each connection.
+//! Counters and log lines: logs changes once, and the counters at the end of each connection.
 
 use std::collections::HashSet;
 
 use super::routes::{Points, Skipped};
 
-/// Most reasons that are remembered as logged: all signals, with a few reasons each. A broker that invents more is not logged further.
+/// Most reasons remembered as logged: all signals with a few reasons each. Further reasons from a broker are not logged.
 const MAX_LOGGED: usize = 1000;
 
 /// Counts since the start of the program.
@@ -12,19 +12,19 @@ const MAX_LOGGED: usize = 1000;
 pub(crate) struct Counts {
     /// Connections whose claim was accepted.
     pub(crate) connections: u64,
-    /// Batches made.
+    /// Batches published.
     pub(crate) batches: u64,
-    /// Signals that a connection did not provide, over all connections.
+    /// Signals skipped, summed over all connections.
     pub(crate) skipped: u64,
-    /// Values withheld because they were outside the broker's limits.
+    /// Values withheld because they exceed the broker's limits.
     pub(crate) withheld: u64,
     /// Values rejected by the broker.
     pub(crate) rejected: u64,
-    /// Questions of the broker without an answer.
+    /// Requests of the broker that were not answered.
     pub(crate) unanswered: u64,
 }
 
-/// Counts, and what was logged.
+/// Counters, and the reasons already logged.
 #[derive(Debug, Default)]
 pub(crate) struct Journal {
     pub(crate) counts: Counts,
@@ -36,7 +36,7 @@ pub(crate) struct Journal {
 impl Journal {
     pub(crate) fn note_connected(&mut self, address: &str, signals: usize) {
         self.counts.connections += 1;
-        tracing::info!(address, signals, "the databroker takes values");
+        tracing::info!(address, signals, "providing values to the databroker");
     }
 
     pub(crate) fn note_skipped(&mut self, skipped: Vec<Skipped>) {
@@ -53,7 +53,7 @@ impl Journal {
         let outside: HashSet<_> = points.withheld.iter().copied().collect();
         self.counts.withheld += u64::try_from(outside.len()).unwrap_or_default();
         for signal in outside.difference(&self.outside) {
-            tracing::warn!(signal, "value outside the databroker's limits: sent as no value");
+            tracing::warn!(signal, "value outside the databroker's limits: sent as unknown");
         }
         self.outside = outside;
     }
@@ -72,7 +72,15 @@ impl Journal {
     /// Logs the counts.
     pub(crate) fn summarise(&self) {
         let Counts { connections, batches, skipped, withheld, rejected, unanswered } = self.counts;
-        tracing::info!(connections, batches, skipped, withheld, rejected, unanswered, "counts since the start");
+        tracing::info!(
+            connections,
+            batches,
+            skipped,
+            withheld,
+            rejected,
+            unanswered,
+            "counts since the start of the program"
+        );
     }
 
     fn is_new(&mut self, text: String) -> bool {

@@ -1,7 +1,7 @@
-//! The part of the protocol `kuksa.val.v2` that a provider of values needs: messages and three calls.
+//! The messages and three calls of the protocol `kuksa.val.v2` that a provider of values needs.
 //!
-//! Written by hand: the generated client of the KUKSA project compiles protoc, a C++ program, at every build. Fields that this program
-//! does not read are left out; protobuf skips them. Field numbers are those of the published protocol.
+//! Written by hand, because the generated client of the KUKSA project compiles protoc, a C++ program, at every build. Fields that
+//! this program does not read are omitted; protobuf skips them. Field numbers are from the published protocol.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ pub(crate) struct Timestamp {
     pub(crate) nanos: i32,
 }
 
-/// A value with its time; without `value` it says that there is none.
+/// A value with its time; without `value`, the value is unknown.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Datapoint {
     #[prost(message, optional, tag = "1")]
@@ -31,14 +31,14 @@ pub(crate) struct Datapoint {
     pub(crate) value: Option<Value>,
 }
 
-/// A value; without a type it is none.
+/// A value; unknown without a type.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Value {
     #[prost(oneof = "TypedValue", tags = "11, 12, 13, 14, 15, 16, 17, 18, 21, 22, 25, 27")]
     pub(crate) typed: Option<TypedValue>,
 }
 
-/// The types that this program sends, or reads as limits.
+/// Types that this program sends, or reads as limits.
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub(crate) enum TypedValue {
     #[prost(string, tag = "11")]
@@ -103,12 +103,12 @@ pub(crate) struct ListMetadataResponse {
     pub(crate) metadata: Vec<Metadata>,
 }
 
-/// What the broker knows of a signal.
+/// The broker's description of a signal.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Metadata {
     #[prost(string, tag = "9")]
     pub(crate) path: String,
-    /// Valid until the broker's next start.
+    /// Valid until the broker restarts.
     #[prost(int32, tag = "10")]
     pub(crate) id: i32,
     /// Number of the VSS datatype.
@@ -143,7 +143,7 @@ pub(crate) struct PublishValuesRequest {
     pub(crate) data_points: BTreeMap<i32, Datapoint>,
 }
 
-/// Answer to a question of the broker, see [`GetProviderValueRequest`].
+/// Answer to a [`GetProviderValueRequest`].
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct GetProviderValueResponse {
     #[prost(uint32, tag = "1")]
@@ -169,11 +169,11 @@ pub(crate) enum Action {
     Answer(GetProviderValueResponse),
 }
 
-/// The broker accepts the claim.
+/// The broker accepts a claim.
 #[derive(Clone, Copy, PartialEq, Eq, prost::Message)]
 pub(crate) struct ProvideSignalResponse {}
 
-/// Values that the broker rejected; it sends nothing for those that it accepted.
+/// Values that the broker rejected. Accepted values have no response.
 #[derive(Clone, PartialEq, Eq, prost::Message)]
 pub(crate) struct PublishValuesResponse {
     #[prost(uint32, tag = "1")]
@@ -190,7 +190,7 @@ pub(crate) struct Rejection {
     pub(crate) message: String,
 }
 
-/// A reader of the broker asks for values; the broker passes that on and waits a second.
+/// A reader asked the broker for values. The broker forwards the request and waits a second.
 #[derive(Clone, PartialEq, Eq, prost::Message)]
 pub(crate) struct GetProviderValueRequest {
     #[prost(uint32, tag = "1")]
@@ -199,7 +199,7 @@ pub(crate) struct GetProviderValueRequest {
     pub(crate) signal_ids: Vec<i32>,
 }
 
-/// A message of the broker. Filters (tag 5) are ignored: every document is published, because other readers see the same values.
+/// A message from the broker. Filters (tag 5) are ignored: every document is published, because all readers see the same values.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct FromBroker {
     #[prost(oneof = "Event", tags = "2, 4, 6")]
@@ -216,7 +216,7 @@ pub(crate) enum Event {
     Asked(GetProviderValueRequest),
 }
 
-/// The calls, over one connection.
+/// Calls over one connection.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     grpc: Grpc<Channel>,
@@ -224,7 +224,7 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// `authorization` is sent with every call.
+    /// Creates a client that sends `authorization` with every call.
     pub(crate) fn new(channel: Channel, authorization: Option<MetadataValue<Ascii>>) -> Self {
         Self { grpc: Grpc::new(channel), authorization }
     }
@@ -239,7 +239,7 @@ impl Client {
         Ok(response.into_inner().metadata)
     }
 
-    /// Opens the stream of a provider.
+    /// Opens the provider stream.
     pub(crate) async fn open_provider_stream(
         &mut self,
         messages: impl Stream<Item = ToBroker> + Send + 'static,

@@ -1,9 +1,9 @@
-//! The messages of one connection to the broker, made when the connection can take one.
+//! The messages of one connection to the broker, created when the connection can send one.
 //!
-//! * A connection that takes nothing holds no more than the newest batch of values: a newer one replaces it.
-//! * Behind each batch goes a claim of nothing, which the broker accepts once it has read what came before: the only receipt that the
-//!   protocol has. A check is such a claim alone.
-//! * An answer goes before a batch that waits too. See `questions` for why the order matters.
+//! * While the connection cannot send, only the newest batch of values is kept.
+//! * An empty claim follows each batch. The broker accepts it after it has read everything before it, so the acceptance serves as a
+//!   receipt; the protocol has no other. A check is such a claim without a batch.
+//! * An answer overtakes a waiting batch. See `questions` for why the order matters.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -16,22 +16,22 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::messages::{Action, GetProviderValueResponse, ProvideSignalRequest, PublishValuesRequest, ToBroker};
 
-/// Answers that wait: the broker asks one question at a time.
+/// Most waiting answers; the broker sends one request at a time.
 const MAX_ANSWERS: usize = 8;
 
-/// What a receipt is for.
+/// What a receipt confirms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sent {
-    /// The batch with this number, and all before it.
+    /// The batch with this number, and everything before it.
     Batch(u32),
-    /// All before it.
+    /// Everything before it.
     Check,
 }
 
-/// Sent, in order, and not known to be read.
+/// Sent messages not yet confirmed as read, in order.
 type Unread = Arc<Mutex<VecDeque<Sent>>>;
 
-/// Where the session puts its messages; dropping this ends the stream after those that wait.
+/// Takes the session's messages. Dropping it ends the stream after the waiting messages.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     batches: watch::Sender<PublishValuesRequest>,
@@ -41,7 +41,7 @@ pub(crate) struct Outbox {
 }
 
 impl Outbox {
-    /// An outbox, and its messages as a stream that begins with the claim.
+    /// Creates an outbox, and its messages as a stream that begins with the claim.
     pub(crate) fn open(claim: ProvideSignalRequest) -> (Self, Messages) {
         let (batches, newest) = watch::channel(PublishValuesRequest::default());
         let (answers, waiting) = mpsc::channel(MAX_ANSWERS);
@@ -56,31 +56,31 @@ impl Outbox {
         (Self { batches, answers, unread }, messages)
     }
 
-    /// Sends the batch, in place of one that waits.
+    /// Sends the batch; replaces a waiting batch.
     pub(crate) fn publish(&self, batch: PublishValuesRequest) {
         self.batches.send_replace(batch);
     }
 
-    /// Sends an answer; `false` = too many wait.
+    /// Sends an answer; `false` if too many are waiting.
     pub(crate) fn answer(&self, answer: GetProviderValueResponse) -> bool {
         self.answers.try_send(Some(answer)).is_ok()
     }
 
-    /// Asks for a receipt; `false` = too many answers wait.
+    /// Requests a receipt; `false` if too many answers are waiting.
     pub(crate) fn check(&self) -> bool {
         self.answers.try_send(None).is_ok()
     }
 
-    /// The broker has read one more: which.
+    /// Handles a receipt: returns what the broker has read.
     pub(crate) fn acknowledge(&self) -> Option<Sent> {
         self.unread.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
     }
 }
 
-/// The messages, for the connection.
+/// The message stream of the connection.
 #[derive(Debug)]
 pub(crate) struct Messages {
-    /// Before everything else: the claim, later a receipt's claim of nothing.
+    /// Sent before everything else: the initial claim, later the empty claim of a receipt.
     next: Option<Action>,
     answers: mpsc::Receiver<Option<GetProviderValueResponse>>,
     batches: WatchStream<PublishValuesRequest>,
@@ -103,7 +103,7 @@ impl Messages {
                 self.note_unread(Sent::Check);
                 return Poll::Ready(Some(receipt));
             }
-            // Closed: the batches end too.
+            // The outbox is closed, so the batches end too.
             Poll::Ready(None) | Poll::Pending => {}
         }
         let Some(batch) = std::task::ready!(Pin::new(&mut self.batches).poll_next(context)) else {
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_connection_that_takes_nothing_keeps_the_newest_batch_only() {
+    async fn blocked_connection_keeps_newest_batch_only() {
         let (outbox, messages) = Outbox::open(ProvideSignalRequest::default());
         (1..=1000).for_each(|id| outbox.publish(batch(id)));
         let unread = Arc::clone(&outbox.unread);
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_answer_goes_before_a_batch_and_receipts_are_in_order() {
+    async fn answer_overtakes_batch_and_receipts_keep_order() {
         let (outbox, messages) = Outbox::open(ProvideSignalRequest::default());
         outbox.publish(batch(1));
         assert!(outbox.answer(answer(7)) && outbox.check());
@@ -168,7 +168,7 @@ mod tests {
     async fn waiting_answers_are_bounded() {
         let (outbox, messages) = Outbox::open(ProvideSignalRequest::default());
         assert!((1..=8).all(|id| outbox.answer(answer(id))));
-        assert!(!outbox.answer(answer(9)) && !outbox.check(), "the queue has no end");
+        assert!(!outbox.answer(answer(9)) && !outbox.check(), "the queue is unbounded");
         drop((outbox, messages));
     }
 }

@@ -1,13 +1,13 @@
-//! Questions of the broker: a reader wants a value now, and the broker asks the provider.
+//! Requests of the broker: a reader wants a value now, and the broker asks the provider.
 //!
-//! The databroker (0.7) reads nothing else of the provider while it waits, for a second, for the answer; and an answer that comes later
-//! it takes for that to its next question, of another signal. A batch sent while the broker waits delays the answer behind it.
+//! While the databroker (0.7) waits up to a second for an answer, it reads nothing else from the provider. It mistakes a late answer
+//! for the answer to its next request, which may be about another signal. A batch sent during the wait delays the answer behind it.
 //! Therefore:
 //!
-//! * A question waits until the broker has read everything; one that has waited for [`DEADLINE`] gets no answer, and the broker answers
-//!   its reader with the value it has.
-//! * An answer is proved in time by the next question, if that comes before the first one's second is over, else by a receipt. Without
-//!   proof the connection ends: with it end the answers that wait in the broker.
+//! * A request is answered only after the broker has read everything sent before. If this takes longer than [`DEADLINE`], the request
+//!   gets no answer, and the broker gives its reader the last value.
+//! * Every answer needs a proof that the broker read it in time: its next request within that second, else a receipt. Without a proof
+//!   the connection ends, which also discards answers waiting in the broker.
 
 use std::time::Duration;
 
@@ -16,37 +16,38 @@ use tokio::time::Instant;
 use super::messages::GetProviderValueRequest;
 use super::outgoing::Sent;
 
-/// Longest wait of a question: half of what the broker waits.
+/// Longest wait before an answer: half of the broker's timeout.
 const DEADLINE: Duration = Duration::from_millis(500);
-/// Pause of the questions after which a receipt is asked for: a reader that asks for many values in a row proves each by the next.
+/// Time without a further request after which a receipt is requested. A reader that asks for many values in a row proves each answer
+/// by its next request.
 const CHECK_AFTER: Duration = Duration::from_millis(100);
-/// Latest proof: what the broker waits, less 200 ms for the way of the question.
+/// Latest time of the proof: the broker's timeout minus 200 ms of transport latency.
 const LATEST_PROOF: Duration = Duration::from_millis(800);
-/// Questions that wait: the broker asks one at a time.
+/// Most waiting requests; the broker sends one at a time.
 const MAX_QUESTIONS: usize = 8;
 
-/// A question and when it came.
+/// A request and its time of arrival.
 pub(crate) type Question = (Instant, GetProviderValueRequest);
 
-/// The questions of one connection.
+/// The requests of one connection.
 #[derive(Debug, Default)]
 pub(crate) struct Questions {
     waiting: Vec<Question>,
-    /// Number of the latest batch made, and of the latest that the broker has read.
+    /// Number of the latest batch made, and of the latest batch the broker has read.
     made: u32,
     read: u32,
-    /// When the question came whose answer is not proved.
+    /// Arrival of the request whose answer is not proved yet.
     unproved: Option<Instant>,
     is_checking: bool,
 }
 
 impl Questions {
-    /// A batch was made.
+    /// Notes that a batch was made.
     pub(crate) fn note_batch(&mut self, number: u32) {
         self.made = number;
     }
 
-    /// The broker has read a message.
+    /// Notes that the broker has read a message.
     pub(crate) fn note_read(&mut self, sent: Option<Sent>) {
         match sent {
             Some(Sent::Batch(number)) => self.read = number,
@@ -55,7 +56,7 @@ impl Questions {
         }
     }
 
-    /// The broker asks; `false` = too many wait.
+    /// Adds a request; `false` if too many are waiting.
     pub(crate) fn ask(&mut self, question: GetProviderValueRequest, now: Instant) -> bool {
         if self.unproved.is_some_and(|asked| now.duration_since(asked) <= LATEST_PROOF) {
             self.unproved = None;
@@ -67,7 +68,7 @@ impl Questions {
         has_room
     }
 
-    /// Questions to answer now, and how many get no answer any more.
+    /// Requests to answer now, and the number of requests that expired.
     pub(crate) fn take(&mut self, now: Instant) -> (Vec<Question>, u64) {
         if self.made != self.read || self.is_checking {
             return (Vec::new(), 0);
@@ -80,15 +81,15 @@ impl Questions {
         (open, expired)
     }
 
-    /// When [`Questions::handle_time`] is due; `None` = not before the next message.
+    /// Time when [`Questions::handle_time`] is due; `None` = not before the next message.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.unproved.map(|asked| asked + if self.is_checking { LATEST_PROOF } else { CHECK_AFTER })
     }
 
-    /// Whether a receipt is to be asked for now.
+    /// Whether to request a receipt now.
     ///
     /// # Errors
-    /// When a proof does not come.
+    /// The proof of an answer is overdue.
     pub(crate) fn handle_time(&mut self, now: Instant) -> Result<bool, String> {
         if self.unproved.is_some_and(|asked| now.duration_since(asked) >= LATEST_PROOF) {
             return Err("the broker may have read an answer late".to_owned());
@@ -117,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn a_question_waits_until_the_latest_batch_is_read() {
+    fn request_waits_until_latest_batch_is_read() {
         let (mut questions, start) = (Questions::default(), Instant::now());
         questions.note_batch(1);
         questions.note_batch(2);
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn a_question_that_waited_too_long_gets_no_answer() {
+    fn expired_request_gets_no_answer() {
         let (mut questions, start) = (Questions::default(), Instant::now());
         questions.note_batch(1);
         assert!(questions.ask(question(5), start));
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn the_next_question_within_the_second_proves_an_answer() {
+    fn next_request_within_second_proves_answer() {
         let (mut questions, start) = (Questions::default(), Instant::now());
         questions.ask(question(5), start);
         assert_eq!(answered(&mut questions, start), (vec![5], 0));
@@ -167,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_without_proof_ends_the_connection() {
+    fn unproved_answer_ends_connection() {
         let (mut questions, start) = (Questions::default(), Instant::now());
         questions.ask(question(5), start);
         answered(&mut questions, start);
@@ -177,7 +178,7 @@ mod tests {
         questions.ask(question(6), start + ms(900));
         assert!(
             questions.handle_time(start + ms(901)).is_err(),
-            "a question after the first one's second proves nothing"
+            "a request after the first one's second proves nothing"
         );
     }
 }

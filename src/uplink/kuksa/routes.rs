@@ -1,7 +1,7 @@
-//! Which id of the broker belongs to which signal, for one connection.
+//! Maps the broker's ids to signals, for one connection.
 //!
-//! In: the broker's metadata; status documents. Out: the claim and data points by id. A signal has a route only when the broker has its
-//! path with the same datatype under an id of its own. Ids change at each start of the broker, so routes end with their connection.
+//! Input: the broker's metadata; status documents. Output: the claim, and data points by id. A signal has a route only if the broker
+//! lists its path with the same datatype and a unique id. Ids change when the broker restarts, so routes belong to a connection.
 //! A value outside the broker's limits is withheld: its data point has no value.
 
 use std::collections::{BTreeMap, HashMap};
@@ -14,18 +14,18 @@ use super::messages::{Datapoint, Metadata, ProvideSignalRequest, SampleInterval,
 use super::signals::{self, Signal};
 use super::value::{Limits, limit, type_name};
 
-/// One signal and where its value goes.
+/// The route of one signal.
 #[derive(Debug)]
 struct Route {
     signal: &'static Signal,
     limits: Limits,
 }
 
-/// A signal that this connection does not provide.
+/// A signal that this connection does not provide, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Skipped {
     pub(crate) path: String,
-    /// Why.
+    /// Why it is skipped.
     pub(crate) reason: String,
 }
 
@@ -33,7 +33,7 @@ pub(crate) struct Skipped {
 #[derive(Debug, Default)]
 pub(crate) struct Points {
     pub(crate) by_id: BTreeMap<i32, Datapoint>,
-    /// Signals whose values are outside the broker's limits.
+    /// Signals whose values exceed the broker's limits.
     pub(crate) withheld: Vec<&'static str>,
 }
 
@@ -44,12 +44,12 @@ pub(crate) struct Routes {
 }
 
 impl Routes {
-    /// Finds every signal in the broker's metadata; the overlay's are below `branch`.
+    /// Finds every signal in the broker's metadata. The overlay's signals are below `branch`.
     pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<Skipped>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
         for entry in metadata {
-            // The overlay's branch may be below the standard one: then its signals are listed twice.
+            // If the overlay's branch is below the standard one, its signals are listed twice.
             if by_path.insert(&entry.path, entry).is_none_or(|earlier| earlier.id != entry.id) {
                 *uses.entry(entry.id).or_default() += 1;
             }
@@ -59,7 +59,7 @@ impl Routes {
             let path = signal.path(branch);
             let found = by_path.get(path.as_str()).copied();
             match found
-                .ok_or_else(|| "the broker does not have it".to_owned())
+                .ok_or_else(|| "the broker does not know the signal".to_owned())
                 .and_then(|entry| check(signal, entry, &uses))
             {
                 Ok((id, route)) => drop(by_id.insert(id, route)),
@@ -86,12 +86,12 @@ impl Routes {
         ProvideSignalRequest { signals: self.by_id.keys().map(|id| (*id, interval)).collect() }
     }
 
-    /// A data point for every signal; without a document none has a value.
+    /// Returns a data point for every signal; without a document, all are unknown.
     pub(crate) fn points(&self, document: Option<&StatusDocument>) -> Points {
         self.points_of(self.by_id.keys(), document)
     }
 
-    /// A data point for each of these ids that this connection provides.
+    /// Returns a data point for each of these ids that this connection provides.
     pub(crate) fn points_of<'a>(
         &self,
         ids: impl IntoIterator<Item = &'a i32>,
@@ -114,17 +114,21 @@ impl Routes {
     }
 }
 
-/// The route to the broker's entry of the signal's path.
+/// Checks the broker's entry for a signal and returns its id and route.
 fn check(signal: &'static Signal, entry: &Metadata, uses: &HashMap<i32, usize>) -> Result<(i32, Route), String> {
     if entry.data_type != signal.data_type.code() {
         let (found, expected) = (type_name(entry.data_type), signal.data_type.name());
-        return Err(format!("the broker has it as {found}, this program as {expected}"));
+        return Err(format!(
+            "datatype {found} in the broker, must be {expected}; load the overlay of this version (packwatch vss)"
+        ));
     }
     if uses.get(&entry.id).is_some_and(|uses| *uses > 1) {
-        return Err(format!("the broker has its id {} for another signal too", entry.id));
+        return Err(format!("the broker uses id {} for another signal too", entry.id));
     }
     if entry.allowed.as_ref().is_some_and(|allowed| allowed.typed.is_some()) {
-        return Err("the broker allows listed values only, so \"no value\" could not replace one".to_owned());
+        return Err(
+            "the broker allows listed values only, so an unknown value could not replace the last one".to_owned()
+        );
     }
     let limits = Limits { min: limit(entry.min.as_ref()), max: limit(entry.max.as_ref()) };
     Ok((entry.id, Route { signal, limits }))

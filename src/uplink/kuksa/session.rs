@@ -1,8 +1,8 @@
 //! One connection to the broker, from its metadata to its end.
 //!
-//! In: settings, documents, the request to stop. Out: values by the ids of this connection. Order: ListMetadata, claim, then a batch
-//! for each document; without a document (the daemon is silent, or this program stops) a batch without values, so that no reader
-//! takes an old value for a present one. Ends with a reason when the broker ends it or does not answer.
+//! Input: settings, documents, the request to stop. Output: values by the ids of this connection. Order: ListMetadata, claim, then a
+//! batch for each document. If the daemon is silent or this program stops, it sends a batch without values, so that no reader takes
+//! an old value for a present one. The connection ends with a reason if the broker ends it or does not answer.
 
 use std::future::Future;
 use std::path::Path;
@@ -25,21 +25,21 @@ use super::signals::STANDARD_BRANCH;
 use crate::files::read_credential;
 use crate::status_stream::Documents;
 
-/// Longest wait for the connection, and for the answer to each call.
+/// Longest wait for the connection and for the answer to each call.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Pings of an idle connection: together with [`PATIENCE`], a broker that is gone is noticed within 15 s.
+/// Period of pings on an idle connection. Together with [`PATIENCE`], a lost broker is noticed within 15 s.
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Longest time for which the broker reads none of the batches: then its readers take old values for present ones.
+/// Longest time in which the broker may read no batch; beyond it, its readers take old values for present ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
 
-/// Serves one connection. `Ok` = ended as asked.
+/// Serves one connection. `Ok` means that it ended on request.
 ///
 /// # Errors
-/// Why it could not be made, or why it ended.
+/// Why the connection could not be opened, or why it ended.
 pub(crate) async fn run(
     settings: &KuksaSettings,
     documents: &mut Documents,
@@ -80,7 +80,7 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Since when the broker owes a receipt.
+/// Time since which the broker owes a receipt.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,
@@ -91,12 +91,12 @@ impl Receipts {
         self.owed_since.get_or_insert(now);
     }
 
-    /// The broker has read: what it has not read yet, the next batch begins to count.
+    /// Handles a receipt: the next batch restarts the time.
     fn note_read(&mut self) {
         self.owed_since = None;
     }
 
-    /// Ends a connection whose broker keeps it and reads nothing, or gives no receipts. One to which nothing was sent owes none.
+    /// Fails if the broker keeps the connection open but reads nothing or sends no receipts. It owes none if nothing was sent.
     fn check(&self, now: Instant) -> Result<(), String> {
         match self.owed_since {
             Some(since) if now.duration_since(since) > UNREAD_LIMIT => {
@@ -109,7 +109,7 @@ impl Receipts {
 
 impl Session {
     async fn open(settings: &KuksaSettings, journal: &mut Journal) -> Result<Self, String> {
-        // Read at each connection: certificates and tokens are renewed.
+        // Read at each connection, because certificates and tokens are renewed.
         let (endpoint, token) = (endpoint(settings)?, token(settings.token_file.as_deref())?);
         let mut client = Client::new(connect(&endpoint).await?, token);
         let mut metadata = call("ListMetadata", list(&mut client, STANDARD_BRANCH)).await?;
@@ -135,7 +135,7 @@ impl Session {
         })
     }
 
-    /// Sends a value of every signal; without a document, that there is none.
+    /// Sends a value of every signal; without a document, all are unknown.
     fn publish(&mut self, document: Option<&StatusDocument>, journal: &mut Journal) {
         let points = self.routes.points(document);
         journal.note_published(&points);
@@ -169,7 +169,7 @@ impl Session {
         }
     }
 
-    /// Asks for the receipt of an answer when that is due.
+    /// Requests the receipt of an answer when it is due.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.questions.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
@@ -177,7 +177,7 @@ impl Session {
         Ok(())
     }
 
-    /// Withdraws every value, and waits until the broker has had time to read that.
+    /// Withdraws every value, and gives the broker time to read it.
     async fn withdraw(mut self, journal: &mut Journal) {
         self.publish(None, journal);
         drop(self.outbox);
@@ -187,7 +187,7 @@ impl Session {
     }
 }
 
-/// Waits until then; for ever without a time.
+/// Waits until `time`; forever without one.
 async fn wait_until(time: Option<Instant>) {
     match time {
         Some(time) => sleep_until(time).await,
@@ -206,7 +206,7 @@ async fn accepted(incoming: &mut Streaming<FromBroker>) -> Result<(), Status> {
     }
 }
 
-/// Metadata at and below `root`; none when the broker does not have it.
+/// Lists metadata at and below `root`; empty if the broker does not know `root`.
 async fn list(client: &mut Client, root: &str) -> Result<Vec<super::messages::Metadata>, Status> {
     match client.list_metadata(root).await {
         Err(status) if status.code() == Code::NotFound => Ok(Vec::new()),
@@ -248,7 +248,7 @@ async fn connect(endpoint: &Endpoint) -> Result<Channel, String> {
     }
 }
 
-/// An error and what caused it, each text once.
+/// An error and its causes; omits repeated texts.
 fn causes(error: &dyn std::error::Error) -> String {
     let mut texts = vec![error.to_string()];
     let mut next = error.source();
@@ -262,18 +262,18 @@ fn causes(error: &dyn std::error::Error) -> String {
     texts.join(": ")
 }
 
-/// The header that carries the token of `file`.
+/// Builds the header with the token of `file`.
 fn token(file: Option<&Path>) -> Result<Option<MetadataValue<Ascii>>, String> {
     let Some(file) = file else { return Ok(None) };
     let at = file.display();
     let text = String::from_utf8(read_credential(file)?).map_err(|error| format!("{at}: {error}"))?;
     let token = text.trim();
     if token.is_empty() || token.len() > MAX_TOKEN_BYTES {
-        return Err(format!("{at}: a token of {} bytes, must be 1 to {MAX_TOKEN_BYTES}", token.len()));
+        return Err(format!("{at}: the token has {} bytes, must be 1 to {MAX_TOKEN_BYTES}", token.len()));
     }
     let mut header: MetadataValue<Ascii> = format!("Bearer {token}")
         .parse()
-        .map_err(|_| format!("{at}: the token has characters that a header cannot hold"))?;
+        .map_err(|_| format!("{at}: the token has characters that are not allowed in an HTTP header"))?;
     header.set_sensitive(true);
     Ok(Some(header))
 }
@@ -283,11 +283,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_broker_that_confirms_nothing_loses_the_connection_and_an_idle_one_does_not() {
+    fn missing_receipts_end_connection_but_idle_does_not() {
         let begin = Instant::now();
         let at = |seconds: u64| begin + Duration::from_secs(seconds);
         let mut receipts = Receipts::default();
-        // No daemon, nothing to send, for an hour; then a batch.
+        // No daemon and nothing to send for an hour; then a batch.
         receipts.note_sent(at(3600));
         assert_eq!(receipts.check(at(3600)), Ok(()));
         receipts.note_read();

@@ -7,20 +7,20 @@ use serde::Deserialize;
 
 use super::signals::STANDARD_BRANCH;
 
-/// Longest branch, bytes: the databroker reads paths of up to 1,000.
+/// Longest branch, bytes; the databroker reads paths of up to 1,000.
 const MAX_BRANCH_BYTES: usize = 200;
 
-/// The databroker, and where the overlay's signals are.
+/// The databroker, and the branch of the overlay's signals.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct KuksaSettings {
     /// `http://HOST:PORT`, `https://HOST:PORT` or `unix:PATH`.
     pub address: String,
-    /// Certificates (PEM) that the databroker's must descend from; with `https` only, and needed there.
+    /// PEM file of the authorities that signed the databroker's certificate; required with `https`, not allowed otherwise.
     pub ca_file: Option<PathBuf>,
-    /// Name in the databroker's certificate, where it is not the host of `address`.
+    /// Name in the databroker's certificate, if it differs from the host of `address`.
     pub server_name: Option<String>,
-    /// File with the token (JWT) that allows to provide the signals.
+    /// File with the token (JWT) that permits providing the signals.
     pub token_file: Option<PathBuf>,
     /// Branch of the overlay's signals.
     pub branch: String,
@@ -39,10 +39,10 @@ impl Default for KuksaSettings {
 }
 
 impl KuksaSettings {
-    /// Checks what one key alone, or several together, may be.
+    /// Checks each key and combinations of keys.
     ///
     /// # Errors
-    /// Names the key, what was found and what is allowed.
+    /// The key, what was found and what is allowed.
     pub(crate) fn check(&self) -> Result<(), String> {
         let address = &self.address;
         let (scheme, rest) = address.split_once(':').unwrap_or_default();
@@ -59,15 +59,15 @@ impl KuksaSettings {
         let is_tls = scheme == "https";
         if is_tls != self.ca_file.is_some() {
             return Err(format!(
-                "kuksa.ca_file must be given with https://, and only then; kuksa.address is \"{address}\""
+                "kuksa.ca_file is required with https:// and not allowed otherwise; kuksa.address = \"{address}\""
             ));
         }
         if self.server_name.is_some() && !is_tls {
-            return Err(format!("kuksa.server_name is for https:// only; kuksa.address is \"{address}\""));
+            return Err(format!("kuksa.server_name is allowed with https:// only; kuksa.address = \"{address}\""));
         }
         if self.token_file.is_some() && scheme == "http" && !host.is_some_and(is_loopback) {
             return Err(format!(
-                "kuksa.token_file: the network could read the token; kuksa.address = \"{address}\", must be https://"
+                "kuksa.token_file: without TLS the token could be read on the network; kuksa.address = \"{address}\", must be https://"
             ));
         }
         self.check_branch()
@@ -84,8 +84,8 @@ impl KuksaSettings {
             return Ok(());
         }
         Err(format!(
-            "kuksa.branch = \"{branch}\", must be a branch of its own below Vehicle, at most {MAX_BRANCH_BYTES} bytes, each part a \
-             capital letter, then letters and digits"
+            "kuksa.branch = \"{branch}\", must be a branch below Vehicle without other signals, at most {MAX_BRANCH_BYTES} bytes, each \
+            part a capital letter, then letters and digits"
         ))
     }
 }
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn addresses_and_branches_that_work_are_accepted() {
+    fn valid_addresses_and_branches_are_accepted() {
         for text in [
             "",
             "address = 'http://databroker:55555'",
@@ -123,15 +123,18 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_the_key_and_what_is_allowed() {
+    fn fault_names_key_and_allowed_values() {
         for (text, expected) in [
             ("address = '127.0.0.1:55555'", "kuksa.address = \"127.0.0.1:55555\", must be"),
             ("address = 'http://a/b'", "kuksa.address"),
             ("address = 'unix:relative'", "kuksa.address"),
-            ("address = 'https://a:1'", "kuksa.ca_file must be given with https://"),
-            ("ca_file = '/ca.pem'", "kuksa.ca_file must be given with https://"),
-            ("server_name = 'x'", "kuksa.server_name is for https:// only"),
-            ("address = 'http://10.0.0.1:1'\ntoken_file = '/t'", "kuksa.token_file: the network could read the token"),
+            ("address = 'https://a:1'", "kuksa.ca_file is required with https://"),
+            ("ca_file = '/ca.pem'", "kuksa.ca_file is required with https://"),
+            ("server_name = 'x'", "kuksa.server_name is allowed with https:// only"),
+            (
+                "address = 'http://10.0.0.1:1'\ntoken_file = '/t'",
+                "kuksa.token_file: without TLS the token could be read on the network",
+            ),
             ("branch = 'Vehicle.Powertrain.TractionBattery'", "kuksa.branch"),
             ("branch = 'Vehicle.private'", "kuksa.branch"),
             ("branch = 'Vehicle..A'", "kuksa.branch"),

@@ -1,8 +1,8 @@
-//! The signals that this program provides, and how each follows from the status document.
+//! The signals that this program provides, and the derivation of each from the status document.
 //!
-//! In: a status document (units in its field names, current positive = discharge, SOC and SOH as fractions, cells from 0).
-//! Out: VSS values: current positive = into the battery, percent, cells from 0. `None` = no value: something it needs is unknown.
-//! An array has a value only when that of every cell is known: its places are the cells, and VSS has no unknown number.
+//! Input: a status document (units in its field names, current positive = discharge, SOC and SOH as fractions, cells from 0).
+//! Output: VSS values: current positive = into the battery, percent, cells from 0. `None` = something the value needs is unknown.
+//! An array has a value only if every cell has one, because its positions are cell numbers and VSS has no unknown number.
 
 mod derived;
 
@@ -17,7 +17,7 @@ use packwatch_host::status::document::StatusDocument;
 
 use super::value::{DataType, Value, single};
 
-/// Branch of VSS's own signals of the battery.
+/// Branch of the battery signals of VSS itself.
 pub(crate) const STANDARD_BRANCH: &str = "Vehicle.Powertrain.TractionBattery";
 
 /// Where a signal is defined.
@@ -32,7 +32,7 @@ pub(crate) enum Origin {
 /// A signal.
 #[derive(Debug)]
 pub(crate) struct Signal {
-    /// Its path below the branch.
+    /// Path below the branch.
     pub(crate) name: Cow<'static, str>,
     pub(crate) origin: Origin,
     pub(crate) data_type: DataType,
@@ -40,12 +40,12 @@ pub(crate) struct Signal {
     pub(crate) unit: Option<&'static str>,
     /// For the overlay and the manual.
     pub(crate) description: Cow<'static, str>,
-    /// Fields of the status document that it follows from.
+    /// Fields of the status document that it is derived from.
     pub(crate) fields: Cow<'static, str>,
     source: Source,
 }
 
-/// Where a value comes from. A number of the catalogue is multiplied by the factor.
+/// Source of a value. A number of the catalogue is multiplied by the factor.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Document(fn(&StatusDocument) -> Option<Value>),
@@ -54,7 +54,7 @@ enum Source {
 }
 
 impl Signal {
-    /// Its full path, with the overlay's signals below `branch`.
+    /// Full path; the overlay's signals are below `branch`.
     pub(crate) fn path(&self, branch: &str) -> String {
         let branch = match self.origin {
             Origin::Standard => STANDARD_BRANCH,
@@ -63,9 +63,9 @@ impl Signal {
         format!("{branch}.{}", self.name)
     }
 
-    /// Its value; `None` = none.
+    /// Its value; `None` if unknown.
     pub(crate) fn value(&self, document: &StatusDocument) -> Option<Value> {
-        // Adding 0 makes -0 a 0.
+        // Adding 0 turns -0 into 0.
         let scaled = |value: Option<f64>, factor: f64| single(value.map(|value| factor * value + 0.0));
         match self.source {
             Source::Document(value) => value(document),
@@ -99,7 +99,7 @@ pub(crate) fn of_overlay() -> impl Iterator<Item = &'static Signal> {
     all().filter(|signal| signal.origin == Origin::Overlay)
 }
 
-/// The signals of a row of the catalogue: its mean, and its standard deviation if it has one.
+/// The signals of a catalogue row: its mean and, if it has one, its standard deviation.
 fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: bool) -> impl Iterator<Item = Signal> {
     let (unit, factor) = vss_unit(row.unit);
     let (owner, data_type) = if is_pack { ("pack", DataType::Float) } else { ("cells", DataType::Floats) };
@@ -110,7 +110,7 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
             Part::Mean => format!("{}{sign}", it.about),
             Part::Std => format!("Standard deviation: {}", it.about),
         };
-        // An array has no unit in VSS.
+        // VSS arrays have no unit.
         let description = if is_pack {
             format!("{about}.")
         } else {
@@ -133,7 +133,7 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     })
 }
 
-/// The path of a part. A standard deviation is always of the overlay: beside a signal of VSS itself, or named after one of the overlay.
+/// The path of a part. A standard deviation is always in the overlay: next to the VSS signal, or named after the overlay's signal.
 fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     match (path, part) {
         (VssPath::Standard(path), Part::Mean) => (Origin::Standard, path.into()),
@@ -146,7 +146,7 @@ fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     }
 }
 
-/// The unit in VSS, and its factor.
+/// Unit in VSS, and the factor to it.
 const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (Some("percent"), 100.0),
@@ -160,7 +160,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     }
 }
 
-/// A value per cell, if each has one, and if the cells are numbered from 0 without a gap: a place in an array is the number of a cell.
+/// Returns a value per cell if every cell has one and cells are numbered from 0 without a gap, because array positions are cell
+/// numbers.
 fn of_cells<T>(document: &StatusDocument, value: impl Fn(&CellView) -> Option<T>) -> Option<Vec<T>> {
     let cells = document.cells.iter().enumerate();
     let values = cells.map(|(index, cell)| if cell.cell.index() == index { value(cell) } else { None });

@@ -1,7 +1,7 @@
 //! Values and their VSS datatypes.
 //!
-//! In: numbers of the status document, limits of the broker. Out: values of the protocol. A number that its datatype cannot hold, or
-//! that is outside the broker's limits, is no value: nothing is clamped.
+//! Input: numbers of the status document, limits of the broker. Output: values of the protocol. A number outside its datatype or the
+//! broker's limits becomes unknown; nothing is clamped.
 
 use super::messages::{Flags, Floats, Texts, TypedValue};
 
@@ -18,7 +18,7 @@ pub(crate) enum DataType {
 }
 
 impl DataType {
-    /// As VSS writes it.
+    /// Name in VSS.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Text => "string",
@@ -31,7 +31,7 @@ impl DataType {
         }
     }
 
-    /// Its number in the protocol.
+    /// Number in the protocol.
     pub(crate) const fn code(self) -> i32 {
         match self {
             Self::Text => 1,
@@ -45,7 +45,7 @@ impl DataType {
     }
 }
 
-/// The name of the datatype with this number, of all that the protocol has.
+/// Name of the datatype with this number, including datatypes that this program does not use.
 pub(crate) fn type_name(code: i32) -> String {
     const SINGLE: [&str; 13] = [
         "string",
@@ -83,7 +83,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// Its datatype.
+    /// Returns its datatype.
     pub(crate) const fn data_type(&self) -> DataType {
         match self {
             Self::Text(_) => DataType::Text,
@@ -96,7 +96,7 @@ impl Value {
         }
     }
 
-    /// Whether every number in it is within the limits.
+    /// Whether all its numbers are within the limits.
     pub(crate) fn is_within(&self, limits: Limits) -> bool {
         match self {
             Self::Uint16(number) => limits.contain(f64::from(*number)),
@@ -106,7 +106,7 @@ impl Value {
         }
     }
 
-    /// As the protocol has it: it knows no integers of 16 bits.
+    /// Converts to the protocol's type, which has no 16-bit integers.
     pub(crate) fn into_message(self) -> TypedValue {
         match self {
             Self::Text(text) => TypedValue::Text(text),
@@ -120,16 +120,16 @@ impl Value {
     }
 }
 
-/// A number as VSS's `float`; `None` = unknown, not finite, or beyond its range.
+/// Converts to a VSS `float`; `None` = unknown, not finite, or out of range.
 pub(crate) fn single(number: Option<f64>) -> Option<f32> {
     #[expect(
         clippy::cast_possible_truncation,
-        reason = "rounds; what is beyond the range becomes infinite and is no value"
+        reason = "rounds; a number out of range becomes infinite, which is rejected below"
     )]
     number.map(|number| number as f32).filter(|number| number.is_finite())
 }
 
-/// The broker's limits of a signal's numbers, both inclusive; `None` = no limit.
+/// The broker's limits of a signal, both inclusive; `None` = no limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Limits {
     pub(crate) min: Option<f64>,
@@ -142,14 +142,14 @@ impl Limits {
     }
 }
 
-/// A limit as a number; `None` = none is given.
+/// Reads a limit as a number; `None` = no limit.
 pub(crate) fn limit(value: Option<&super::messages::Value>) -> Option<f64> {
     match value?.typed.as_ref()? {
         TypedValue::Int32(number) => Some(f64::from(*number)),
         TypedValue::Uint32(number) => Some(f64::from(*number)),
         TypedValue::Float(number) => Some(f64::from(*number)),
         TypedValue::Double(number) => Some(*number),
-        // No signal of this program has a datatype of 64 bits.
+        // This program has no 64-bit signals.
         _ => None,
     }
 }
@@ -159,7 +159,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_that_a_float_cannot_hold_is_no_value() {
+    fn number_beyond_float_range_is_unknown() {
         assert_eq!(single(Some(1.5)), Some(1.5));
         for number in [None, Some(f64::NAN), Some(f64::INFINITY), Some(1e39)] {
             assert_eq!(single(number), None, "{number:?}");
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_hold_for_every_number_of_an_array() {
+    fn limits_apply_to_every_array_element() {
         let limits = Limits { min: Some(0.0), max: Some(100.0) };
         assert!(Value::Float(100.0).is_within(limits) && Value::Float(0.0).is_within(limits));
         assert!(!Value::Float(100.1).is_within(limits) && !Value::Uint16(101).is_within(limits));
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn datatypes_have_the_names_of_their_numbers() {
+    fn datatype_numbers_map_to_names() {
         for data_type in [
             DataType::Text,
             DataType::Flag,

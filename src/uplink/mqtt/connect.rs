@@ -1,6 +1,6 @@
-//! A connection to the broker: options, credentials, certificates, and its faults in words.
+//! A connection to the broker: options, credentials, certificates, and descriptions of its errors.
 //!
-//! In: settings and the files they name. Out: a client whose last will is `offline` on the status topic.
+//! Input: settings and the files they name. Output: a client whose last will is `offline` on the status topic.
 
 use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::{ConnectReturnCode, LastWill};
@@ -10,28 +10,28 @@ use super::settings::{MqttSettings, TlsSettings};
 use super::{OFFLINE, topic};
 use crate::files::read_credential;
 
-/// Longest wait for the connection and the broker's answer, s.
+/// Longest wait for the connection and for the broker's answer, s.
 const CONNECT_LIMIT_S: u64 = 15;
-/// Requests that wait in memory for the connection: a window of messages of the queue.
+/// Most requests waiting in memory for the connection: a window of messages of the queue.
 const REQUESTS: usize = 64;
-/// Messages on their way at once, of the queue and of the current values.
+/// Most unacknowledged messages, of the queue and of the current values together.
 const IN_FLIGHT: u16 = 64;
-/// Longest packet that the broker may send, bytes: nothing is subscribed.
+/// Largest packet accepted from the broker, bytes; there are no subscriptions.
 const MAX_INCOMING_BYTES: u32 = 64 << 10;
 
-/// A client that is not connected yet; its event loop connects.
+/// Creates a client. Its event loop connects.
 ///
 /// # Errors
-/// When a file of the settings cannot be read or used.
+/// A file named by the settings cannot be read or used.
 pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), String> {
     let broker = Broker::tcp(settings.host.clone(), settings.port());
     let mut options = MqttOptions::new(settings.client_id(), broker);
     options.set_keep_alive(u16::try_from(settings.keep_alive_s).unwrap_or(u16::MAX));
-    // What was not acknowledged is in the queue on disk: a session at the broker would only repeat old values.
+    // Unacknowledged messages are in the queue on disk; a session at the broker would only repeat old values.
     options.set_clean_start(true);
     options.set_last_will(LastWill::new(settings.topic(topic::STATUS), OFFLINE, QoS::AtLeastOnce, true, None));
     options.set_incoming_packet_size_limit(rumqttc::IncomingPacketSizeLimit::Bytes(MAX_INCOMING_BYTES));
-    // Places in memory for messages on their way: by default there are 65,535.
+    // Memory for unacknowledged messages; the default is 65,535.
     options.set_outgoing_inflight_upper_limit(IN_FLIGHT);
     let mut network = options.network_options();
     network.set_connection_timeout(CONNECT_LIMIT_S);
@@ -50,7 +50,7 @@ pub fn client(settings: &MqttSettings) -> Result<(AsyncClient, EventLoop), Strin
 }
 
 fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
-    // The settings' check has found those together that belong together.
+    // The settings' check ensures that both or neither are given.
     let client_auth = match (&tls.certificate_file, &tls.key_file) {
         (Some(certificate), Some(key)) => Some((read_credential(certificate)?, read_credential(key)?)),
         _ => None,
@@ -61,18 +61,18 @@ fn certificates(tls: &TlsSettings) -> Result<TlsConfiguration, String> {
     }
 }
 
-/// Why a connection failed, and what to do where that is clear.
+/// Describes why a connection failed and, if known, what to do.
 pub fn explain(error: &ConnectionError) -> String {
     match error {
         ConnectionError::ConnectionRefused(
             ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
-        ) => "the broker refuses user or password (mqtt.user, mqtt.password_file)".to_owned(),
-        ConnectionError::ConnectionRefused(code) => format!("the broker refuses the connection: {code:?}"),
+        ) => "the broker rejects user or password (mqtt.user, mqtt.password_file)".to_owned(),
+        ConnectionError::ConnectionRefused(code) => format!("the broker rejects the connection: {code:?}"),
         ConnectionError::Timeout(_) => format!("no answer within {CONNECT_LIMIT_S} s"),
         ConnectionError::Io(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
-            format!("{error}: a firewall forbids it, or the unit (IPAddressAllow=)")
+            format!("{error}: blocked by a firewall or by IPAddressAllow= of the unit")
         }
-        // "TLS: I/O: ..." names the certificate's fault.
+        // "TLS: I/O: ..." describes the certificate error.
         other => other.to_string(),
     }
 }

@@ -1,7 +1,7 @@
-//! Discovery messages of Home Assistant: which entities there are, and where their values come from.
+//! Home Assistant discovery messages: the entities and the sources of their values.
 //!
-//! In: the daemon's status (cells, rules, vehicle) and the settings. Out: retained messages, one for each entity, all of one device.
-//! An entity is available while both the uplink and the daemon are; those about the uplink itself while the uplink is.
+//! Input: the daemon's status (cells, rules, vehicle) and the settings. Output: retained messages, one per entity, all for one device.
+//! Entities of the pack are available while both uplink and daemon are online; entities of the uplink while the uplink is online.
 
 use packwatch_host::status::document::StatusDocument;
 use serde_json::{Value, json};
@@ -37,7 +37,7 @@ pub fn messages(settings: &MqttSettings, document: &StatusDocument) -> Vec<Messa
     pack.chain(alarms).chain([device.event()]).chain(cells).chain(uplink).collect()
 }
 
-/// Adds what Home Assistant needs to know of a kind of value.
+/// Adds unit, device class and state class of a kind of value.
 fn describe(config: &mut Value, kind: Kind) {
     match kind {
         Kind::Measured { unit, class, decimals } => {
@@ -54,7 +54,7 @@ fn describe(config: &mut Value, kind: Kind) {
     }
 }
 
-/// What all entities share.
+/// Fields shared by all entities.
 struct Device<'a> {
     settings: &'a MqttSettings,
     node: String,
@@ -80,7 +80,7 @@ impl<'a> Device<'a> {
         Self { settings, node, device, version: &document.program_version }
     }
 
-    /// An entity whose value is at `path` of the JSON in the topic `source`.
+    /// Builds an entity whose value is at `path` in the JSON of topic `source`.
     fn entity(&self, name: &str, key: &str, source: &str, path: &str) -> Value {
         json!({
             "name": name,
@@ -109,13 +109,13 @@ impl<'a> Device<'a> {
         let name = format!("Alarm {}", rule.replace('_', " "));
         let mut config = self.entity(&name, &key, topic::INFO, &format!("alarms.{rule}"));
         config["device_class"] = "problem".into();
-        // A template writes the JSON words true, false and null so.
+        // Templates write the JSON values true, false and null as True, False and None.
         config["payload_on"] = "True".into();
         config["payload_off"] = "False".into();
         self.message("binary_sensor", &key, &config)
     }
 
-    /// Name, topic and identifier are Battery-Emulator's.
+    /// Name, topic and identifier match Battery-Emulator.
     fn cell(&self, index: usize) -> Message {
         let number = index + 1;
         let name = format!("Battery Cell Voltage {number}");
@@ -130,7 +130,7 @@ impl<'a> Device<'a> {
         config["json_attributes_topic"] = self.settings.topic(topic::EVENTS).into();
         config["entity_category"] = "diagnostic".into();
         config["icon"] = "mdi:information-outline".into();
-        // A state of Home Assistant has at most 255 characters.
+        // Home Assistant limits a state to 255 characters.
         config["value_template"] = "{{ value_json.message[:255] }}".into();
         self.message("sensor", "event", &config)
     }

@@ -1,8 +1,8 @@
-//! The entities of a pack: key in `info`, name, unit and value of each. Most are rows of the catalogue.
+//! The entities of a pack: key in `info`, name, unit and value. Most are rows of the catalogue.
 //!
-//! In: the daemon's status. Out: the values as JSON. Keys and names are Battery-Emulator's where it has the quantity. Outside,
-//! SOC and the like are percent and current and power are positive into the pack (charging), as Battery-Emulator has them: the
-//! daemon's current is negated. Cells count from 1. What is not known is `null`, never a number.
+//! Input: the daemon's status. Output: the values as JSON. Keys and names match Battery-Emulator where it has the quantity. As in
+//! Battery-Emulator, published SOC and similar values are percent, and current and power are positive into the pack (charging), so the
+//! daemon's current is negated. Cells count from 1. Unknown values are `null`, never a number.
 
 use std::borrow::Cow;
 use std::sync::LazyLock;
@@ -12,10 +12,10 @@ use packwatch_host::quantity::{CellIndex, Mode};
 use packwatch_host::status::document::StatusDocument;
 use serde_json::Value;
 
-/// What kind of value an entity has.
+/// Kind of value of an entity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A quantity with unit, device class and state class of Home Assistant; empty = none.
+    /// A quantity with unit, device class and state class of Home Assistant; empty means none.
     Measured {
         /// Unit.
         unit: &'static str,
@@ -24,7 +24,7 @@ pub enum Kind {
         /// Decimals.
         decimals: i32,
     },
-    /// A count or a cell's number.
+    /// A count or a cell number.
     Number,
     /// A word.
     Word,
@@ -36,16 +36,16 @@ pub enum Kind {
 pub struct Entity {
     /// Key in `info`, and part of the identifiers in Home Assistant.
     pub key: Cow<'static, str>,
-    /// Name shown.
+    /// Display name.
     pub name: Cow<'static, str>,
-    /// What kind of value it is.
+    /// Kind of value.
     pub kind: Kind,
     /// Whether it describes the daemon rather than the pack.
     pub is_diagnostic: bool,
     source: Source,
 }
 
-/// Where the value of an entity comes from.
+/// Source of an entity's value.
 enum Source {
     Document(fn(&StatusDocument) -> Value),
     Catalogue(Quantity, Part),
@@ -61,7 +61,7 @@ impl Entity {
         Self { is_diagnostic: true, ..self }
     }
 
-    /// Its value; `null` = not known.
+    /// Its value; `null` if unknown.
     pub fn value(&self, document: &StatusDocument) -> Value {
         match self.source {
             Source::Document(value) => value(document),
@@ -70,7 +70,7 @@ impl Entity {
     }
 }
 
-/// A number of a quantity as it is published; `null` = not known.
+/// Formats a number of a quantity for publication; `null` if unknown.
 pub fn published(quantity: Quantity, part: Part, value: Option<f64>) -> Value {
     let (Measure { decimals, .. }, factor) = measure(quantity.row().unit);
     let factor = if part == Part::Std { factor.abs() } else { factor };
@@ -90,7 +90,7 @@ impl Measure {
     }
 }
 
-/// How values of a unit are published, and by what they are multiplied.
+/// Published form and factor of a unit.
 const fn measure(unit: Unit) -> (Measure, f64) {
     let (unit, class, decimals, factor) = match unit {
         Unit::Level => ("%", "battery", 2, 100.0),
@@ -114,7 +114,7 @@ fn of_catalogue() -> impl Iterator<Item = Entity> {
             let (measure, _) = measure(row.unit);
             let (ending, name, class) = match part {
                 Part::Mean => ("", name.into(), measure.class),
-                // The deviation of a battery's level is not a level.
+                // The class is for levels; a deviation is not a level.
                 Part::Std if row.unit == Unit::Level => ("_std", format!("{name} Standard Deviation").into(), ""),
                 Part::Std => ("_std", format!("{name} Standard Deviation").into(), measure.class),
             };
@@ -135,7 +135,7 @@ pub fn entities() -> &'static [Entity] {
     &ENTITIES
 }
 
-/// The entities that are not rows of the catalogue.
+/// Entities outside the catalogue.
 fn derived() -> [Entity; 19] {
     let volts = measure(Unit::Volts).0.kind();
     let millivolts = Kind::Measured { unit: "mV", class: "voltage", decimals: 0 };
@@ -143,7 +143,7 @@ fn derived() -> [Entity; 19] {
     [
         Entity::new("time", "Time of the Values", Kind::Time, |d| super::payload::stamp(d.wall_time).into())
             .diagnostic(),
-        // Battery-Emulator has a scaled SOC too; without scaling, as here, they are equal.
+        // Battery-Emulator also has a scaled SOC. Here the two are equal.
         Entity::new("SOC_real", "SoC (real)", measure(Unit::Level).0.kind(), |d| {
             published(Quantity::Soc, Part::Mean, d.pack.values.mean(Quantity::Soc))
         }),
@@ -181,10 +181,10 @@ fn derived() -> [Entity; 19] {
     ]
 }
 
-/// A number with so many decimals; `null` = not known.
+/// Rounds to a number of decimals; `null` if unknown.
 pub fn rounded(value: Option<f64>, decimals: i32) -> Value {
     let scale = 10_f64.powi(decimals);
-    // Adding 0 makes -0 a 0. What is not finite becomes null.
+    // Adding 0 turns -0 into 0. Non-finite numbers become null.
     value.map_or(Value::Null, |value| Value::from((value * scale).round() / scale + 0.0))
 }
 
@@ -202,7 +202,7 @@ fn spread_mv(document: &StatusDocument) -> Option<f64> {
     Some((document.greatest(voltage)?.1 - document.least(voltage)?.1) * 1000.0)
 }
 
-/// Battery-Emulator's words.
+/// Charging state in Battery-Emulator's terms.
 fn charging_state(mode: Mode) -> Value {
     match mode {
         Mode::Charge => Value::from("Charging"),

@@ -1,9 +1,10 @@
-//! The link to the broker: connects for ever, publishes current values, and forwards the queue.
+//! The link to the broker: reconnects until stopped, publishes current values, and forwards the queue.
 //!
-//! In: the daemon's documents and the [`Queue`]. Out: messages with QoS 1. Each connection starts with nothing in memory, so no value of an
-//! earlier one is repeated: current values are those of the newest document, and a message leaves the queue only after the broker
-//! acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a longer connection it starts at 1 s.
-//! A message that the broker refuses ends nothing: one of the queue is tried again after `retry_max_s`, a current value with the next one.
+//! Input: the daemon's documents and the [`Queue`]. Output: messages with QoS 1. Each connection starts without messages in memory, so
+//! no value of an earlier connection is repeated. Current values come from the newest document. A message leaves the queue only after
+//! the broker has acknowledged it. After a lost connection the pause doubles up to `retry_max_s`; after a longer connection it restarts
+//! at 1 s. A message that the broker rejects does not end the connection: a queued message is retried after `retry_max_s`, a current
+//! value with the next document.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -25,13 +26,13 @@ use crate::status_stream::Documents;
 
 /// First pause after a lost connection.
 const RETRY: Duration = Duration::from_secs(1);
-/// Messages of the queue that are on their way at once: what most brokers accept.
+/// Most unacknowledged messages of the queue; most brokers accept this number.
 const WINDOW: usize = 20;
-/// Longest wait for the acknowledgement of the next message: a connection that lives and acknowledges nothing ends then.
+/// Longest wait for an acknowledgement. A connection that acknowledges nothing is closed then.
 const ACKNOWLEDGEMENT: Duration = Duration::from_secs(120);
-/// Pause before the queue on disk is tried again.
+/// Pause before the queue on disk is retried.
 const QUEUE_RETRY: Duration = Duration::from_secs(5);
-/// Time to say farewell to the broker.
+/// Longest time for the last messages before disconnecting.
 const FAREWELL: Duration = Duration::from_secs(2);
 
 /// A message to the broker.
@@ -39,14 +40,14 @@ const FAREWELL: Duration = Duration::from_secs(2);
 pub struct Message {
     /// Its topic.
     pub topic: String,
-    /// Its text; empty and retained = the retained message is removed.
+    /// Its text. If empty and retained, the broker removes the retained message.
     pub text: String,
     /// Whether the broker keeps it for later readers.
     pub is_retained: bool,
 }
 
 impl Message {
-    /// A message that the broker keeps.
+    /// Creates a message that the broker keeps.
     pub fn retained(topic: String, text: impl Into<String>) -> Self {
         Self { topic, text: text.into(), is_retained: true }
     }
@@ -55,9 +56,9 @@ impl Message {
 /// Why a message was not published.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Fault {
-    /// The broker does not accept it.
+    /// The broker rejected it.
     Refused(String),
-    /// The connection does not carry it.
+    /// The connection failed.
     Lost(String),
 }
 
@@ -72,14 +73,14 @@ impl fmt::Display for Fault {
 pub struct Link<'a> {
     /// Settings.
     pub settings: &'a MqttSettings,
-    /// Messages that wait.
+    /// Queued messages.
     pub queue: &'a Queue,
     /// The newest document.
     pub documents: Documents,
 }
 
 impl Link<'_> {
-    /// Connects again and again until `stopped` changes; then takes leave of the broker.
+    /// Connects repeatedly until `stopped` changes, then disconnects in order.
     pub async fn run(&self, mut stopped: watch::Receiver<bool>) {
         let most = Duration::from_secs(self.settings.retry_max_s);
         let (mut pause, mut latest) = (RETRY, String::new());
@@ -89,7 +90,7 @@ impl Link<'_> {
             if began.elapsed() > most {
                 (pause, latest) = (RETRY, String::new());
             }
-            // Once for each reason, not at each attempt.
+            // Log each reason once, not each attempt.
             if error != latest {
                 tracing::warn!(
                     broker = self.broker(),
@@ -111,11 +112,11 @@ impl Link<'_> {
         format!("{}:{}", self.settings.host, self.settings.port())
     }
 
-    /// One connection, until it fails or `stopped` changes.
+    /// Runs one connection until it fails or `stopped` changes.
     async fn connection(&self, stopped: &mut watch::Receiver<bool>) -> Result<(), String> {
         let (client, mut events) = connect::client(self.settings)?;
         let mut driven = pin!(drive(&mut events));
-        // Each class by itself: where the broker refuses one, the other flows.
+        // Each class is separate: if the broker rejects one, the other continues.
         let work = async {
             let (samples, events) = (self.forward(&client, Class::Sample), self.forward(&client, Class::Event));
             tokio::try_join!(self.current(&client), samples, events).map(|_| ())
@@ -129,7 +130,7 @@ impl Link<'_> {
         Ok(())
     }
 
-    /// Publishes what the last will would, and disconnects.
+    /// Publishes the same state as the last will, and disconnects.
     async fn farewell(&self, client: &AsyncClient, driven: Pin<&mut impl Future<Output = String>>) {
         let farewell = async {
             publish(client, vec![Message::retained(self.settings.topic(topic::STATUS), OFFLINE)]).await;
@@ -146,7 +147,7 @@ impl Link<'_> {
         tracing::info!("disconnected");
     }
 
-    /// Publishes current values every period, and at once when the daemon falls silent or comes back.
+    /// Publishes current values every period, and at once when the daemon falls silent or reports again.
     async fn current(&self, client: &AsyncClient) -> Result<Infallible, String> {
         let mut documents = self.documents.clone();
         let period = Duration::from_secs(self.settings.period_s);
@@ -166,20 +167,20 @@ impl Link<'_> {
                 tracing::info!(broker = self.broker(), waiting = self.queue.fill().messages, "connected");
             }
             if let Some(fault) = faults.first().filter(|_| !refused) {
-                tracing::error!(count = faults.len(), first = %fault, "the broker refuses current values");
+                tracing::error!(count = faults.len(), first = %fault, "the broker rejects current values");
                 refused = true;
             }
             tokio::select! {
                 _ = rhythm.tick() => {}
                 changed = documents.wait_for(|document| document.is_some() != is_online) => {
-                    // The sender lives as long as the link.
+                    // The sender outlives the link.
                     changed.map_err(|error| error.to_string())?;
                 }
             }
         }
     }
 
-    /// Sends the queue's messages of a class, oldest first, and removes what the broker acknowledged.
+    /// Sends queued messages of a class, oldest first, and removes acknowledged ones.
     async fn forward(&self, client: &AsyncClient, class: Class) -> Result<Infallible, String> {
         let topic = match class {
             Class::Sample => topic::HISTORY,
@@ -204,7 +205,7 @@ impl Link<'_> {
                 Some(Fault::Lost(error)) => return Err(error),
                 Some(Fault::Refused(error)) => {
                     if error != refused {
-                        tracing::error!(error, "the broker refuses messages of the queue: they are tried again");
+                        tracing::error!(error, "the broker rejects queued messages; retrying");
                         refused = error;
                     }
                     sleep(Duration::from_secs(self.settings.retry_max_s)).await;
@@ -214,14 +215,14 @@ impl Link<'_> {
     }
 }
 
-/// A message of the queue with its number, by which a reader finds gaps and repetitions.
+/// Adds the sequence number to a queued message, so that a reader finds gaps and repetitions.
 fn numbered(topic: &str, queued: &QueuedMessage) -> Message {
     let rest = queued.body.strip_prefix('{').unwrap_or_default();
     let text = format!("{{\"sequence\":{},{rest}", queued.sequence);
     Message { topic: topic.to_owned(), text, is_retained: false }
 }
 
-/// Does something with the queue as soon as the disk lets it.
+/// Retries an operation on the queue until it succeeds.
 async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>) -> T {
     let mut has_failed = false;
     loop {
@@ -233,7 +234,7 @@ async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>
             Ok(done) => return done,
             Err(error) => {
                 if !std::mem::replace(&mut has_failed, true) {
-                    tracing::error!(action, error, "the queue cannot be used: it waits");
+                    tracing::error!(action, error, "the queue cannot be used; retrying");
                 }
                 sleep(QUEUE_RETRY).await;
             }
@@ -241,7 +242,7 @@ async fn persist<T>(action: &str, mut attempt: impl FnMut() -> Result<T, String>
     }
 }
 
-/// What this connection has published, so that only news is.
+/// What this connection has published, so that only changes are sent.
 #[derive(Debug, Default)]
 struct PublishedState {
     has_status: bool,
@@ -252,8 +253,8 @@ struct PublishedState {
 }
 
 impl PublishedState {
-    /// Messages that are due: the values, whether the daemon is online, how full the queue is, whether this program is online, discovery
-    /// when the entities changed. In this order, so that no reader takes earlier values as current.
+    /// Messages that are due: the values, whether the daemon is online, the queue's fill, whether this program is online, and discovery if
+    /// the entities changed. The order ensures that no reader takes earlier values as current.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
         let retained = |name: &str, text: String| Message::retained(settings.topic(name), text);
         let mut news = Vec::new();
@@ -293,7 +294,7 @@ impl PublishedState {
     }
 }
 
-/// How full the queue is.
+/// Describes the queue's fill.
 fn uplink(fill: Fill) -> String {
     json!({
         "queue_messages": fill.messages,
@@ -304,12 +305,12 @@ fn uplink(fill: Fill) -> String {
     .to_string()
 }
 
-/// Drives the connection until it fails; returns why.
+/// Drives the connection until it fails; returns the reason.
 async fn drive(events: &mut EventLoop) -> String {
     loop {
         match events.poll().await {
             Ok(Event::Incoming(Packet::Disconnect(packet))) => {
-                return format!("the broker disconnects: {:?}", packet.reason_code);
+                return format!("the broker disconnected: {:?}", packet.reason_code);
             }
             Ok(_) => {}
             Err(error) => return connect::explain(&error),
@@ -317,7 +318,7 @@ async fn drive(events: &mut EventLoop) -> String {
     }
 }
 
-/// Publishes messages with QoS 1, in order; returns the outcome of each.
+/// Publishes messages with QoS 1 in order; returns the result of each.
 async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Vec<Result<(), Fault>> {
     let late = || Fault::Lost(format!("no acknowledgement within {ACKNOWLEDGEMENT:?}"));
     let mut notices = Vec::with_capacity(messages.len());
@@ -341,7 +342,7 @@ async fn publish(client: &AsyncClient, messages: Vec<Message>) -> Vec<Result<(),
                 Err(_) => Err(late()),
                 Ok(completion) => completion.map(|_| ()).map_err(|error| match error {
                     PublishNoticeError::V5PubAck(reason) => {
-                        Fault::Refused(format!("{topic}: the broker refuses it: {reason:?}"))
+                        Fault::Refused(format!("{topic}: the broker rejects the message: {reason:?}"))
                     }
                     other => Fault::Lost(format!("{topic}: {other}")),
                 }),

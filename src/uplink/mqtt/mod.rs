@@ -1,15 +1,15 @@
-//! `packwatch mqtt`: the daemon's status for an MQTT broker and Home Assistant, with a queue for a lost link.
+//! `packwatch mqtt`: sends the daemon's status to an MQTT broker and Home Assistant, with a queue for a lost link.
 //!
 //! | module | what lives there |
 //! | --- | --- |
-//! | `settings` | table `[mqtt]` |
-//! | `entity`, `payload` | the table of entities; the documents that are published |
-//! | `discovery` | messages for Home Assistant |
-//! | `queue` | messages that wait, on disk |
-//! | `recorder` | what becomes a message of the queue |
-//! | `connect`, `link` | a connection; publishing and forwarding |
+//! | `settings` | the table `[mqtt]` |
+//! | `entity`, `payload` | the table of entities; the published documents |
+//! | `discovery` | Home Assistant discovery messages |
+//! | `queue` | pending messages on disk |
+//! | `recorder` | which documents and events are queued |
+//! | `connect`, `link` | one connection; publishing and forwarding |
 //!
-//! Recorder and link share one thread and the queue. The recorder does not wait for the link.
+//! Recorder and link share one thread and the queue. The recorder never waits for the link.
 
 pub mod connect;
 pub mod discovery;
@@ -31,7 +31,7 @@ use queue::Queue;
 use recorder::Recorder;
 use settings::MqttSettings;
 
-/// Topics below the base topic: `info`, `spec_data`, `events` and `status` are Battery-Emulator's.
+/// Topics below the base topic. `info`, `spec_data`, `events` and `status` match Battery-Emulator.
 pub mod topic {
     /// Whether the uplink is online: retained, and the last will.
     pub const STATUS: &str = "status";
@@ -45,29 +45,32 @@ pub mod topic {
     pub const EVENTS: &str = "events";
     /// Samples, each once, in order.
     pub const HISTORY: &str = "history";
-    /// How full the queue is: retained.
+    /// Fill of the queue: retained.
     pub const UPLINK: &str = "uplink";
 }
 
-/// Payload while available, as Home Assistant expects it.
+/// Payload of an available state, as Home Assistant expects it.
 pub const ONLINE: &str = "online";
-/// Payload while not.
+/// Payload of an unavailable state.
 pub const OFFLINE: &str = "offline";
 
 /// Runs until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// When the settings are not usable or have no broker, or the queue cannot be opened.
+/// The settings are invalid or have no broker, or the queue cannot be opened.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let config = options.config.display();
-    let mqtt = settings.mqtt.as_ref().ok_or_else(|| Failure::config(format!("{config}: no table [mqtt]")))?;
+    let mqtt = settings
+        .mqtt
+        .as_ref()
+        .ok_or_else(|| Failure::config(format!("{config}: no table [mqtt]; add it, with host = \"...\"")))?;
     serve(&settings, mqtt).map_err(|error| Failure::new(format!("{config}: {error}")))
 }
 
 fn serve(settings: &Settings, mqtt: &MqttSettings) -> Result<(), String> {
     if mqtt.password_file.is_some() && mqtt.tls.is_none() && !is_this_computer(&mqtt.host) {
-        tracing::warn!(host = mqtt.host, "the password is sent in plain text: add a table [mqtt.tls]");
+        tracing::warn!(host = mqtt.host, "the password is sent in plain text; add a table [mqtt.tls]");
     }
     let queue = Queue::open(&mqtt.history)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();

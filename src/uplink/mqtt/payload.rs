@@ -1,6 +1,6 @@
-//! The documents that are published: `info`, `spec_data`, a sample of the history, an event.
+//! The published documents: `info`, `spec_data`, a sample of the history, an event.
 //!
-//! In: the daemon's status. Out: JSON. The same status gives the same bytes. What is not known is `null`.
+//! Input: the daemon's status. Output: JSON. The same status gives the same bytes. Unknown values are `null`.
 
 use packwatch_host::alarm::Rule;
 use packwatch_host::io::stamp::format_utc;
@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 
 use super::entity::{entities, published, rounded};
 
-/// The pack: every entity, and `alarms` with the state of each rule that has a threshold.
+/// Values of the pack: every entity, and `alarms` with the state of each rule that has a threshold.
 pub fn info(document: &StatusDocument) -> Value {
     let mut info: Map<_, _> =
         entities().iter().map(|entity| (entity.key.to_string(), entity.value(document))).collect();
@@ -22,14 +22,14 @@ pub fn info(document: &StatusDocument) -> Value {
     info.into()
 }
 
-/// Whether an alarm of the rule is raised; `null` = that is not known of every one.
+/// Whether an alarm of the rule is raised; `null` if any of them is unknown and none raised.
 fn alarm(alarms: &AlarmStatus, rule: Rule) -> Value {
     let is_raised = alarms.list.iter().any(|alarm| alarm.rule == rule && alarm.state.is_raised());
     let is_known = alarms.omitted == 0 && alarms.unknown.iter().all(|unknown| unknown.rule != rule);
     if is_raised || is_known { is_raised.into() } else { Value::Null }
 }
 
-/// The cells: voltages in mV and, as Battery-Emulator has them, in V; SOC, capacity and resistance with standard deviations.
+/// Values of the cells: voltages in mV and, for Battery-Emulator, in V; SOC, capacity and resistance with standard deviations.
 pub fn spec_data(document: &StatusDocument) -> Value {
     let each = |of: &dyn Fn(&CellView) -> Value| document.cells.iter().map(of).collect::<Value>();
     let millivolts = |cell: &CellView| whole(cell.values.mean(Quantity::Voltage).map(|volts| volts * 1000.0));
@@ -48,12 +48,12 @@ pub fn spec_data(document: &StatusDocument) -> Value {
     data.into()
 }
 
-/// One sample of the history: what `info` and `spec_data` held.
+/// One sample of the history: the contents of `info` and `spec_data`.
 pub fn sample(document: &StatusDocument) -> Value {
     json!({ "time": stamp(document.wall_time), "info": info(document), "spec_data": spec_data(document) })
 }
 
-/// An event of the daemon, with Battery-Emulator's `event_type`, `severity` and `message`. Its time is that of the computer's clock.
+/// An event of the daemon, with Battery-Emulator's `event_type`, `severity` and `message`. Its time is from the computer's clock.
 pub fn event(document: &StatusDocument, event: &Value) -> Value {
     let text = |key: &str| event.get(key).and_then(Value::as_str);
     let name = text("event").unwrap_or("unknown");
@@ -68,7 +68,7 @@ pub fn event(document: &StatusDocument, event: &Value) -> Value {
     })
 }
 
-/// The event in one line: `capacity_low raised, cell 1, value 2.41, threshold 2.5`, else its name and values.
+/// Describes the event in one line: `capacity_low raised, cell 1, value 2.41, threshold 2.5`, else its name and values.
 fn message(name: &str, event: &Value) -> String {
     let text = |key: &str| event.get(key).and_then(Value::as_str).unwrap_or("?");
     let is_alarm = name == "alarm";
@@ -89,23 +89,23 @@ fn message(name: &str, event: &Value) -> String {
     words
 }
 
-/// A number with at most four decimals.
+/// Formats a number with at most four decimals.
 fn short(number: Option<f64>) -> String {
     rounded(number, 4).to_string()
 }
 
-/// A whole number; `null` = not known, or not finite.
+/// A whole number; `null` if unknown or not finite.
 fn whole(value: Option<f64>) -> Value {
-    #[expect(clippy::cast_possible_truncation, reason = "a voltage in mV is far inside; `as` saturates")]
+    #[expect(clippy::cast_possible_truncation, reason = "voltages in mV are far within the range; `as` saturates")]
     value.filter(|value| value.is_finite()).map_or(Value::Null, |value| Value::from(value.round() as i64))
 }
 
-/// The word that a value of an enumeration has in JSON.
+/// Name of an enumeration value in JSON.
 pub fn word(value: &impl Serialize) -> String {
     serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
 }
 
-/// Time as ISO 8601 in UTC with milliseconds.
+/// Formats the time as ISO 8601 in UTC with milliseconds.
 pub fn stamp(time: Timestamp) -> String {
     let millis = time.nanos().div_euclid(1_000_000).rem_euclid(1000);
     format!("{}.{millis:03}Z", format_utc(time).trim_end_matches('Z'))

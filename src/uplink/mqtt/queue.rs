@@ -1,9 +1,9 @@
-//! The queue on disk: messages that the broker has not acknowledged yet, oldest first.
+//! The queue on disk: messages that the broker has not acknowledged, oldest first.
 //!
-//! In: messages of the recorder. Out: the oldest messages of a class in order, until they are removed. A message that was accepted survives a
-//! power cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. When it is
-//! full, the oldest samples are dropped, and the oldest events only when no sample is left. Drops are counted for ever. A
-//! file that is damaged is put aside and a new one begun; where the disk fails or a newer program wrote the file, it stays as it is.
+//! Input: messages of the recorder. Output: the oldest messages of a class in order, until removed. An added message survives a power
+//! cut and a restart (SQLite, write-ahead log, flushed at each commit). The queue is bounded in messages and bytes. If full, it drops
+//! the oldest samples; it drops the oldest events only if no samples are left. Drops are counted permanently. A damaged file is set
+//! aside and a new one created. If the disk fails or a newer version wrote the file, the file is left unchanged.
 
 use std::cell::{Cell, RefCell};
 use std::fs::File;
@@ -17,35 +17,35 @@ use super::settings::HistorySettings;
 
 const FILE: &str = "queue.db";
 const LOCK: &str = "queue.lock";
-/// Layout of the file.
+/// Layout version of the file.
 const VERSION: i64 = 1;
-/// Pages (4 KiB) of the write-ahead log before it is copied into the file: 1 MiB.
+/// Pages (4 KiB) of the write-ahead log before a checkpoint: 1 MiB.
 const CHECKPOINT_PAGES: i64 = 256;
 
-/// What is dropped first.
+/// Class of a message; decides what is dropped first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Class {
     /// A periodic sample.
     Sample = 0,
-    /// An event, alarms among them: dropped only when no sample is left.
+    /// An event, including alarms; dropped only if no samples are left.
     Event = 1,
 }
 
-/// A message in the queue.
+/// A queued message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct QueuedMessage {
-    /// Its number: rises by one with each message, also over restarts.
+    /// Sequence number; increases by one with each message, also across restarts.
     pub sequence: i64,
     /// Its text.
     pub body: String,
 }
 
-/// How full the queue is, and what fell out of it since it was created.
+/// Fill of the queue, and drops since it was created.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Fill {
-    /// Messages.
+    /// Number of messages.
     pub messages: u64,
-    /// Bytes of messages.
+    /// Size of the messages, bytes.
     pub bytes: u64,
     /// Samples dropped.
     pub dropped_samples: u64,
@@ -65,10 +65,10 @@ pub struct Queue {
 }
 
 impl Queue {
-    /// Opens the queue in its folder, and creates what is missing.
+    /// Opens the queue in its folder; creates what is missing.
     ///
     /// # Errors
-    /// When the folder cannot be written, or another uplink uses it.
+    /// The folder cannot be written, or another uplink uses it.
     pub fn open(settings: &HistorySettings) -> Result<Self, String> {
         let folder = &settings.folder;
         let at = |error: &dyn std::fmt::Display| format!("{}: {error}", folder.display());
@@ -80,8 +80,8 @@ impl Queue {
             Ok(database) => database,
             Err(OpenFault::Damaged(error)) => {
                 let aside = put_aside(&path).map_err(|error| at(&error))?;
-                tracing::error!(error, aside = %aside.display(), "the queue is damaged: put aside, a new one begins");
-                // Beyond every number of the old one: a reader takes a number that it knows for a repetition.
+                tracing::error!(error, aside = %aside.display(), "the queue is damaged: set aside, starting a new one");
+                // Start above all numbers of the old queue; a reader takes a known number for a repetition.
                 let millis = Reading::now().realtime_ns / 1_000_000;
                 prepare(&path, millis).map_err(|fault| at(&fault.text()))?
             }
@@ -93,7 +93,7 @@ impl Queue {
         Ok(Self { database, max_messages, max_bytes, fill: Cell::new(fill), added: Notify::new(), _lock: lock })
     }
 
-    /// How full it is.
+    /// Returns its fill.
     pub fn fill(&self) -> Fill {
         self.fill.get()
     }
@@ -103,10 +103,10 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages and notes `seen` for [`Self::seen`], all or nothing. On return they are on disk.
+    /// Adds messages and stores `seen` for [`Self::seen`] in one transaction. On return they are on disk.
     ///
     /// # Errors
-    /// When the disk does not take them.
+    /// The disk fails or is full.
     pub fn add(&self, messages: &[(Class, String)], seen: Option<&str>) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let fill = self.try_add(&mut database, messages, seen).map_err(|error| error.to_string())?;
@@ -142,7 +142,7 @@ impl Queue {
         Ok(fill)
     }
 
-    /// What the latest [`Self::add`] with `seen` noted.
+    /// Returns the text stored by the latest [`Self::add`] with `seen`.
     pub fn seen(&self) -> Option<String> {
         let database = self.database.borrow();
         let seen = database.query_row("SELECT text FROM seen", [], |row| row.get(0)).optional();
@@ -152,10 +152,10 @@ impl Queue {
         })
     }
 
-    /// The oldest messages of a class, at most `count`.
+    /// Returns the oldest messages of a class, at most `count`.
     ///
     /// # Errors
-    /// When the disk cannot be read.
+    /// The disk cannot be read.
     pub fn oldest(&self, class: Class, count: usize) -> Result<Vec<QueuedMessage>, String> {
         let database = self.database.borrow();
         let read = || {
@@ -169,10 +169,10 @@ impl Queue {
         read().map_err(|error| error.to_string())
     }
 
-    /// Removes messages that the broker has. One that was dropped meanwhile is no fault.
+    /// Removes acknowledged messages. Messages already dropped are ignored.
     ///
     /// # Errors
-    /// When the disk does not take it: they are sent again then.
+    /// The disk cannot be written; the messages will be sent again.
     pub fn remove(&self, messages: &[QueuedMessage]) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let mut fill = self.fill.get();
@@ -193,7 +193,7 @@ impl Queue {
     }
 }
 
-/// A column that is never negative.
+/// Reads a column that is never negative.
 fn count(row: &rusqlite::Row<'_>, column: usize) -> rusqlite::Result<u64> {
     row.get::<_, i64>(column).map(i64::unsigned_abs)
 }
@@ -204,9 +204,9 @@ fn length(body: &str) -> u64 {
 
 /// Why the file cannot be opened.
 enum OpenFault {
-    /// It holds no queue.
+    /// The file is not a valid queue.
     Damaged(String),
-    /// It may hold one: the disk is full or fails, or the file is a newer program's.
+    /// The file may be valid: the disk is full or fails, or a newer version wrote it.
     Failed(String),
 }
 
@@ -227,7 +227,7 @@ impl From<rusqlite::Error> for OpenFault {
     }
 }
 
-/// Opens the file and checks it. Where it has no tables, they are created; the first message has the number after `latest`.
+/// Opens the file and checks it. Creates missing tables; the first message then gets the number after `latest`.
 fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     let database = Connection::open(path)?;
     database.pragma_update(None, "journal_mode", "wal")?;
@@ -243,11 +243,11 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
         0 => {}
         _ => {
             return Err(OpenFault::Failed(format!(
-                "{FILE} has layout {version}, must be {VERSION}: a newer program's"
+                "{FILE} has layout {version}, must be {VERSION}: written by a newer version of packwatch"
             )));
         }
     }
-    // AUTOINCREMENT: no number is used twice, also when the queue was empty meanwhile.
+    // AUTOINCREMENT: numbers are never reused, even if the queue was empty in between.
     database.execute_batch(&format!(
         "BEGIN;
          CREATE TABLE IF NOT EXISTS message (id INTEGER PRIMARY KEY AUTOINCREMENT, class INTEGER NOT NULL, body TEXT NOT NULL);
@@ -261,7 +261,7 @@ fn prepare(path: &Path, latest: i64) -> Result<Connection, OpenFault> {
     Ok(database)
 }
 
-/// Renames the file, over an earlier one that was put aside; its log belongs to it.
+/// Renames the file and its write-ahead log, replacing those set aside earlier.
 fn put_aside(path: &Path) -> std::io::Result<PathBuf> {
     let aside = path.with_extension("damaged");
     for suffix in ["", "-wal", "-shm"] {
@@ -286,13 +286,13 @@ fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
             database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
         count.optional().map(Option::unwrap_or_default)
     };
-    // In bytes, as `length` counts: of a text, SQLite counts characters.
+    // In bytes, as in `length`; SQLite counts characters of a text.
     let size = "SELECT count(*), coalesce(sum(length(CAST(body AS BLOB))), 0) FROM message";
     let (messages, bytes) = database.query_row(size, [], |row| Ok((count(row, 0)?, count(row, 1)?)))?;
     Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
 }
 
-/// Drops the oldest sample, else the oldest event; `false` = the queue is empty.
+/// Drops the oldest sample, else the oldest event; `false` if the queue is empty.
 fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Result<bool> {
     let oldest = "DELETE FROM message WHERE id = (SELECT id FROM message ORDER BY class, id LIMIT 1)
                   RETURNING class, length(CAST(body AS BLOB))";

@@ -1,9 +1,8 @@
-//! The recorder: which of the daemon's documents become samples, and which of its events are new.
+//! The recorder: selects the documents to queue as samples, and the new events.
 //!
-//! In: the daemon's documents. Out: messages in the [`Queue`], whether the broker can be reached or not. A sample is due by the
-//! daemon's clock. The document lists the latest events; those that an earlier document listed are recognised by their place in that
-//! list, also over a restart of this program. Events that leave the list between two documents, or while this program is not running,
-//! are not seen; the first is logged.
+//! Input: the daemon's documents. Output: messages in the [`Queue`], whether or not the broker can be reached. Samples are due by the
+//! daemon's clock. Each document lists the latest events; the recorder finds the new ones by comparing the lists, also across its own
+//! restart. Events that leave the list between two documents, or while this program is not running, are missed; the former is logged.
 
 use std::cell::Cell;
 
@@ -16,7 +15,7 @@ use super::payload;
 use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
-/// A document that comes this much before a sample is due is taken: the daemon's documents come about once a second.
+/// A document this much before a sample is due is used, because documents arrive about once a second.
 const TOLERANCE_S: f64 = 0.5;
 
 /// State of the recorder.
@@ -31,13 +30,13 @@ pub struct Recorder<'a> {
 }
 
 impl<'a> Recorder<'a> {
-    /// A recorder that takes a sample every `period_s` seconds, none for 0.
+    /// Creates a recorder that queues a sample every `period_s` seconds; 0 = no samples.
     pub fn new(queue: &'a Queue, period_s: u64) -> Self {
         let events = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok()).unwrap_or_default();
         Self { queue, period_s, due: None, events, works: Cell::new(true), drops: Cell::new(false) }
     }
 
-    /// Takes documents, for ever.
+    /// Handles documents until the stream ends.
     pub async fn run(mut self, mut documents: Documents) {
         while documents.changed().await.is_ok() {
             let document = documents.borrow_and_update().clone();
@@ -48,11 +47,11 @@ impl<'a> Recorder<'a> {
         std::future::pending().await
     }
 
-    /// Queues what is new in a document. What the disk does not take is tried again with the next one.
+    /// Queues what is new in a document. If the disk fails, retries with the next document.
     pub fn take(&mut self, document: &StatusDocument) {
         let news = new_events(&self.events, &document.events);
         if !self.events.is_empty() && news.len() == document.events.len() && news.len() >= MAX_EVENTS {
-            tracing::warn!(listed = news.len(), "the daemon had more new events than it lists: some are missed");
+            tracing::warn!(listed = news.len(), "the daemon had more new events than it lists; some may be missing");
         }
         let mut messages: Vec<_> =
             news.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
@@ -70,7 +69,7 @@ impl<'a> Recorder<'a> {
         if self.works.replace(result.is_ok()) != result.is_ok() {
             match &result {
                 Ok(()) => tracing::info!("the queue can be written again"),
-                Err(error) => tracing::error!(error, "the queue cannot be written: samples are lost until it can"),
+                Err(error) => tracing::error!(error, "the queue cannot be written; samples are lost until it can"),
             }
         }
         if result.is_ok() {
@@ -79,7 +78,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Logs that messages fall out of the queue, once until none does.
+    /// Logs once when messages are dropped, until no more are.
     fn note_drops(&self, before: Fill, now: Fill) {
         let is_dropping = (before.dropped_samples, before.dropped_events) != (now.dropped_samples, now.dropped_events);
         if is_dropping && !self.drops.get() {
@@ -92,7 +91,7 @@ impl<'a> Recorder<'a> {
         self.drops.set(is_dropping);
     }
 
-    /// When the next sample is due, if one is due `now`. After a pause or a step of the clock the rhythm begins again.
+    /// Returns the time of the next sample if one is due `now`. After a pause or a clock step the schedule restarts.
     fn next_due(&self, now: Timestamp) -> Option<Timestamp> {
         if self.period_s == 0 {
             return None;
@@ -111,7 +110,7 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Events of `now` that `before` did not list: `now` begins with the end of `before`, because the daemon drops the oldest.
+/// Events of `now` not listed in `before`. `now` begins with the end of `before`, because the daemon drops the oldest.
 fn new_events<'a>(before: &[Value], now: &'a [Value]) -> &'a [Value] {
     let kept = (0..=before.len()).find_map(|dropped| {
         let end = &before[dropped..];

@@ -1,7 +1,7 @@
-//! Table `[mqtt]` of the uplink's settings: the broker, what is published when, and how much waits for a lost link.
+//! Table `[mqtt]` of the uplink's settings: the broker, what is published when, and the queue for a lost link.
 //!
-//! In: TOML. Out: checked settings; a number or text outside its range is a fault of its line. Files are read at each connection,
-//! so that a new certificate or password needs no restart.
+//! Input: TOML. Output: validated settings. A value outside its range is reported with its line. Files are read at each connection, so
+//! a new certificate or password needs no restart.
 
 use std::path::PathBuf;
 
@@ -9,23 +9,23 @@ use serde::{Deserialize, Deserializer, de};
 
 use crate::files::read_credential;
 
-/// Longest topic, bytes: MQTT's own limit of 65,535 less what is appended, by far.
+/// Longest topic, bytes; leaves ample room for suffixes below MQTT's limit of 65,535.
 const MAX_TOPIC_BYTES: usize = 200;
 
-/// The broker and what it gets.
+/// The broker, and what is sent to it.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MqttSettings {
     /// Host name or address of the broker.
     #[serde(deserialize_with = "text")]
     pub host: String,
-    /// Its port; `None` = 1883, or 8883 with TLS.
+    /// Port; `None` = 1883, or 8883 with TLS.
     pub port: Option<u16>,
-    /// Name of this client at the broker, one for each uplink; `None` = `packwatch-` and the topic.
+    /// Name of this client at the broker, unique for each uplink; `None` = `packwatch-` and the topic.
     pub client_id: Option<String>,
     /// User name; `None` = anonymous.
     pub user: Option<String>,
-    /// File with the password. A relative path is below `CREDENTIALS_DIRECTORY`, if systemd set that.
+    /// File with the password. A relative path is relative to `CREDENTIALS_DIRECTORY`, if systemd has set it.
     pub password_file: Option<PathBuf>,
     /// Base of all topics of this pack.
     #[serde(deserialize_with = "topic")]
@@ -33,17 +33,17 @@ pub struct MqttSettings {
     /// Time between current values, s.
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub period_s: u64,
-    /// Longest silence on the connection, s; the broker publishes the last will after one and a half of it.
+    /// Longest silence on the connection, s. The broker publishes the last will after 1.5 times this.
     #[serde(deserialize_with = "whole::<5, 3600, _>")]
     pub keep_alive_s: u64,
-    /// Longest pause between two attempts to connect, s.
+    /// Longest pause between attempts to connect, s.
     #[serde(deserialize_with = "whole::<1, 3600, _>")]
     pub retry_max_s: u64,
-    /// TLS; `None` = the connection is plain.
+    /// TLS; `None` = unencrypted.
     pub tls: Option<TlsSettings>,
     /// Discovery by Home Assistant.
     pub discovery: DiscoverySettings,
-    /// What is kept for a lost link.
+    /// Queue for a lost link.
     pub history: HistorySettings,
 }
 
@@ -53,7 +53,7 @@ pub struct MqttSettings {
 pub struct TlsSettings {
     /// PEM file of the authorities that may sign the broker's certificate; `None` = those of the system.
     pub ca_file: Option<PathBuf>,
-    /// PEM file with the client's certificate; `None` = none is shown.
+    /// PEM file with the client's certificate; `None` = no client certificate.
     pub certificate_file: Option<PathBuf>,
     /// PEM file with the key of that certificate.
     pub key_file: Option<PathBuf>,
@@ -63,22 +63,22 @@ pub struct TlsSettings {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DiscoverySettings {
-    /// Whether it is published.
+    /// Whether discovery messages are published.
     pub enabled: bool,
-    /// First part of its topics.
+    /// First part of the discovery topics.
     #[serde(deserialize_with = "topic")]
     pub prefix: String,
-    /// Whether each cell's voltage is an entity.
+    /// Whether each cell voltage is an entity.
     pub cells: bool,
-    /// Name of the device; `None` = the vehicle as the daemon's configuration names it, else the topic.
+    /// Name of the device; `None` = the vehicle named by the daemon's configuration, else the topic.
     pub device_name: Option<String>,
 }
 
-/// What is kept for a lost link.
+/// Queue for a lost link.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HistorySettings {
-    /// Time between samples, s of the daemon's clock; 0 = none.
+    /// Time between samples in the daemon's clock, s; 0 = no samples.
     #[serde(deserialize_with = "whole::<0, 86_400, _>")]
     pub period_s: u64,
     /// Folder of the queue.
@@ -86,7 +86,7 @@ pub struct HistorySettings {
     /// Most messages in the queue.
     #[serde(deserialize_with = "whole::<1, 10_000_000, _>")]
     pub max_messages: u64,
-    /// Most bytes of messages in the queue.
+    /// Largest total size of queued messages, bytes.
     #[serde(deserialize_with = "whole::<100_000, 100_000_000_000, _>")]
     pub max_bytes: u64,
 }
@@ -128,31 +128,31 @@ impl Default for HistorySettings {
 }
 
 impl MqttSettings {
-    /// The broker's port.
+    /// Returns the broker's port.
     pub fn port(&self) -> u16 {
         self.port.unwrap_or(if self.tls.is_some() { 8883 } else { 1883 })
     }
 
-    /// Name of this client at the broker.
+    /// Returns the name of this client at the broker.
     pub fn client_id(&self) -> String {
         self.client_id.clone().unwrap_or_else(|| format!("packwatch-{}", self.node()))
     }
 
-    /// The topic `name` of this pack.
+    /// Returns the topic `name` of this pack.
     pub fn topic(&self, name: &str) -> String {
         format!("{}/{name}", self.topic)
     }
 
-    /// The topic as one word of letters, digits, `-` and `_`: what Home Assistant allows in its topics and identifiers.
+    /// Converts the topic to a word of letters, digits, `-` and `_`, as Home Assistant requires in topics and identifiers.
     pub fn node(&self) -> String {
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         self.topic.chars().map(|c| if allowed(c) { c } else { '_' }).collect()
     }
 
-    /// Checks what several keys together may be.
+    /// Checks combinations of keys.
     ///
     /// # Errors
-    /// Names the keys and what is allowed.
+    /// The keys and what is allowed.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Some(tls) = &self.tls else { return Ok(()) };
         if tls.certificate_file.is_some() != tls.key_file.is_some() {
@@ -164,10 +164,10 @@ impl MqttSettings {
         Ok(())
     }
 
-    /// Reads the password; the line end after it does not belong to it.
+    /// Reads the password; a trailing line end is removed.
     ///
     /// # Errors
-    /// When the file cannot be read or is empty.
+    /// The file cannot be read or is empty.
     pub fn password(&self) -> Result<Option<Vec<u8>>, String> {
         let Some(path) = &self.password_file else { return Ok(None) };
         let mut password = read_credential(path)?;
@@ -175,7 +175,7 @@ impl MqttSettings {
             password.pop();
         }
         if password.is_empty() {
-            return Err(format!("{}: no password in it", path.display()));
+            return Err(format!("{}: contains no password", path.display()));
         }
         Ok(Some(password))
     }
@@ -197,7 +197,7 @@ fn topic<'de, D: Deserializer<'de>>(source: D) -> Result<String, D::Error> {
     let has_empty_level = topic.split('/').any(str::is_empty);
     if has_empty_level || topic.starts_with('$') || topic.contains(['+', '#']) || topic.contains(char::is_control) {
         return Err(de::Error::custom(
-            "must be a topic: levels between '/', not empty, without '+' and '#', no '$' in front",
+            "must be a topic: non-empty levels separated by '/', without '+' and '#', not starting with '$'",
         ));
     }
     if topic.len() > MAX_TOPIC_BYTES {
@@ -211,7 +211,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_topic_with_levels_is_one_word_in_identifiers() {
+    fn topic_levels_become_one_identifier_word() {
         let settings = MqttSettings { topic: "fleet/Bus 12/pack-1".to_owned(), ..MqttSettings::default() };
         assert_eq!(
             (settings.node().as_str(), settings.topic("info").as_str()),
@@ -221,13 +221,13 @@ mod tests {
     }
 
     #[test]
-    fn the_port_follows_tls() {
+    fn default_port_depends_on_tls() {
         let tls = MqttSettings { tls: Some(TlsSettings::default()), ..MqttSettings::default() };
         assert_eq!((MqttSettings::default().port(), tls.port()), (1883, 8883));
     }
 
     #[test]
-    fn a_password_ends_before_its_line_end_and_may_not_be_empty() {
+    fn password_is_trimmed_and_not_empty() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let settings = MqttSettings { password_file: Some(file.path().to_owned()), ..MqttSettings::default() };
         for (text, password) in [("a b", "a b"), ("a b\n", "a b"), ("a b\r\n", "a b"), (" a\n\n", " a")] {
@@ -235,7 +235,7 @@ mod tests {
             assert_eq!(settings.password().unwrap().unwrap(), password.as_bytes());
         }
         std::fs::write(file.path(), "\n").unwrap();
-        assert!(settings.password().unwrap_err().ends_with("no password in it"));
+        assert!(settings.password().unwrap_err().ends_with("contains no password"));
         std::fs::remove_file(file.path()).unwrap();
         assert!(settings.password().unwrap_err().contains("No such file"));
     }

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Paths of the leaves below a node of the JSON, with their datatypes.
+/// Paths of the leaves below a JSON node, with datatypes.
 fn leaves(path: &str, node: &Value, found: &mut Vec<(String, String)>) {
     if node["type"] == "branch" {
         for (name, child) in node["children"].as_object().unwrap() {
@@ -14,7 +14,7 @@ fn leaves(path: &str, node: &Value, found: &mut Vec<(String, String)>) {
 }
 
 #[test]
-fn both_files_have_every_signal_of_the_overlay_and_no_other() {
+fn both_files_list_exactly_the_overlay_signals() {
     for branch in ["Vehicle.Powertrain.TractionBattery.Packwatch", "Vehicle.Private.Makers.Packwatch"] {
         let mut expected: Vec<_> =
             signals::of_overlay().map(|signal| (signal.path(branch), signal.data_type.name().to_owned())).collect();
@@ -32,7 +32,7 @@ fn both_files_have_every_signal_of_the_overlay_and_no_other() {
 }
 
 #[test]
-fn a_branch_of_its_own_defines_its_parents_but_none_of_vss() {
+fn own_branch_defines_parents_but_no_vss_branches() {
     let yaml = vspec("Vehicle.Private.Packwatch");
     assert!(yaml.contains("\nVehicle.Private:\n  type: branch\n") && yaml.contains("\nVehicle.Private.Packwatch:\n"));
     assert!(yaml.contains("\nVehicle.Private.Packwatch.Cells:\n  type: branch\n"));
@@ -42,7 +42,7 @@ fn a_branch_of_its_own_defines_its_parents_but_none_of_vss() {
 }
 
 #[test]
-fn names_follow_the_rules_of_vss() {
+fn names_follow_vss_rules() {
     for signal in signals::of_overlay() {
         let leaf = signal.name.rsplit('.').next().unwrap();
         assert!(
@@ -64,7 +64,7 @@ fn names_follow_the_rules_of_vss() {
 }
 
 #[test]
-fn the_manual_has_every_signal() {
+fn manual_page_matches_reference() {
     let page =
         std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/src/reference/vss.md")).unwrap();
     assert!(page == reference(), "regenerate it: packwatch vss --reference > docs/src/reference/vss.md");

@@ -1,4 +1,4 @@
-//! Ids and datatypes of a broker against those of the signals: what is skipped, what is withheld.
+//! Ids and datatypes of a broker compared with those of the signals: skipped signals, withheld values.
 
 use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::status::client::parse;
@@ -18,7 +18,7 @@ fn float(number: f32) -> Value {
     Value { typed: Some(TypedValue::Float(number)) }
 }
 
-/// Both are percent from 0 to 100.
+/// A signal in percent, limited to 0 to 100.
 fn entry(path: &str, id: i32) -> Metadata {
     let (min, max) = (Some(float(0.0)), Some(float(100.0)));
     Metadata { path: path.into(), id, data_type: 11, allowed: None, min, max }
@@ -38,7 +38,7 @@ fn sent(points: &Points, id: i32) -> Option<f32> {
 }
 
 #[test]
-fn a_value_goes_to_the_id_of_its_own_path() {
+fn value_is_sent_with_id_of_its_path() {
     for (health, charge) in [(7, 8), (8, 7)] {
         let (routes, _) = Routes::resolve(&[entry(HEALTH, health), entry(CHARGE, charge)], BRANCH);
         let points = routes.points(Some(&document()));
@@ -48,15 +48,18 @@ fn a_value_goes_to_the_id_of_its_own_path() {
 }
 
 #[test]
-fn a_path_that_is_missing_or_of_another_datatype_is_skipped() {
+fn missing_path_or_other_datatype_is_skipped() {
     let other = Metadata { data_type: 7, ..entry(HEALTH, 1) };
-    assert_eq!(reason(&[other], HEALTH), "the broker has it as uint8, this program as float");
-    assert_eq!(reason(&[], CHARGE), "the broker does not have it");
+    assert_eq!(
+        reason(&[other], HEALTH),
+        "datatype uint8 in the broker, must be float; load the overlay of this version (packwatch vss)"
+    );
+    assert_eq!(reason(&[], CHARGE), "the broker does not know the signal");
     assert_eq!(reason(&[entry(HEALTH, 1)], HEALTH), "");
 }
 
 #[test]
-fn a_path_whose_value_could_not_be_withdrawn_is_skipped() {
+fn path_with_listed_values_is_skipped() {
     let listed = Value { typed: Some(TypedValue::Texts(Texts { values: vec!["valid".into()] })) };
     let path = format!("{BRANCH}.Validity");
     let validity = Metadata { path: path.clone(), id: 3, data_type: 1, allowed: Some(listed), min: None, max: None };
@@ -64,15 +67,15 @@ fn a_path_whose_value_could_not_be_withdrawn_is_skipped() {
 }
 
 #[test]
-fn an_id_of_two_paths_is_used_for_neither() {
+fn id_of_two_paths_is_used_for_neither() {
     let twice = [entry(HEALTH, 5), entry(CHARGE, 5)];
-    assert!(reason(&twice, HEALTH).contains("its id 5 for another signal"));
-    assert!(reason(&twice, CHARGE).contains("its id 5 for another signal"));
+    assert!(reason(&twice, HEALTH).contains("id 5 for another signal"));
+    assert!(reason(&twice, CHARGE).contains("id 5 for another signal"));
     assert_eq!(reason(&[entry(HEALTH, 5), entry("Vehicle.Speed", 6), entry(HEALTH, 5)], HEALTH), "", "listed twice");
 }
 
 #[test]
-fn a_value_outside_the_limits_is_no_value() {
+fn value_outside_limits_is_withheld() {
     let (routes, _) = Routes::resolve(&[entry(HEALTH, 7)], BRANCH);
     let mut status = document();
     status.pack.values.set(Quantity::Soh, Some(1.02));
@@ -84,7 +87,7 @@ fn a_value_outside_the_limits_is_no_value() {
 }
 
 #[test]
-fn without_a_document_every_signal_has_a_point_without_a_value() {
+fn missing_document_gives_points_without_values() {
     let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
     let points = routes.points(None);
     assert_eq!(points.by_id.len(), 2);
@@ -92,7 +95,7 @@ fn without_a_document_every_signal_has_a_point_without_a_value() {
 }
 
 #[test]
-fn a_question_is_answered_for_own_ids_only() {
+fn request_is_answered_for_own_ids_only() {
     let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
     let points = routes.points_of(&[8, 99], Some(&document()));
     assert_eq!(points.by_id.keys().copied().collect::<Vec<_>>(), [8]);

@@ -1,12 +1,13 @@
-//! Signals that are not rows of the catalogue: what follows from several values, from the alarms, from the state of the daemon.
+//! Signals outside the catalogue: derived from several values, from the alarms, or from the state of the daemon.
 //!
-//! Those of VSS itself have its names, datatypes and units (releases 3 to 6). Left out, because the status document cannot say it:
-//! `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah), `StateOfCharge.CurrentEnergy` and the energies (no energy is
-//! estimated), the throughputs "over lifetime of the battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what the
-//! customer sees), `Charging.IsCharging` (true only with a charger; a drive brakes into the battery too).
+//! VSS signals have the names, datatypes and units of releases 3 to 6. Some are omitted, because the status document has no value for
+//! them: `NetCapacity` and `GrossCapacity` (whole kWh; the daemon learns Ah), `StateOfCharge.CurrentEnergy` and the energies (no energy
+//! is estimated), the throughputs "over lifetime of the battery" (the daemon knows its own time only), `StateOfCharge.Displayed` (what
+//! the customer sees), `Charging.IsCharging` (true only with a charger; braking also charges the battery).
 //!
-//! Booleans of the overlay begin with `Is`, as VSS asks. None has a unit of temperature: its name changed from VSS 5 to 6. None has a list
-//! of allowed values: the databroker (0.7) compares it with "no value" too, and the last value would stay.
+//! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because its name changed from VSS 5 to
+//! 6. None has a list of allowed values: the databroker (0.7) also checks an unknown value against the list, and the last value would
+//! stay.
 
 use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::quantity::{CellIndex, Mode};
@@ -16,11 +17,11 @@ use serde::Serialize;
 use super::super::value::{DataType, Value, single};
 use super::{Origin, Signal, Source, of_cells};
 
-/// Path, datatype, unit, fields of the status document, value, description.
+/// Path, datatype, unit, status fields, value, description.
 type Row =
     (&'static str, DataType, Option<&'static str>, &'static str, fn(&StatusDocument) -> Option<Value>, &'static str);
 
-/// The signals, those of VSS itself first.
+/// The signals; those of VSS first.
 pub(super) fn signals() -> Vec<Signal> {
     let signal = |origin| {
         move |(name, data_type, unit, fields, value, description): Row| Signal {
@@ -250,7 +251,7 @@ fn count(count: usize) -> Option<Value> {
     count.try_into().ok().map(Value::Uint16)
 }
 
-/// A word of the status document, as its JSON has it.
+/// A word of the status document, as in its JSON.
 fn word(value: Option<impl Serialize>) -> Option<Value> {
     match serde_json::to_value(value?) {
         Ok(serde_json::Value::String(word)) => Some(Value::Text(word)),
@@ -263,8 +264,8 @@ fn average(status: &StatusDocument, quantity: Quantity) -> Option<f64> {
     Some(numbers.iter().sum::<f64>() / numbers.len() as f64)
 }
 
-/// Codes of the raised alarms, `RULE:SEVERITY` and of a cell `RULE:SEVERITY:cell3`; without any, only when every threshold was
-/// judged.
+/// Codes of the raised alarms: `RULE:SEVERITY`, for a cell `RULE:SEVERITY:cell3`. If none is raised, returns an empty list only if
+/// every threshold was evaluated.
 fn alarm_codes(document: &StatusDocument) -> Option<Value> {
     let alarms = &document.alarms;
     let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
@@ -274,12 +275,12 @@ fn alarm_codes(document: &StatusDocument) -> Option<Value> {
             format!("{}:{}{cell}", alarm.rule.name(), alarm.severity.name())
         })
         .collect();
-    // An empty list means "no error": only where that is known.
+    // An empty list means "no error", so send it only if that is known.
     let is_known = !codes.is_empty() || (alarms.raised == 0 && alarms.are_judged());
     is_known.then_some(Value::Texts(codes))
 }
 
-/// Without estimates nothing is looked for: an empty list would look healthy.
+/// Findings; `None` without estimates, because an empty list would look healthy.
 fn findings(status: &StatusDocument) -> Option<Value> {
     let codes: Vec<String> = status
         .findings

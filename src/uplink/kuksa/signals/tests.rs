@@ -1,4 +1,4 @@
-//! Values of the signals from documents: signs, unknown values, the table's own consistency.
+//! Values of the signals from documents: signs, unknown values, consistency of the table.
 
 use std::collections::BTreeSet;
 
@@ -7,7 +7,7 @@ use packwatch_host::status::client::parse;
 
 use super::*;
 
-/// The document of the test with real clients. Every value is known: those that it lacks are made up.
+/// The document that the tests with real clients use, with all missing values filled in.
 fn document() -> StatusDocument {
     let mut document = parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap();
     fill(&mut document.pack.values);
@@ -28,7 +28,7 @@ fn value(document: &StatusDocument, name: &str) -> Option<Value> {
 }
 
 #[test]
-fn every_signal_has_a_value_of_its_datatype_when_everything_is_known() {
+fn complete_document_gives_every_signal_a_value() {
     let document = document();
     let mut names = BTreeSet::new();
     for signal in all() {
@@ -39,7 +39,7 @@ fn every_signal_has_a_value_of_its_datatype_when_everything_is_known() {
 }
 
 #[test]
-fn currents_have_the_sign_of_vss() {
+fn charge_current_is_positive_in_vss() {
     let mut document = document();
     assert_eq!(value(&document, "CurrentCurrent"), Some(Value::Float(-12.5)));
     let Some(Value::Float(power_w)) = value(&document, "CurrentPower") else { panic!("no power") };
@@ -56,7 +56,7 @@ fn currents_have_the_sign_of_vss() {
 }
 
 #[test]
-fn one_unknown_cell_leaves_no_number_of_all_cells() {
+fn unknown_cell_hides_values_over_all_cells() {
     let mut document = document();
     document.cells[2].values.set(Quantity::Voltage, None::<f64>);
     for name in
@@ -72,7 +72,7 @@ fn one_unknown_cell_leaves_no_number_of_all_cells() {
 }
 
 #[test]
-fn a_cell_that_is_missing_does_not_move_the_others_to_its_place() {
+fn missing_cell_hides_array() {
     let mut document = document();
     document.cells.remove(1);
     for signal in all().filter(|signal| matches!(signal.data_type, DataType::Floats | DataType::Flags)) {
@@ -83,7 +83,7 @@ fn a_cell_that_is_missing_does_not_move_the_others_to_its_place() {
 }
 
 #[test]
-fn the_extreme_cells_are_the_first_of_their_voltage() {
+fn extreme_cell_is_first_of_equal_voltage() {
     let mut document = document();
     for (cell, voltage_v) in document.cells.iter_mut().zip([3.5, 3.25, 3.75, 3.25]) {
         cell.values.set(Quantity::Voltage, Some(voltage_v));
@@ -95,7 +95,7 @@ fn the_extreme_cells_are_the_first_of_their_voltage() {
 }
 
 #[test]
-fn no_alarm_means_healthy_only_when_every_threshold_is_judged() {
+fn empty_error_codes_need_every_threshold_evaluated() {
     let mut document = document();
     assert_eq!(value(&document, "ErrorCodes"), Some(Value::Texts(vec!["capacity_low:severe:cell0".into()])));
     let unknown = parse(include_bytes!("../../../../tests/kuksa/status.json")).unwrap().alarms.list[0];
@@ -113,11 +113,11 @@ fn no_alarm_means_healthy_only_when_every_threshold_is_judged() {
     assert_eq!(value(&document, "Alarms.HighestSeverity"), None);
     document.alarms.unknown.clear();
     document.alarms.thresholds = 0;
-    assert_eq!(value(&document, "ErrorCodes"), None, "nothing is watched");
+    assert_eq!(value(&document, "ErrorCodes"), None, "no thresholds");
 }
 
 #[test]
-fn without_estimates_nothing_looks_healthy() {
+fn missing_estimates_never_look_healthy() {
     let mut document = document();
     document.findings.clear();
     assert_eq!(value(&document, "Findings"), Some(Value::Texts(Vec::new())));

@@ -1,10 +1,10 @@
-//! Discovery messages against the entities and a table of what Home Assistant accepts.
+//! Compares discovery messages with the entities and with a table of what Home Assistant accepts.
 
 use std::collections::BTreeSet;
 
 use super::*;
 
-/// Device classes of Home Assistant that are used, the units it accepts for them, and whether the value may be a measurement.
+/// Home Assistant device classes in use, their accepted units, and whether the value may be a measurement.
 const CLASSES: &[(&str, &[&str])] = &[
     ("battery", &["%"]),
     ("current", &["A", "mA"]),
@@ -20,7 +20,7 @@ fn document() -> StatusDocument {
 }
 
 #[test]
-fn every_message_is_one_that_home_assistant_accepts() {
+fn messages_match_home_assistant_rules() {
     let settings = MqttSettings { topic: "fleet/Bus 12".to_owned(), ..MqttSettings::default() };
     let (mut ids, mut topics) = (BTreeSet::new(), BTreeSet::new());
     for Message { topic, text, is_retained } in messages(&settings, &document()) {
@@ -53,7 +53,7 @@ fn every_message_is_one_that_home_assistant_accepts() {
 }
 
 #[test]
-fn an_entity_of_the_pack_needs_uplink_and_daemon_and_one_of_the_uplink_only_that() {
+fn pack_entity_needs_daemon_and_uplink_entity_does_not() {
     let all = messages(&MqttSettings::default(), &document());
     let availability = |key: &str| {
         let topic = format!("homeassistant/sensor/packwatch/{key}/config");

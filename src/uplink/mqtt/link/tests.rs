@@ -11,7 +11,7 @@ fn topics(messages: &[Message]) -> Vec<&str> {
 }
 
 #[test]
-fn discovery_is_repeated_only_when_the_entities_change_and_entities_that_are_gone_are_removed() {
+fn discovery_repeats_on_change_and_removes_old_entities() {
     let settings = MqttSettings::default();
     let mut published = PublishedState::default();
     let mut document = document();
@@ -26,7 +26,7 @@ fn discovery_is_repeated_only_when_the_entities_change_and_entities_that_are_gon
 }
 
 #[test]
-fn a_daemon_is_online_after_its_values_and_offline_without_them() {
+fn daemon_is_online_after_values_and_offline_without() {
     let mut settings = MqttSettings::default();
     settings.discovery.enabled = false;
     let mut published = PublishedState::default();
@@ -44,7 +44,7 @@ fn a_daemon_is_online_after_its_values_and_offline_without_them() {
 }
 
 #[test]
-fn a_connection_is_online_after_its_values_and_before_discovery() {
+fn uplink_is_online_after_values_before_discovery() {
     let mut published = PublishedState::default();
     let news = published.news(&MqttSettings::default(), Some(&document()), Fill::default());
     let place = |topic: &str| topics(&news).iter().position(|it| *it == topic).unwrap();

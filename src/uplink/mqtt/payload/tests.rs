@@ -1,4 +1,4 @@
-//! Published documents: signs, units, and null for what is not known.
+//! Published documents: signs, units, and null for unknown values.
 
 use super::*;
 
@@ -7,7 +7,7 @@ fn document() -> StatusDocument {
 }
 
 #[test]
-fn percent_outside_and_current_positive_while_charging() {
+fn published_soc_is_percent_and_charge_positive() {
     let mut document = document();
     document.cells.truncate(1);
     let info = info(&document);
@@ -34,7 +34,7 @@ fn percent_outside_and_current_positive_while_charging() {
 }
 
 #[test]
-fn what_is_not_known_is_null_everywhere() {
+fn unknown_values_are_null() {
     let mut document = document();
     let pack: Map<_, _> = serde_json::to_value(document.pack).unwrap().as_object().unwrap().clone();
     let without = |(key, value): (String, Value)| {
@@ -65,7 +65,7 @@ fn what_is_not_known_is_null_everywhere() {
 }
 
 #[test]
-fn the_event_level_is_none_only_when_every_threshold_is_judged() {
+fn event_level_none_needs_every_threshold_evaluated() {
     let mut document = document();
     let of = |document: &StatusDocument| info(document)["event_level"].clone();
     let unknown = std::mem::take(&mut document.alarms.unknown);
@@ -83,23 +83,23 @@ fn the_event_level_is_none_only_when_every_threshold_is_judged() {
     assert_eq!(of(&document), json!("severe"));
     (document.alarms.highest_severity, document.alarms.thresholds) = (None, 0);
     document.alarms.unknown.clear();
-    assert_eq!(of(&document), Value::Null, "nothing is watched");
+    assert_eq!(of(&document), Value::Null, "no thresholds");
 }
 
 #[test]
-fn an_alarm_that_may_be_raised_is_not_shown_as_healthy() {
+fn omitted_alarm_is_not_published_as_healthy() {
     let mut document = document();
     let of = |document: &StatusDocument, rule: &str| info(document)["alarms"][rule].clone();
     assert_eq!(of(&document, "soc_low"), json!(false));
-    // The list had no room for all.
+    // The list had no room for all alarms.
     document.alarms.omitted = 1;
     assert_eq!((of(&document, "soc_low"), of(&document, "capacity_low")), (Value::Null, json!(true)));
-    // A rule without a threshold has no state.
+    // Rules without thresholds have no state.
     assert_eq!(info(&document)["alarms"].get("cell_leak"), None);
 }
 
 #[test]
-fn an_alarm_event_has_its_rule_severity_and_time_on_the_computers_clock() {
+fn alarm_event_has_rule_severity_and_wall_time() {
     let mut document = document();
     document.wall_time = document.time.plus_secs(100.0);
     let raised = json!({

@@ -1,4 +1,4 @@
-//! The queue on disk: order, bounds, what is dropped first, restarts.
+//! The queue on disk: order, bounds, drops, restarts.
 
 use super::*;
 
@@ -6,7 +6,7 @@ fn settings(folder: &Path, max_messages: u64, max_bytes: u64) -> HistorySettings
     HistorySettings { folder: folder.to_owned(), max_messages, max_bytes, ..HistorySettings::default() }
 }
 
-/// What is left, in the order in which it came.
+/// Remaining messages, in the order of arrival.
 fn texts(queue: &Queue) -> Vec<String> {
     let mut left = queue.oldest(Class::Event, 100).unwrap();
     left.extend(queue.oldest(Class::Sample, 100).unwrap());
@@ -23,7 +23,7 @@ fn event(text: &str) -> (Class, String) {
 }
 
 #[test]
-fn messages_come_out_in_order_and_survive_a_restart() {
+fn messages_keep_order_across_restart() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
     queue.add(&[event("{e1}"), sample("{s1 ä}")], Some("[1]")).unwrap();
@@ -38,13 +38,13 @@ fn messages_come_out_in_order_and_survive_a_restart() {
     let found: Vec<_> = oldest.iter().map(|message| (message.sequence, message.body.as_str())).collect();
     assert_eq!(found, [(1, "{e1}"), (2, "{s1 ä}")]);
     queue.remove(&oldest).unwrap();
-    // Twice is no fault: it may have been dropped meanwhile.
+    // Removing twice is allowed; the message may have been dropped before.
     queue.remove(&oldest).unwrap();
     assert_eq!((texts(&queue), queue.fill().bytes), (vec!["{s2}".to_owned()], 4));
 }
 
 #[test]
-fn numbers_are_never_used_twice() {
+fn sequence_numbers_are_never_reused() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
     queue.add(&[sample("a")], None).unwrap();
@@ -56,7 +56,7 @@ fn numbers_are_never_used_twice() {
 }
 
 #[test]
-fn samples_are_dropped_before_events_and_both_are_counted_for_ever() {
+fn full_queue_drops_samples_first_and_counts() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
     queue.add(&[event("e1"), sample("s1"), sample("s2"), event("e2")], None).unwrap();
@@ -70,7 +70,7 @@ fn samples_are_dropped_before_events_and_both_are_counted_for_ever() {
 }
 
 #[test]
-fn the_bound_in_bytes_holds_for_a_message_that_is_longer_than_it() {
+fn byte_limit_holds_for_oversized_message() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 100, 10)).unwrap();
     queue.add(&[sample("12345"), sample("67890")], None).unwrap();
@@ -80,7 +80,7 @@ fn the_bound_in_bytes_holds_for_a_message_that_is_longer_than_it() {
 }
 
 #[test]
-fn a_second_uplink_is_refused_and_a_damaged_file_is_put_aside() {
+fn second_uplink_fails_and_damaged_file_is_set_aside() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
     let refusal = Queue::open(&settings(folder.path(), 3, 1000)).unwrap_err();
@@ -90,13 +90,13 @@ fn a_second_uplink_is_refused_and_a_damaged_file_is_put_aside() {
     let queue = Queue::open(&settings(folder.path(), 3, 1000)).unwrap();
     queue.add(&[sample("a")], None).unwrap();
     assert_eq!(queue.fill().messages, 1);
-    // No reader knows its numbers.
+    // Readers cannot know its numbers.
     assert!(queue.oldest(Class::Sample, 1).unwrap()[0].sequence > 1_700_000_000_000);
     assert!(folder.path().join("queue.damaged").exists());
 }
 
 #[test]
-fn a_queue_that_the_disk_does_not_open_or_a_newer_program_wrote_stays_as_it_is() {
+fn unreadable_or_newer_file_is_left_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let open = || Queue::open(&settings(folder.path(), 10, 1000));
     open().unwrap().add(&[event("e1")], None).unwrap();
@@ -110,7 +110,10 @@ fn a_queue_that_the_disk_does_not_open_or_a_newer_program_wrote_stays_as_it_is()
     let database = Connection::open(folder.path().join(FILE)).unwrap();
     database.pragma_update(None, "user_version", VERSION + 1).unwrap();
     let refusal = open().unwrap_err();
-    assert!(refusal.ends_with("queue.db has layout 2, must be 1: a newer program's"), "{refusal}");
+    assert!(
+        refusal.ends_with("queue.db has layout 2, must be 1: written by a newer version of packwatch"),
+        "{refusal}"
+    );
     database.pragma_update(None, "user_version", VERSION).unwrap();
     assert_eq!(texts(&open().unwrap()), ["e1"]);
     assert!(!folder.path().join("queue.damaged").exists());

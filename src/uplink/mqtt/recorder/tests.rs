@@ -1,4 +1,4 @@
-//! Which samples and events become messages, each once, also over restarts of the daemon.
+//! Which samples and events are queued, each once, also across restarts of the daemon.
 
 use super::super::settings::HistorySettings;
 use super::*;
@@ -17,7 +17,7 @@ fn queue(folder: &tempfile::TempDir) -> Queue {
     Queue::open(&HistorySettings { folder: folder.path().to_owned(), ..HistorySettings::default() }).unwrap()
 }
 
-/// Seconds of those documents that became samples.
+/// Seconds of the documents that became samples.
 fn sampled(period_s: u64, seconds: &[f64]) -> Vec<f64> {
     let folder = tempfile::tempdir().unwrap();
     let queue = queue(&folder);
@@ -31,7 +31,7 @@ fn sampled(period_s: u64, seconds: &[f64]) -> Vec<f64> {
 }
 
 #[test]
-fn samples_keep_their_rhythm_although_documents_jitter() {
+fn samples_keep_period_despite_document_jitter() {
     let jitter = [0.0, 1.02, 1.97, 3.01, 3.98, 5.03, 6.0];
     assert_eq!(sampled(2, &jitter), [0.0, 1.97, 3.98, 6.0]);
     assert_eq!(sampled(1, &jitter), jitter);
@@ -39,14 +39,14 @@ fn samples_keep_their_rhythm_although_documents_jitter() {
 }
 
 #[test]
-fn the_rhythm_begins_again_after_a_pause_and_on_another_clock() {
+fn schedule_restarts_after_pause_or_clock_step() {
     assert_eq!(sampled(10, &[0.0, 10.0, 95.0, 99.0, 105.0]), [0.0, 10.0, 95.0, 105.0]);
-    // The daemon started again on a clock that was set back.
+    // The daemon restarted with a clock that was set back.
     assert_eq!(sampled(10, &[1000.0, 1005.0, 100.0, 105.0, 110.0]), [1000.0, 100.0, 110.0]);
 }
 
 #[test]
-fn new_events_are_those_that_earlier_documents_did_not_list() {
+fn new_events_are_those_not_listed_before() {
     let list = |numbers: &[i64]| numbers.iter().map(|&number| json!({ "time": number })).collect::<Vec<_>>();
     for (before, now, new) in [
         (&[][..], &[1, 2][..], &[1, 2][..]),
@@ -55,9 +55,9 @@ fn new_events_are_those_that_earlier_documents_did_not_list() {
         // The daemon dropped the oldest.
         (&[1, 2, 3], &[2, 3, 4], &[4]),
         (&[1, 2, 3], &[7, 8, 9], &[7, 8, 9]),
-        // Two of the same time.
+        // Two events of the same time.
         (&[1, 1], &[1, 1, 1], &[1]),
-        // Another daemon.
+        // A different daemon.
         (&[1, 2, 3], &[], &[]),
     ] {
         assert_eq!(new_events(&list(before), &list(now)), list(new), "{before:?} {now:?}");
@@ -65,7 +65,7 @@ fn new_events_are_those_that_earlier_documents_did_not_list() {
 }
 
 #[test]
-fn an_event_is_queued_once_also_over_a_restart() {
+fn event_is_queued_once_across_restart() {
     let folder = tempfile::tempdir().unwrap();
     let mut with_event = document(START as f64);
     with_event.events = vec![json!({ "event": "gap", "time": START * 1_000_000_000, "seconds": 4.0 })];

@@ -1,5 +1,5 @@
-//! `packwatch-uplink mqtt` as its user runs it: the program, a real broker (Debian's mosquitto) on a port of the loopback, a reader
-//! (mosquitto_sub) with a session of its own, and a status socket fed by the test.
+//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a reader
+//! (mosquitto_sub) with its own session, and a status socket fed by the test.
 
 mod rig;
 
@@ -10,18 +10,18 @@ use std::time::Duration;
 use rig::{Broker, Daemon, Reader, Uplink, document, fill, wait_for};
 use serde_json::Value;
 
-/// A link that tries again every second and takes every document as a sample.
+/// Retry every second and sample every document.
 const EAGER: &str = "period_s = 1\nretry_max_s = 1\n[mqtt.history]\nperiod_s = 1\n";
 
 #[test]
-fn ninety_six_cells_are_published_in_millivolts_and_kept_for_late_readers() {
+fn cells_are_published_in_millivolts_and_retained() {
     let (broker, daemon) = (Broker::start(""), Daemon::start());
     let _uplink = Uplink::start(&broker, &daemon, EAGER);
     let mut pack = document(96, 0);
     pack["cells"][95]["voltage_v"] = Value::Null;
     daemon.send(&pack);
     wait_for("discovery", || Reader::retained(&broker, "homeassistant/#").len() == 153);
-    // Connects only now: what it gets is what the broker keeps.
+    // This reader connects late and gets the retained messages.
     let kept: BTreeMap<_, _> = Reader::retained(&broker, "packwatch/#").into_iter().collect();
     assert_eq!(
         kept.keys().collect::<Vec<_>>(),
@@ -37,7 +37,7 @@ fn ninety_six_cells_are_published_in_millivolts_and_kept_for_late_readers() {
         (&info["SOC"], &info["SOC_std"], &info["battery_current"]),
         (&63.2.into(), &1.2.into(), &(-12.5).into())
     );
-    // One voltage is not known: then the least and the greatest are not either.
+    // With one unknown voltage, minimum and maximum are unknown.
     assert_eq!((&info["cell_max_voltage"], &info["SOC_reported"]), (&Value::Null, &Value::Null));
     assert_eq!(
         info["alarms"],
@@ -46,7 +46,7 @@ fn ninety_six_cells_are_published_in_millivolts_and_kept_for_late_readers() {
 }
 
 #[test]
-fn the_last_will_says_that_the_uplink_is_gone_and_the_daemons_topic_that_it_is_silent() {
+fn last_will_marks_uplink_and_topic_marks_silent_daemon() {
     let (broker, daemon) = (Broker::start(""), Daemon::start());
     let mut uplink = Uplink::start(&broker, &daemon, EAGER);
     let status = |topic: &str| Reader::retained(&broker, topic).pop().map(|(_, text)| text).unwrap_or_default();
@@ -65,14 +65,14 @@ fn the_last_will_says_that_the_uplink_is_gone_and_the_daemons_topic_that_it_is_s
 }
 
 #[test]
-fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
+fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     const HOUR: i64 = 3600;
     let (mut broker, daemon) = (Broker::start(""), Daemon::start());
     let reader = Reader::start(&broker, &["packwatch/history", "packwatch/events", "packwatch/info"]);
     let mut uplink = Uplink::start(&broker, &daemon, EAGER);
     daemon.send(&document(96, 0));
     reader.wait_for_messages(4);
-    // What the broker has but did not confirm would wait in the queue too.
+    // Messages that the broker has but did not confirm would also wait in the queue.
     wait_for("the broker's receipts", || fill(&uplink).messages == 0);
     broker.stop();
     for second in 1..=HOUR {
@@ -100,12 +100,12 @@ fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
     let mut latest = (0, 0);
     for sample in &samples {
         let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
-        // Once or more, none left out: the next one follows, or an earlier one is repeated.
+        // Each sample at least once and none skipped: the next one follows, or an earlier one repeats.
         assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
         latest = latest.max(now);
     }
     assert_eq!((latest.1, samples.len() >= HOUR as usize), (HOUR + 1, true));
-    // Two power cuts repeat at most a window of messages each.
+    // Each power cut repeats at most a window of messages.
     assert!(samples.len() <= HOUR as usize + 2 + 2 * 20, "{} samples", samples.len());
     let current: Vec<i64> = messages
         .iter()
@@ -113,7 +113,7 @@ fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
         .map(|(_, value)| rig::second_of(value))
         .collect();
     assert!(current.is_sorted(), "a current value is older than one before it: {current:?}");
-    // The broker, too, repeats what a reader had not confirmed when it stopped: by its number a message is known.
+    // The broker also repeats what a stopped reader had not confirmed. Sequence numbers identify repetitions.
     let events: BTreeSet<i64> = messages
         .iter()
         .filter(|(topic, _)| topic == "packwatch/events")
@@ -123,7 +123,7 @@ fn an_hour_without_the_broker_and_two_power_cuts_lose_nothing() {
 }
 
 #[test]
-fn a_full_queue_drops_the_oldest_samples_first_and_counts_them() {
+fn full_queue_drops_oldest_samples_first_and_counts() {
     let (mut broker, daemon) = (Broker::start(""), Daemon::start());
     let reader = Reader::start(&broker, &["packwatch/history", "packwatch/events"]);
     broker.stop();
@@ -160,7 +160,7 @@ fn a_full_queue_drops_the_oldest_samples_first_and_counts_them() {
 }
 
 #[test]
-fn a_topic_that_the_broker_refuses_does_not_stop_the_others() {
+fn rejected_topic_does_not_stop_others() {
     let folder = tempfile::tempdir().unwrap();
     let rights = folder.path().join("rights");
     fs::write(&rights, "topic read #\ntopic write packwatch/history\ntopic write packwatch/status\n").unwrap();
@@ -174,7 +174,7 @@ fn a_topic_that_the_broker_refuses_does_not_stop_the_others() {
     let topics = |reader: &Reader| reader.messages().into_iter().map(|(topic, _)| topic).collect::<Vec<_>>();
     assert!(!topics(&reader).contains(&"packwatch/events".to_owned()));
     let log = uplink.log();
-    assert!(log.contains("packwatch/events: the broker refuses it: NotAuthorized"), "{log}");
+    assert!(log.contains("packwatch/events: the broker rejects the message: NotAuthorized"), "{log}");
     for topic in ["packwatch/events", "packwatch/info", "homeassistant/"] {
         assert!(log.lines().filter(|line| line.contains(topic)).count() <= 1, "once, not each time: {log}");
     }
@@ -189,7 +189,7 @@ fn a_topic_that_the_broker_refuses_does_not_stop_the_others() {
 }
 
 #[test]
-fn tls_needs_the_right_authority_and_a_wrong_password_is_said_and_tried_again() {
+fn wrong_password_is_retried_and_wrong_authority_fails() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).display().to_string();
     rig::make_certificates(folder.path());
@@ -208,7 +208,7 @@ fn tls_needs_the_right_authority_and_a_wrong_password_is_said_and_tried_again() 
     };
     let uplink = Uplink::start(&broker, &daemon, &with(&ca));
     wait_for("the broker's refusal", || {
-        uplink.log().contains("the broker refuses user or password (mqtt.user, mqtt.password_file)")
+        uplink.log().contains("the broker rejects user or password (mqtt.user, mqtt.password_file)")
     });
     std::thread::sleep(Duration::from_millis(2500));
     assert_eq!(
@@ -217,7 +217,7 @@ fn tls_needs_the_right_authority_and_a_wrong_password_is_said_and_tried_again() 
         "once, not at each attempt: {}",
         uplink.log()
     );
-    // With a line end, as an editor writes it. It is read again at each attempt.
+    // With a line end, as an editor writes it. The file is read again at each attempt.
     fs::write(at("password"), "s3cret\r\n").unwrap();
     wait_for("a connection", || uplink.log().contains("connected broker"));
 

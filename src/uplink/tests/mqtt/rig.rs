@@ -1,4 +1,4 @@
-//! What the tests run the uplink against: a broker, a reader, a daemon's status socket.
+//! Test rig of the uplink: a broker, a reader, a daemon's status socket.
 
 #![expect(clippy::unwrap_used, reason = "a step that fails ends the test")]
 
@@ -17,12 +17,12 @@ use rusqlite::{Connection, OpenFlags};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Longest wait for anything: on an idle machine all come within three seconds.
+/// Longest wait for anything; on an idle machine every wait ends within three seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Time of the first document, ns.
 const START_NS: i64 = 1_800_000_000_000_000_000;
 
-/// Waits until `is_so`.
+/// Waits until `is_so` returns true.
 pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
     let end = Instant::now() + PATIENCE;
     while !is_so() {
@@ -31,7 +31,7 @@ pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// A document of the daemon `second` seconds after the first; cell `n` has 3.6 V and `n` mV.
+/// Builds a document of the daemon `second` seconds after the first. Cell `n` has 3.6 V and `n` mV.
 pub(crate) fn document(cells: usize, second: i64) -> Value {
     let mut document: Value = serde_json::from_str(include_str!("../data/status.json")).unwrap();
     let time = START_NS + second * 1_000_000_000;
@@ -52,7 +52,7 @@ pub(crate) fn second_of(message: &Value) -> i64 {
     (parse_stamp(message["time"].as_str().unwrap()).unwrap().nanos() - START_NS) / 1_000_000_000
 }
 
-/// A broker that keeps its state over a restart.
+/// A broker that keeps its state across restarts.
 pub(crate) struct Broker {
     folder: TempDir,
     pub(crate) port: u16,
@@ -60,12 +60,12 @@ pub(crate) struct Broker {
 }
 
 impl Broker {
-    /// Starts it; `more` are further lines of its configuration.
+    /// Starts it; `more` adds lines to its configuration.
     pub(crate) fn start(more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let anonymous = if more.contains("allow_anonymous") { "" } else { "allow_anonymous true\n" };
-        // As root it would become another user, who cannot read the test's folder.
+        // By default root becomes another user, who cannot read the test's folder.
         let text = format!(
             "user root\nlistener {port} 127.0.0.1\n{anonymous}{more}persistence true\npersistence_location {}/\nmax_queued_messages 100000\n",
             folder.path().display()
@@ -76,7 +76,7 @@ impl Broker {
         broker
     }
 
-    /// Starts it again with what it kept.
+    /// Restarts it with its stored state.
     pub(crate) fn restart(&mut self) {
         let log = fs::File::options().create(true).append(true).open(self.folder.path().join("log")).unwrap();
         let mut command = Command::new("mosquitto");
@@ -87,7 +87,7 @@ impl Broker {
         wait_for("the broker", || TcpStream::connect(("127.0.0.1", port)).is_ok());
     }
 
-    /// Ends it; it keeps its state.
+    /// Stops it; it keeps its state.
     pub(crate) fn stop(&mut self) {
         if let Some(mut process) = self.process.take() {
             signal(&process, "TERM");
@@ -120,13 +120,13 @@ impl Daemon {
         Self { folder, listener, client: RefCell::new(None) }
     }
 
-    /// Sends a document, to a new client if the former has gone.
+    /// Sends a document; accepts a new client if the former has disconnected.
     pub(crate) fn send(&self, document: &Value) {
         let line = format!("{document}\n");
         loop {
             let mut client = self.client.borrow_mut();
             let stream = client.get_or_insert_with(|| self.listener.accept().unwrap().0);
-            // A client that was killed is noticed by the end of what it sends, which is nothing else.
+            // Reading detects a killed client: it sends nothing else.
             stream.set_nonblocking(true).unwrap();
             let has_gone = matches!(std::io::Read::read(stream, &mut [0]), Ok(0));
             stream.set_nonblocking(false).unwrap();
@@ -137,7 +137,7 @@ impl Daemon {
         }
     }
 
-    /// Closes the connection, as a daemon that ends.
+    /// Closes the connection, like a daemon that exits.
     pub(crate) fn hang_up(&self) {
         *self.client.borrow_mut() = None;
     }
@@ -150,7 +150,7 @@ pub(crate) struct Uplink {
 }
 
 impl Uplink {
-    /// Starts it; `more` are further lines of its table `[mqtt]`.
+    /// Starts it; `more` adds lines to its table `[mqtt]`.
     pub(crate) fn start(broker: &Broker, daemon: &Daemon, more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let socket = daemon.folder.path().join("status.sock");
@@ -181,19 +181,19 @@ impl Uplink {
         command.spawn().unwrap()
     }
 
-    /// As a power cut ends it.
+    /// Kills it, like a power cut.
     pub(crate) fn kill(&mut self) {
         self.process.kill().unwrap();
         self.process.wait().unwrap();
     }
 
-    /// As systemd stops it.
+    /// Terminates it, like systemd.
     pub(crate) fn terminate(&mut self) {
         signal(&self.process, "TERM");
         assert!(self.process.wait().unwrap().success());
     }
 
-    /// Starts it again on the same queue.
+    /// Restarts it with the same queue.
     pub(crate) fn restart(self) -> Self {
         let folder = Arc::clone(&self.folder);
         drop(self);
@@ -216,14 +216,14 @@ impl Drop for Uplink {
     }
 }
 
-/// What the queue's file holds.
+/// Contents of the queue's file.
 pub(crate) struct Fill {
-    /// Messages that were ever written.
+    /// Messages ever written.
     pub(crate) written: u64,
     pub(crate) messages: u64,
 }
 
-/// Reads the queue's file beside the uplink; zeros before it exists.
+/// Reads the queue's file; zeros before it exists.
 pub(crate) fn fill(uplink: &Uplink) -> Fill {
     let read = || {
         let file = Connection::open_with_flags(uplink.queue(), OpenFlags::SQLITE_OPEN_READ_ONLY)?;
@@ -236,14 +236,14 @@ pub(crate) fn fill(uplink: &Uplink) -> Fill {
     read().unwrap_or(Fill { written: 0, messages: 0 })
 }
 
-/// A reader for which the broker keeps what it has not got yet.
+/// A reader whose missed messages the broker keeps.
 pub(crate) struct Reader {
     process: Child,
     lines: Arc<Mutex<Vec<String>>>,
 }
 
 impl Reader {
-    /// Subscribes, and waits until the broker has confirmed it.
+    /// Subscribes, and waits for the broker's confirmation.
     pub(crate) fn start(broker: &Broker, topics: &[&str]) -> Self {
         let mut command = Command::new("stdbuf");
         command.args([
@@ -275,7 +275,7 @@ impl Reader {
         reader
     }
 
-    /// Messages that the broker keeps for every reader: topic and text.
+    /// Returns retained messages: topic and text.
     pub(crate) fn retained(broker: &Broker, topic: &str) -> Vec<(String, String)> {
         let mut command = Command::new("mosquitto_sub");
         command.args([
@@ -299,7 +299,7 @@ impl Reader {
             .collect()
     }
 
-    /// Messages so far: topic and JSON.
+    /// Returns the messages so far: topic and JSON.
     pub(crate) fn messages(&self) -> Vec<(String, Value)> {
         let lines = self.lines.lock().unwrap();
         let messages = lines.iter().filter_map(|line| line.split_once(' '));
@@ -315,7 +315,7 @@ impl Reader {
         });
     }
 
-    /// Waits for the message of a topic that was true at a second.
+    /// Waits for the message of a topic whose time is this second.
     pub(crate) fn wait_for_topic_time(&self, topic: &str, second: i64) {
         wait_for("the newest value", || {
             let lines = self.lines.lock().unwrap();
