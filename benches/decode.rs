@@ -1,4 +1,5 @@
-//! Time of one frame through [`InputMap::decode`], and of the frames of one set of values through [`InputEncoder`].
+//! Time to decode one frame with [`InputMap::decode`], and to encode the frames of one set of values with
+//! [`InputEncoder`].
 
 use divan::{Bencher, black_box};
 use packwatch_host::can::dbc::Database;
@@ -7,7 +8,7 @@ use packwatch_host::can::encode::InputEncoder;
 use packwatch_host::can::{CanId, Frame};
 use packwatch_host::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
-/// Cells of the shipped example pack, three on each of 32 pages.
+/// Cells of the shipped example pack, on 32 pages of three.
 const CELLS: u16 = 96;
 
 fn main() {
@@ -16,7 +17,7 @@ fn main() {
 
 fn bind(db: &Database, name: &str, channel: Channel) -> Binding {
     let (message, signal) = db.signal(name).expect("the shipped DBC has the signal");
-    Binding::new(BusIndex(0), message, signal, channel).expect("its layout is readable")
+    Binding::new(BusIndex(0), message, signal, channel).expect("its layout is valid")
 }
 
 fn three_signals() -> InputMap {
@@ -57,7 +58,7 @@ fn decode_a_page_of_96_multiplexed_cells(bencher: Bencher) {
     let map = cells();
     let mut frames = Vec::new();
     InputEncoder::new(&map).encode(&values(), &mut frames);
-    let (_, last) = frames.last().expect("one frame for each page");
+    let (_, last) = frames.last().expect("one frame per page");
     decode(bencher, &map, last);
 }
 

@@ -1,4 +1,4 @@
-//! One estimator step, and one round of a 96-cell pack through the whole core (frames in, frames out).
+//! Time of one estimator step, and of one round of a 96-cell pack through the whole core (frames in, frames out).
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;
@@ -8,7 +8,7 @@ use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 mod common;
 
-/// Shows what a step allocates: nothing.
+/// Shows that a step allocates nothing.
 #[global_allocator]
 static ALLOCATOR: divan::AllocProfiler = divan::AllocProfiler::system();
 

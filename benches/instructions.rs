@@ -1,7 +1,9 @@
 //! Work whose instructions `tests/instructions` counts: parser, decoder, estimator.
 //!
-//! `instructions WORK PASSES` does one of [`WORKS`] that many times over the same inputs and prints how many units a pass has
-//! and which wide instructions the processor offered (they decide what the estimator runs). Counted for some passes and for
+//! `instructions WORK PASSES` runs one of [`WORKS`] that many times over the same inputs. It prints the number of units
+//! per pass and the wide instructions that the processor offers, because these select the estimator's code. The
+//! difference between two counts, one with twice the passes of the other, excludes start-up. Without arguments, as
+//! under `cargo bench`, it prints the time of each work.
 //! twice as many, the difference is the work alone. Without arguments, as under `cargo bench`, it prints the time of each.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
@@ -23,7 +25,7 @@ use tempfile::NamedTempFile;
 
 mod common;
 
-/// Name, what one unit of it is, and what makes it.
+/// Name, unit, and constructor of each work.
 const WORKS: [Named; 8] = [
     ("parse", "candump line of 8 bytes, read and placed in time", parse),
     ("parse_and_decode", "such a line and its 3 signals", parse_and_decode),
@@ -35,21 +37,21 @@ const WORKS: [Named; 8] = [
     ("plain_step", "step of one cell by the readable filter, 1 branch", plain),
 ];
 
-/// Lines, frames or steps in a pass.
+/// Lines, frames or steps per pass.
 const UNITS: u32 = 9600;
-/// Passes timed under `cargo bench`.
+/// Number of passes timed under `cargo bench`.
 const TIMED_PASSES: u32 = 200;
 
 type Named = (&'static str, &'static str, fn() -> Work);
 
-/// A pass over the work's inputs; what it gives keeps the optimiser from leaving it out.
+/// Runs one pass over the inputs. Returns a result so that the optimiser cannot remove the work.
 type Work = Box<dyn FnMut() -> f64>;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     match arguments.as_slice() {
         [name, passes] => {
-            let (_, _, work) = WORKS.iter().find(|(known, _, _)| known == name).expect("a work that is known");
+            let (_, _, work) = WORKS.iter().find(|(known, _, _)| known == name).expect("the name of a work");
             let (mut work, passes) = (work(), passes.parse::<u32>().expect("a number of passes"));
             for _ in 0..passes {
                 black_box(work());
@@ -60,7 +62,7 @@ fn main() {
     }
 }
 
-/// What decides at run time which code runs.
+/// Processor features that select the code at run time.
 fn features() -> String {
     #[cfg(target_arch = "x86_64")]
     let found = [
@@ -86,7 +88,7 @@ fn time((name, unit, work): &Named) {
     println!("{name:20} {:8.1} ns median per {unit}", took_ns[took_ns.len() / 2]);
 }
 
-/// Lines as a pack at work sends them, of one message with three signals.
+/// A candump log as a running pack produces it, with one message of three signals.
 fn log() -> NamedTempFile {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -115,7 +117,7 @@ fn parse_and_decode() -> Work {
     })
 }
 
-/// The frames of a log, as replay has them: reading, lines and their places in time are in it.
+/// Calls `take` for each frame of a log, read as replay does. Includes reading, parsing and timing of the lines.
 fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],
@@ -125,7 +127,7 @@ fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     };
     let mut source = LogSource::new([log.path().to_owned()], options);
     let mut batch = Batch::new(Batch::MAX);
-    while source.next_batch(&mut batch).expect("a log without faults") {
+    while source.next_batch(&mut batch).expect("the log is valid") {
         for record in batch.records() {
             let RecordKind::Frame { bus, frame } = &record.kind else { panic!("frames alone") };
             take(*bus, frame);
@@ -133,7 +135,7 @@ fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     }
 }
 
-/// Every signal of a DBC whose name is wanted, each as a channel of its own.
+/// Binds the wanted signals of a DBC, each to a separate channel.
 fn bind(dbc: &str, wanted: fn(&str) -> bool) -> InputMap {
     let database = Database::parse(dbc).expect("the shipped DBC parses");
     let signals =
@@ -141,7 +143,7 @@ fn bind(dbc: &str, wanted: fn(&str) -> bool) -> InputMap {
     let wanted = (0..).zip(signals.filter(|(_, signal)| wanted(&signal.name)));
     let binding =
         |(n, (message, signal))| Binding::new(BusIndex(0), message, signal, Channel::CellVoltage(CellIndex(n)));
-    InputMap::new(wanted.map(|of| binding(of).expect("its layout is readable")).collect())
+    InputMap::new(wanted.map(|of| binding(of).expect("its layout is valid")).collect())
 }
 
 fn decode_page() -> Work {

@@ -1,6 +1,6 @@
-//! How fast candump logs become frames and readings: as `replay` does it, beside
-//! the newline scan that any reader must do.
-#![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
+//! Time to turn candump logs into frames and readings as `replay` does, compared with a plain newline scan, which any
+//! reader needs.
+#![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -18,7 +18,7 @@ fn main() {
 /// Lines of one log, about 10 MB.
 const LINES: u64 = 200_000;
 
-/// Classic frames of 8 bytes with three signals each, at a bus's pace.
+/// Classic frames of 8 bytes with three signals each, at a realistic bus rate.
 fn log() -> Vec<u8> {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -63,7 +63,7 @@ fn newline_scan(bencher: Bencher) {
     });
 }
 
-/// Reads a file as `replay` does and gives every batch to `each`.
+/// Reads a file as `replay` does and passes every batch to `each`.
 fn batches(bencher: Bencher, mut each: impl FnMut(&[Record])) {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), log()).unwrap();

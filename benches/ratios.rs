@@ -1,6 +1,6 @@
-//! How much faster the estimator of a pack is than the plain form of the same filter, as ratios: both are timed in turns
-//! in one run, so that what else the machine does is felt by both. The medians of the rounds are what is printed.
-#![expect(clippy::print_stdout, reason = "what it measures is what it prints")]
+//! Speed of a pack's estimator relative to the plain form of the same filter. Both are timed alternately in one run, so
+//! that other load on the machine affects both. Prints the medians of the rounds.
+#![expect(clippy::print_stdout, reason = "the printed table is the result")]
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -11,14 +11,14 @@ use packwatch_host::config::Config;
 
 mod common;
 
-/// Turns each form is timed in.
+/// Number of turns in which each form is timed.
 const ROUNDS: usize = 15;
-/// Rounds of a pack in one turn.
+/// Rounds of a pack per turn.
 const STEPS: u32 = 2000;
 const CELLS: usize = 96;
 
 fn main() {
-    // cargo test runs benches, too, to see that they do.
+    // `cargo test` also runs the benches; one round then suffices.
     let rounds = if std::env::args().any(|argument| argument == "--bench") { ROUNDS } else { 1 };
     let mut plain = Plain::new(1);
     let mut plain_pack = Plain::new(CELLS);

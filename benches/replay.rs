@@ -1,5 +1,5 @@
-//! The whole replay of a log: read, parse, decode, estimate, encode, as the command does it.
-#![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
+//! Time of a whole replay of a log with the command: read, parse, decode, estimate, encode.
+#![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use std::process::Command;
 
@@ -7,7 +7,7 @@ fn main() {
     divan::main();
 }
 
-/// Ten minutes of the EV day of 96 cells, simulated once.
+/// Ten minutes of the EV day with 96 cells, simulated once.
 fn log() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let log = folder.path().join("day.log");

@@ -1,7 +1,7 @@
-//! In steady state nothing on the way of a frame allocates: reading a log, the core with the example's 96 cells, its ticks
+//! In steady state no code on a frame's path allocates: reading a log, the core with the example's 96 cells, its ticks
 //! and the frames it sends. The first frames (growing buffers), transitions, and events may allocate.
 //!
-//! Every thread of the process counts. When a test fails, `dhat-heap.json` says where it allocated.
+//! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -17,35 +17,35 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// A hole in the record longer than this means that its recorder was asleep, s; there is none here.
+/// A longer gap in the record means that the recorder was asleep, s. Here there is no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log, s.
 const LOG_S: f64 = 160.0;
-/// Its first part warms up, s: the health frames go through the 96 cells once.
+/// Length of the warm-up, s: the health frames go through all 96 cells once.
 const WARM_S: f64 = 110.0;
-/// Fewer frames than this after it would prove nothing: 50 s of 10 currents and 32 other frames each 100 ms.
+/// Minimum number of frames after the warm-up: 50 s of 10 currents and 32 other frames each 100 ms give more.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Most blocks that the end of a row of the findings allocates, for 96 cells.
+/// Maximum number of blocks allocated at the end of a row of findings, for 96 cells.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
-/// One test at a time: all of them count the whole process.
+/// Serialises the tests, because each counts the allocations of the whole process.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Runs `work`, in which no thread may allocate.
+/// Runs `work`. No thread may allocate.
 fn without_allocating(what: &str, work: impl FnOnce()) {
     allocating_at_most(0, what, work);
 }
 
-/// Runs `work`, in which all threads together may allocate this many blocks.
+/// Runs `work`. All threads together may allocate `most` blocks.
 fn allocating_at_most(most: u64, what: &str, work: impl FnOnce()) {
     let profiler = dhat::Profiler::builder().testing().build();
     work();
     let blocks = dhat::HeapStats::get().total_blocks;
-    // Its own assertion saves where.
+    // dhat's own assertion saves the allocation sites.
     dhat::assert!(blocks <= most, "{what}: {blocks} blocks allocated");
     drop(profiler);
 }
@@ -87,22 +87,25 @@ fn next(source: &mut LogSource) -> Option<Record> {
     source.next_record().expect("a good log")
 }
 
-/// Has the log reached its steady part?
+/// Whether the log has reached its steady part.
 fn is_warm(record: &Record, first: &Record) -> bool {
     record.time.since(first.time) >= WARM_S
 }
 
 #[test]
-fn an_allocation_is_counted() {
+fn allocation_is_counted() {
     let _alone = alone();
     let profiler = dhat::Profiler::builder().testing().build();
     let kept = std::thread::spawn(|| vec![0_u8; 1000]).join();
-    assert!(dhat::HeapStats::get().total_bytes >= 1000, "else the zeros of the other tests say nothing");
+    assert!(
+        dhat::HeapStats::get().total_bytes >= 1000,
+        "allocations are not counted, so the other tests prove nothing"
+    );
     drop((profiler, kept));
 }
 
 #[test]
-fn a_line_of_a_log_allocates_nothing() {
+fn log_line_allocates_nothing() {
     let _alone = alone();
     let folder = tempfile::tempdir().expect("a folder");
     let text = std::fs::read(pack_log(folder.path())).expect("a log");
@@ -116,7 +119,7 @@ fn a_line_of_a_log_allocates_nothing() {
 }
 
 #[test]
-fn a_frame_read_from_a_log_allocates_nothing() {
+fn frame_read_from_log_allocates_nothing() {
     let _alone = alone();
     let folder = tempfile::tempdir().expect("a folder");
     let mut source = source(&pack_log(folder.path()));
@@ -124,14 +127,14 @@ fn a_frame_read_from_a_log_allocates_nothing() {
     while !is_warm(&next(&mut source).expect("a long log"), &first) {}
     let mut frames = 0;
     without_allocating("reading a log", || {
-        // The last frames are left: what is done at the end of a file is done once.
+        // Leave the last frames: work at the end of a file is done only once.
         while frames < MIN_FRAMES {
             frames += u64::from(matches!(next(&mut source), Some(Record { kind: RecordKind::Frame { .. }, .. })));
         }
     });
 }
 
-/// The core as a replay drives it.
+/// The core, driven as in a replay.
 struct Core {
     monitor: Monitor,
     ticks: Ticks,
@@ -142,7 +145,7 @@ struct Core {
 
 impl Core {
     fn new() -> Self {
-        let config = config::load(&example()).expect("the example is good");
+        let config = config::load(&example()).expect("the example is valid");
         let ticks = Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S);
         Self { monitor: Monitor::new(config.monitor), ticks, out: Outputs::default(), sent: 0, events: 0 }
     }
@@ -164,7 +167,7 @@ impl Core {
 }
 
 #[test]
-fn a_frame_through_the_core_with_96_cells_allocates_nothing() {
+fn frame_through_core_allocates_nothing() {
     let _alone = alone();
     let folder = tempfile::tempdir().expect("a folder");
     let mut source = source(&pack_log(folder.path()));
@@ -178,9 +181,9 @@ fn a_frame_through_the_core_with_96_cells_allocates_nothing() {
     assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
     before.iter().for_each(|record| core.feed(record));
     (core.sent, core.events) = (0, 0);
-    // A row of the findings ends once in a minute or more, and allocates then.
+    // A row of findings ends at most once a minute and may then allocate.
     allocating_at_most(BLOCKS_OF_A_ROW, "the core", || steady.iter().for_each(|record| core.feed(record)));
     assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
-    assert!(core.monitor.latest().flatten().count() == 96, "every cell has its estimate");
+    assert!(core.monitor.latest().flatten().count() == 96, "every cell must have an estimate");
     assert_eq!(core.events, 0, "a steady part");
 }

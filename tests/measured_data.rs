@@ -1,5 +1,5 @@
-//! Build script: sets `cfg(measured_data)` when measured data are present, so that the tests that need them are
-//! ignored (and counted as skipped) when they are not.
+//! Build script: sets `cfg(measured_data)` if measured data are present. Otherwise the tests that need them are ignored
+//! (and counted as skipped).
 //!
 //! The folder is the one that `PACKWATCH_DATA` names, or `../shared/data` next to the project.
 #![expect(clippy::print_stdout, reason = "Cargo reads the output of a build script")]

@@ -1,4 +1,4 @@
-//! The estimators' work that benches share: the example pack's cells, and what is measured of them.
+//! Estimator inputs shared by several benches: the example pack's cells and their readings.
 
 use packwatch_host::cell::CellStep;
 use packwatch_host::config::{self, Config};
@@ -9,8 +9,8 @@ pub(crate) fn example() -> Config {
     config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
 }
 
-/// Ten readings a second under a load that turns round every 30 s; cells differ by some millivolts, and eight share a
-/// temperature.
+/// Ten readings a second under a load that reverses every 30 s. Cells differ by some millivolts; groups of eight share
+/// a temperature.
 pub(crate) fn reading(k: u32, cell: usize) -> CellStep {
     let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
     CellStep {

@@ -1,4 +1,4 @@
-//! Fuzz target of the door `bpx`.
+//! Fuzz target of the entry point `bpx`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| packwatch_fuzz::doors::door("bpx")(data));

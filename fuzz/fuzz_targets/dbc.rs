@@ -1,4 +1,4 @@
-//! Fuzz target of the door `dbc`.
+//! Fuzz target of the entry point `dbc`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| packwatch_fuzz::doors::door("dbc")(data));

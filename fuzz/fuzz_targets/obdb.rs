@@ -1,4 +1,4 @@
-//! Fuzz target of the door `obdb`.
+//! Fuzz target of the entry point `obdb`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| packwatch_fuzz::doors::door("obdb")(data));

@@ -1,3 +1,3 @@
-//! Fuzzers of packwatch: every door through which something enters the program, as a function of bytes.
+//! Fuzzers of packwatch: every input of the program as a function of bytes.
 
 pub mod doors;

@@ -1,9 +1,9 @@
-//! The finding that an injected fault asks for.
+//! The finding that packwatch should report for an injected fault.
 
 use packwatch::cell_faults::CellFaultKind;
 use packwatch::sim::FaultKind;
 
-/// The finding of a fault; `None` = packwatch has none for it.
+/// The expected finding; `None` if packwatch has no finding for this fault.
 pub(crate) fn kind_of(fault: &FaultKind) -> Option<CellFaultKind> {
     match fault {
         FaultKind::Leak { .. } => Some(CellFaultKind::Leak),

@@ -2,12 +2,16 @@
 //!
 //! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
 //!
-//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); cells have spread. Every kind of fault is
-//! injected in packs with good, usual and poor sensors, without balancing, with it, and with bits that show which cells are bled, at a
-//! random cell on a random day of the first third. `--packs` are distributed over the rows, each at least one. `--quick` simulates
-//! one pack per fault with usual sensors and balancing. `--only WORD` takes the faults whose name has the word: `--only healthy
-//! --packs 3000` for the rate of false findings. `--list` prints each finding that was not asked for, with its pack. `--write` writes
-//! `tests/diagnose.md`. Needs the repository's cell model and nothing else.
+//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`); its cells differ. Each kind of
+//! fault is injected at a random cell on a random day of the first third, in packs with good, usual and poor sensors,
+//! without balancing, with balancing, and with balancing whose bits show which cells are bled. Needs only the
+//! repository's cell model.
+//!
+//! - `--packs`: total number of packs, distributed over the rows, at least one per row
+//! - `--quick`: one pack per fault, with usual sensors and balancing
+//! - `--only WORD`: only faults whose name contains the word; `--only healthy --packs 3000` gives the rate of false findings
+//! - `--list`: prints each unexpected finding with its pack
+//! - `--write`: writes `tests/diagnose.md`
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program whose output is its table")]
 
 mod finding;
@@ -32,10 +36,10 @@ const SIZES: [PackSize; 2] = [PackSize { cells: 12, capacity_ah: 60.0 }, PackSiz
 const QUALITIES: [(&str, SensorQuality); 3] =
     [("good", SensorQuality::Good), ("usual", SensorQuality::Usual), ("poor", SensorQuality::Poor)];
 
-/// Quality of the sensors of `--quick`.
+/// Index of the sensor quality that `--quick` uses.
 const QUICK_QUALITY: usize = 1;
 
-/// Kinds of faults: name, pack size, text of the fault with places for two cells (A, B) and a sensor (S).
+/// Kinds of faults: name, pack size, and fault text with placeholders for two cells (A, B) and a sensor (S).
 const FAULTS: [(&str, usize, &str); 21] = [
     ("healthy", 0, ""),
     ("healthy", 1, ""),
@@ -60,7 +64,7 @@ const FAULTS: [(&str, usize, &str); 21] = [
     ("temperature off", 1, "temperature-off:S"),
 ];
 
-/// Name of a fault that grows for ten days, and its steps.
+/// Suffix of a fault that grows for ten days, and its number of steps.
 const SLOWLY: &str = " in 10 days";
 const SLOW_S: f64 = 10.0 * 86_400.0;
 const SLOW_STEPS: u32 = 80;
@@ -135,7 +139,7 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// CPU time of this process so far, s: unlike the time on the clock it is the same on a busy machine.
+/// CPU time of this process so far, s. Unlike wall-clock time, it does not depend on the load of the machine.
 fn cpu_s() -> Option<f64> {
     const TICKS_PER_S: f64 = 100.0; // USER_HZ of Linux
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
@@ -144,7 +148,7 @@ fn cpu_s() -> Option<f64> {
     Some((ticks(11)? + ticks(12)?) / TICKS_PER_S)
 }
 
-/// A row of the table, in its order.
+/// A row of the table, in sort order: fault, sensor quality, balancing.
 type Row = (usize, usize, PackBalancing);
 
 fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
@@ -159,7 +163,7 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     for i in 0..each {
         for row @ (f, q, balancing) in rows.iter().copied() {
             let (name, size, text) = FAULTS[f];
-            // The same pack in every row: rows differ by their fault and sensors alone.
+            // Use the same pack in every row, so that rows differ only in fault and sensors.
             let seed = options.seed + i as u64;
             let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
             let fault = fault_of(text, size, seed, days)?;
@@ -218,7 +222,7 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
     scores.into_inner().unwrap_or_default()
 }
 
-/// Prints the findings that are not the fault's.
+/// Prints the findings that the fault does not explain.
 fn list((f, q, balancing): Row, case: &Case, seen: &[Seen]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
@@ -236,13 +240,12 @@ fn list((f, q, balancing): Row, case: &Case, seen: &[Seen]) {
 fn table(scores: &BTreeMap<Row, Score>, options: &Options) -> String {
     let days = options.days;
     let mut text = format!(
-        "# Diagnosis of simulated packs\n\nWritten by `tests/diagnose/run --write`. {days} days each. Found: right kind and right cell. Delays in days \
-         from the beginning of the fault, over all packs of the row: `-` when so many were not found. In one drive: found before the second drive \
-         with the fault began. Wrong cell: right kind, on other cells only. \
-         Wrong kind: in addition or instead. False: findings per pack-month without a fault, and in brackets the rate that they exclude at 95 %. \
-         A finding that comes and goes counts once.\n\n\
-         Rows are no independent samples: row by row the packs are the same ones, up to the fault. The packs' true cells follow the cell model that \
-         the monitor has; real cells do not.\n\n\
+        "# Diagnosis of simulated packs\n\nWritten by `tests/diagnose/run --write`. {days} days each. Found: right kind and right cell. \
+         Median and 90 %: delay in days after the start of the fault within which that share of the row's packs was found; `-` if fewer were \
+         found. In one drive: found before the second drive with the fault began. Wrong cell: right kind, but only on other cells. Wrong \
+         kind: another kind, in addition or instead. False: findings per pack-month without a fault; in brackets the upper 95 % limit of \
+         that rate. A finding that recurs counts once.\n\nThe rows are not independent samples: all rows use the same packs with different \
+         faults. The packs' true cells follow the monitor's cell model exactly, unlike real cells.\n\n\
          | fault | pack | sensors | balancing | packs | found | in one drive | median | 90 % | wrong cell | wrong kind | any finding | false |\n\
          | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
     );

@@ -1,4 +1,4 @@
-//! One simulated pack through the whole core: truth, sensors, frames of a DBC, `Monitor`.
+//! Runs one simulated pack through the whole core: truth, sensors, frames of a DBC, `Monitor`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,16 +15,16 @@ use packwatch::sim::{Balancing, Fault, Scenario, SensorQuality, Sensors, Setting
 
 use crate::finding::kind_of;
 
-/// A hole in the record longer than this is sleep, s.
+/// A longer gap in the record means sleep, s.
 const SLEEP_GAP_S: f64 = 30.0;
-/// Time between two looks at the findings while the buses are awake, s.
+/// Interval between two checks of the findings while the buses are awake, s.
 const LOOK_S: f64 = 300.0;
-/// Discharge of a drive, part of the capacity per hour; and a time without one that ends it, s.
+/// A drive discharges more than this, as part of the capacity per hour; it ends after this time without discharge, s.
 const DRIVE_PER_H: f64 = 0.05;
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
-/// Capacity of the cells of the model file, Ah.
+/// Capacity of the cells in the model file, Ah.
 const MODEL_AH: f64 = 2.6;
 
 /// Size of a pack.
@@ -34,7 +34,7 @@ pub(crate) struct PackSize {
     pub(crate) capacity_ah: f64,
 }
 
-/// Whether a BMS balances, and whether it shows which cells it bleeds.
+/// Whether the BMS balances, and whether it reports which cells it bleeds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum PackBalancing {
     Off,
@@ -45,7 +45,7 @@ pub(crate) enum PackBalancing {
 impl PackBalancing {
     pub(crate) const ALL: [Self; 3] = [Self::Off, Self::On, Self::Bits];
 
-    /// As the table has it.
+    /// Name in the table.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Off => "off",
@@ -61,24 +61,24 @@ pub(crate) struct Case {
     pub(crate) size: PackSize,
     pub(crate) quality: SensorQuality,
     pub(crate) balancing: PackBalancing,
-    /// The fault; one that grows is several.
+    /// The fault; a growing fault consists of several steps.
     pub(crate) faults: Vec<Fault>,
     pub(crate) seed: u64,
     pub(crate) days: u32,
     pub(crate) period_ms: u32,
 }
 
-/// A finding when it was there for the first time.
+/// A finding at its first occurrence.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Seen {
-    /// From the start, s.
+    /// Time since the start, s.
     pub(crate) at_s: f64,
-    /// Drives that have begun since the start of the fault, with the one in which it began.
+    /// Drives since the start of the fault, including the one in which it began.
     pub(crate) drives: u32,
     pub(crate) found: CellFault,
 }
 
-/// The configuration of a pack whose BMS shows which cells it bleeds, written into `folder`.
+/// Writes the configuration of a pack whose BMS reports which cells it bleeds to `folder`.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -108,7 +108,7 @@ fn dbc(cells: u16, sensors: u16) -> String {
     text
 }
 
-/// The model of the repository's example cell, scaled.
+/// The repository's example cell model, scaled.
 fn cell_model(capacity_ah: f64) -> Result<String, String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells/example_nmc_2600.toml");
     let text = std::fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
@@ -124,7 +124,7 @@ fn cell_model(capacity_ah: f64) -> Result<String, String> {
     toml::to_string(&model).map_err(|e| e.to_string())
 }
 
-/// Resistances by 1/k, capacitances by k, in all tables.
+/// Divides resistances by k and multiplies capacitances by k, in all tables.
 fn scale(table: &mut toml::Table, k: f64) {
     for (key, value) in table.iter_mut() {
         match (key.as_str(), value) {
@@ -179,7 +179,7 @@ fn pack(size: PackSize, sensors: u16) -> String {
 }
 
 impl Case {
-    /// The fault as it begins.
+    /// The first step of the fault.
     pub(crate) fn fault(&self) -> Option<Fault> {
         self.faults.first().copied()
     }
@@ -206,7 +206,8 @@ impl Case {
         }
     }
 
-    /// Runs the pack; the findings in the order in which they were there first, without those that are true of the sensors' own errors.
+    /// Runs the pack. Returns the findings in the order of their first occurrence, without those that correctly
+    /// describe the sensors' own errors.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<Seen> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
@@ -260,7 +261,7 @@ fn median(values: &[f64]) -> f64 {
     0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2])
 }
 
-/// Collects the first time of each finding.
+/// Collects the first occurrence of each finding.
 #[derive(Debug, Default)]
 struct Looks {
     first: Vec<Seen>,
@@ -277,7 +278,7 @@ impl Looks {
     }
 }
 
-/// Counts drives, from the one in which a fault begins.
+/// Counts drives, starting with the one in which a fault begins.
 #[derive(Debug, Default)]
 struct Drives {
     begun: u32,
@@ -285,7 +286,7 @@ struct Drives {
 }
 
 impl Drives {
-    /// Takes a moment of a drive.
+    /// Handles a reading during a drive.
     fn note(&mut self, now_s: f64, from_s: f64) {
         let is_new = self.last_s.replace(now_s).is_none_or(|last_s| now_s - last_s > PARKED_S);
         if now_s >= from_s && (is_new || self.begun == 0) {

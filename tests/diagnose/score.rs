@@ -1,4 +1,4 @@
-//! Counts what was found against what was injected.
+//! Compares findings with the injected faults.
 
 use packwatch::quantity::CellIndex;
 use packwatch::sim::FaultKind;
@@ -15,17 +15,17 @@ const MONTH_DAYS: f64 = 30.0;
 pub(crate) struct Score {
     packs: u32,
     days: f64,
-    /// Days from the beginning of the fault to the right finding, of the packs in which it was found.
+    /// Days from the start of the fault to the right finding, for packs in which it was found.
     delays_days: Vec<f64>,
-    /// Packs in which it was found before the second drive with the fault began.
+    /// Packs in which the fault was found before the second drive with the fault began.
     in_one_drive: u32,
     /// Packs whose fault was found on another cell only.
     wrong_cell: u32,
-    /// Packs with a finding of another kind after the beginning.
+    /// Packs with a finding of another kind after the start of the fault.
     wrong_kind: u32,
-    /// Packs with any finding after the beginning.
+    /// Packs with any finding after the start of the fault.
     any: u32,
-    /// Findings before the beginning, or in a healthy pack.
+    /// Findings before the start of the fault, or in a healthy pack.
     false_findings: u32,
     /// Days without a fault.
     healthy_days: f64,
@@ -51,7 +51,7 @@ impl Score {
         self.any += u32::from(after().next().is_some());
     }
 
-    /// As cells of a Markdown row.
+    /// The row's cells in Markdown.
     pub(crate) fn row(&self) -> String {
         let share = |count: usize| format!("{:.0} %", 100.0 * count as f64 / f64::from(self.packs.max(1)));
         let rate = self.false_rate();
@@ -68,7 +68,7 @@ impl Score {
         )
     }
 
-    /// Delay within which this share of all packs was found; one that was not found has no delay.
+    /// Delay within which this share of all packs was found. A pack whose fault was not found counts as infinite delay.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
         delays.sort_by(f64::total_cmp);
@@ -87,14 +87,14 @@ impl Score {
     }
 }
 
-/// The mean of a Poisson distribution that gives `count` or fewer in 5 % of cases (Wilson and Hilferty; 1 % too low at 0).
+/// Mean of a Poisson distribution that gives `count` or fewer in 5 % of cases (Wilson and Hilferty; 1 % too low at 0).
 fn poisson_upper(count: f64) -> f64 {
     const NORMAL_95: f64 = 1.645;
     let n = count + 1.0;
     n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
-/// Cells that a right finding may name, first and last; none = the pack.
+/// Cells that a right finding may name, as ranges; empty = the pack.
 fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
     let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
     match *fault {
@@ -116,7 +116,7 @@ fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
 fn is_right_place(places: &[(CellIndex, CellIndex)], found: Option<(CellIndex, CellIndex)>) -> bool {
     match found {
         None => places.is_empty(),
-        // A sensor of the last cells may have fewer of them.
+        // The sensor of the last cells may have fewer cells.
         Some((first, last)) => places.iter().any(|place| place.0 == first && last <= place.1 && last >= place.0),
     }
 }

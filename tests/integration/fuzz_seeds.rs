@@ -7,7 +7,7 @@ use std::path::Path;
 use self::doors::DOORS;
 
 #[path = "../../fuzz/src/doors/mod.rs"]
-#[expect(unreachable_pub, dead_code, reason = "the fuzz targets need a door by its name")]
+#[expect(unreachable_pub, dead_code, reason = "the fuzz targets look up an entry point by name")]
 mod doors;
 
 /// Number of mutated copies per entry point; tests/fuzz runs the fuzzers.

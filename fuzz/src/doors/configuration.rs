@@ -1,4 +1,4 @@
-//! Configurations and cell models: what is accepted runs and accepts its own stored state.
+//! Configurations and cell models: an accepted configuration must run and accept its own stored state.
 
 use packwatch::config::Config;
 use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};
@@ -9,7 +9,7 @@ use super::world::{self, CELL, DBC, PACK};
 
 const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
-/// Tables and keys that the reference page lists with a number.
+/// Tables and keys with a numeric value in the reference page.
 fn keys() -> &'static [(&'static str, &'static str)] {
     static KEYS: std::sync::OnceLock<Vec<(&str, &str)>> = std::sync::OnceLock::new();
     KEYS.get_or_init(|| {
@@ -28,7 +28,7 @@ fn keys() -> &'static [(&'static str, &'static str)] {
     })
 }
 
-/// The base with numbers of any size in some keys.
+/// The base configuration with numbers of any size in some keys.
 fn drawn(source: &mut Source<'_>) -> Vec<u8> {
     let mut text = PACK.to_owned();
     for _ in 0..=source.byte() % 6 {
@@ -50,7 +50,7 @@ fn drawn(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// TOML of any kind, and numbers of any size.
+/// Arbitrary TOML, or a configuration with numbers of any size.
 pub fn configuration(data: &[u8]) {
     let mut source = Source::new(data);
     let pack = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { drawn(&mut source) };
@@ -59,7 +59,7 @@ pub fn configuration(data: &[u8]) {
     }
 }
 
-/// A cell model with changed numbers or of any kind.
+/// An arbitrary cell model, or one with changed numbers.
 pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);
     let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };
@@ -85,7 +85,7 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// A short drive, and the state after it.
+/// Runs a short drive, then restores the resulting state.
 fn use_it(config: &Config) {
     const DRIVE: &[u8] = &[7, 0xE8, 3, 0, 20, 6, 20, 7, 0x18, 0xFC, 6, 20];
     let mut monitor = Monitor::new(config.monitor.clone());
@@ -94,8 +94,8 @@ fn use_it(config: &Config) {
         out.clear();
         monitor.handle(record, &mut out);
     }
-    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
     let accepted = Monitor::new(config.monitor.clone()).restore(snapshot, Downtime::AsStamped);
-    assert!(accepted.is_ok(), "its own state is refused: {accepted:?}");
+    assert!(accepted.is_ok(), "the monitor rejects its own state: {accepted:?}");
 }

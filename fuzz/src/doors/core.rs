@@ -1,4 +1,5 @@
-//! The core: a small vehicle whose driver, faults, testers and attackers follow from the bytes, for up to some thousand inputs.
+//! The core: the bytes determine a small vehicle with its driver, faults, testers and attackers, for up to some
+//! thousand inputs.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -14,38 +15,38 @@ use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 use super::source::Source;
 use super::world;
 
-/// Most inputs of one execution: some 50 ms of work.
+/// Maximum number of inputs per execution: about 50 ms of work.
 const MAX_INPUTS: usize = 3000;
-/// Most cuts of one execution: each takes as long as some hundred inputs.
+/// Maximum number of cuts per execution: each takes as long as some hundred inputs.
 const MAX_CUTS: usize = 100;
-/// Most outputs of one input: the largest pack of the configuration has two cells and eleven rules.
+/// Maximum number of outputs per input. The configuration has at most two cells and eleven rules.
 const MAX_OUTPUTS: usize = 2000;
-/// Inputs and cuts of all executions of this process, for tests/fuzz.
+/// Inputs and cuts of all executions of this process, printed for tests/fuzz.
 static INPUTS: AtomicU64 = AtomicU64::new(0);
 static CUTS: AtomicU64 = AtomicU64::new(0);
-/// Inputs between two lines about their number.
+/// Number of inputs between two printed counts.
 const REPORT_EVERY: u64 = 100_000;
 const BUS: BusIndex = BusIndex(0);
-/// Identifiers that the configuration sends: output messages and diagnostic requests.
+/// Identifiers sent by the configuration: output messages and diagnostic requests.
 const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
-/// Address of the J1939 node, and that of a node which has none.
+/// Address of the J1939 node, and the address used while it has none.
 const OWN_ADDRESSES: [u32; 2] = [249, 254];
 const MS: i64 = 1_000_000;
-/// After a longer time without an input a restored monitor takes it that the program was off, s.
+/// After a longer time without input, a restored monitor assumes that the program was off, s.
 const BREAK_S: f64 = 30.0;
 
-/// Frames, gaps and commands in; a second run must give the same.
+/// Feeds frames, gaps and commands; a second run must give the same outputs.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
     let is_repeated = source.byte().is_multiple_of(8);
     let records = records(&mut source);
     let first = run(&records, true);
     if is_repeated {
-        assert!(first == run(&records, false), "a second run gives other outputs");
+        assert!(first == run(&records, false), "a second run gives different outputs");
     }
 }
 
-/// The same through two monitors; one of them is replaced by its own stored form after every so many inputs.
+/// Feeds two monitors; one of them is regularly replaced by its own stored state.
 pub fn cuts(data: &[u8]) {
     let mut source = Source::new(data);
     let steps = [1 + usize::from(source.byte()), 1 + usize::from(source.byte())];
@@ -54,7 +55,7 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // By the monitor's clock: after a stamp of the far future it waits for a while before it goes back.
+        // Use the monitor's clock: after a time stamp in the far future the clock waits before it goes back.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;
@@ -72,7 +73,7 @@ pub fn cuts(data: &[u8]) {
     count(records.len(), cuts);
 }
 
-/// Runs the inputs through a monitor, checks its outputs and digests them.
+/// Feeds the inputs to a monitor, checks its outputs and returns their digest.
 fn run(records: &[Record], is_checked: bool) -> u64 {
     let (mut monitor, mut out, mut digest) = (monitor(), outputs(), 0xCBF2_9CE4_8422_2325);
     let mut digested = |number: u64| digest = (digest ^ number).wrapping_mul(0x0100_0000_01B3);
@@ -102,7 +103,7 @@ fn handle(monitor: &mut Monitor, record: &Record, out: &mut Outputs) {
     monitor.handle(record, out);
 }
 
-/// Adds to the counts of this process, and prints them at times.
+/// Adds to this process's counts and prints them from time to time.
 fn count(inputs: usize, cuts: usize) {
     let (inputs, cuts) = (inputs as u64, cuts as u64);
     let before = INPUTS.fetch_add(inputs, Ordering::Relaxed);
@@ -112,20 +113,20 @@ fn count(inputs: usize, cuts: usize) {
     }
 }
 
-/// A monitor that continues from the state of another, through its stored form.
+/// A monitor restored from another monitor's state, through its stored form.
 fn restored(monitor: &Monitor) -> Monitor {
-    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
     let mut restored = Monitor::new(world::config().monitor.clone());
-    restored.restore(snapshot, Downtime::AsStamped).expect("its own state is accepted");
+    restored.restore(snapshot, Downtime::AsStamped).expect("a monitor accepts its own state");
     restored
 }
 
-/// Whether frames, events and estimates are the same to the last bit.
+/// Whether frames, events and estimates are bit-identical.
 fn is_same(one: &Outputs, other: &Outputs) -> bool {
     let are_events_same = || match (one.events.is_empty(), other.events.is_empty()) {
         (true, true) => true,
-        // By their text: a number that is none equals itself there, and zero differs from minus zero.
+        // Compare as text: NaN then equals NaN, and zero differs from minus zero.
         _ => format!("{:?}", one.events) == format!("{:?}", other.events),
     };
     one.frames == other.frames
@@ -157,7 +158,10 @@ fn numbers(estimate: &Estimate) -> impl Iterator<Item = u64> + use<> {
 }
 
 pub(super) fn check(record: &Record, out: &Outputs) {
-    assert!(out.frames.len() + out.events.len() + out.estimates.len() < MAX_OUTPUTS, "{record:?}: too many outputs");
+    assert!(
+        out.frames.len() + out.events.len() + out.estimates.len() < MAX_OUTPUTS,
+        "{record:?}: found too many outputs"
+    );
     for sent in &out.frames {
         let is_own = match sent.frame.id() {
             CanId::Standard(id) => OWN.contains(&id),
@@ -181,7 +185,7 @@ pub(super) fn check(record: &Record, out: &Outputs) {
     }
 }
 
-/// The vehicle at one moment.
+/// State of the simulated vehicle.
 struct Vehicle {
     encoder: InputEncoder,
     now_ns: i64,
@@ -196,7 +200,7 @@ struct Vehicle {
     records: Vec<Record>,
 }
 
-/// The inputs that the bytes stand for.
+/// The inputs that the bytes encode.
 pub(super) fn records(source: &mut Source<'_>) -> Vec<Record> {
     let mut vehicle = Vehicle {
         encoder: InputEncoder::new(&world::config().monitor.input),
@@ -310,12 +314,12 @@ impl Vehicle {
             }
             // A flood of one identifier.
             22 => (0..u16::from(source.byte()) * 2).for_each(|_| self.frame(CanId::Standard(0x110), &[1; 8])),
-            // An answer of a controller as it is meant.
+            // A valid answer of a controller.
             _ => self.frame(CanId::Standard(0x7BB), &[4, 0x61, 1, 0x20, source.byte(), 0, 0, 0]),
         }
     }
 
-    /// What a healthy pack sends in one period, and the tick after it.
+    /// Frames of a healthy pack in one period, and the following tick.
     fn drive(&mut self, period_ns: i64) {
         self.soc = (self.soc - self.current_a * period_ns as f64 / 1e9 / 3600.0 / 2.6 * 10.0).clamp(0.02, 0.98);
         let voltage_v = 3.3 + 0.8 * self.soc - 0.03 * self.current_a + self.offset_v;
@@ -347,19 +351,17 @@ impl Vehicle {
 
     fn protected(&mut self, profile: Profile, data_id: u16, mut payload: [u8; 8]) {
         self.counter = profile.next_counter(self.counter);
-        Protection { profile, data_id }.protect(&mut payload, self.counter).expect("8 bytes are enough");
+        Protection { profile, data_id }.protect(&mut payload, self.counter).expect("8 bytes suffice");
         self.frame(CanId::Standard(0x100), &payload);
     }
 
-    /// A command frame with any content and a right, repeated or wrong counter.
+    /// A command frame with arbitrary content and a correct, repeated or wrong counter.
     fn command(&mut self, source: &mut Source<'_>) {
         let (profile, mut payload) = (Profile::P01A, source.array::<8>());
         if !source.byte().is_multiple_of(4) {
             self.command_counter = profile.next_counter(self.command_counter);
         }
-        Protection { profile, data_id: 0x0321 }
-            .protect(&mut payload, self.command_counter)
-            .expect("8 bytes are enough");
+        Protection { profile, data_id: 0x0321 }.protect(&mut payload, self.command_counter).expect("8 bytes suffice");
         self.frame(CanId::Standard(0x6B3), &payload);
     }
 }

@@ -1,4 +1,4 @@
-//! Files that are read in pieces: logs, journals, tables. Each lies in a folder in memory where there is one.
+//! Files that are read in pieces: logs, journals, tables. They are written to a folder in memory if possible.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use packwatch::monitor::Record;
 
 use super::source::Source;
 
-/// Most records that are compared.
+/// Maximum number of records compared.
 const MAX_RECORDS: usize = 20_000;
 
 /// Calls `read` with a file of this name and content.
@@ -26,7 +26,7 @@ pub(super) fn folder() -> tempfile::TempDir {
     made.expect("a folder")
 }
 
-/// A candump log or CSV, plain or compressed: the first byte chooses the name.
+/// A candump log or CSV, plain or compressed: the first byte selects the file name.
 pub fn log(data: &[u8]) {
     let mut source = Source::new(data);
     let name = source.one_of(&["a.log", "a.csv", "a.log.gz", "a.log.zst", "a.csv.zst"]);
@@ -50,7 +50,7 @@ fn options(strict: bool) -> LogOptions {
     }
 }
 
-/// One by one and in batches must give the same; a strict reader gives the beginning of it.
+/// Reading one by one and in batches must give the same records; a strict reader gives a prefix of them.
 fn compare(path: &Path) {
     let one_by_one = |strict: bool| -> (Vec<Record>, bool) {
         let mut log = LogSource::new([path.to_owned()], options(strict));
@@ -72,7 +72,7 @@ fn compare(path: &Path) {
     while batched.len() < records.len() && log.next_batch(&mut batch).unwrap_or(false) {
         batched.extend_from_slice(batch.records());
     }
-    // By their text: a number that is none equals itself there.
+    // Compare as text, because NaN does not equal NaN.
     let text = |records: &[Record]| format!("{records:?}");
     let count = records.len().min(batched.len());
     assert_eq!(records.len(), count, "batches end before the records");
@@ -102,7 +102,7 @@ pub fn table(data: &[u8]) {
         let wanted = ColumnSelection { columns: &names[..1], optional: &names[1..], missing: MissingPolicy::Skipped };
         let files = [path.to_owned()];
         if let Ok(table) = ColumnTable::read(&files, &wanted, &PartColumn::Default) {
-            assert_eq!(table.values.len(), table.len() * table.width(), "a row has another number of values");
+            assert_eq!(table.values.len(), table.len() * table.width(), "a row has a different number of values");
         }
     });
 }

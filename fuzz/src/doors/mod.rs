@@ -1,17 +1,18 @@
-//! The doors: each takes any bytes, drives one entrance of the program with them and panics when an invariant does not hold.
+//! Fuzz entry points ("doors"): each takes arbitrary bytes, feeds them to one input of the program and panics if an
+//! invariant is broken.
 //!
-//! | door | entrance | invariants, besides "no panic" |
+//! | entry point | input of the program | invariants, in addition to "no panic" |
 //! | --- | --- | --- |
 //! | `core` | frames, ticks, gaps, commands, J1939, diagnostics into the monitor | only own identifiers are sent; estimates are numbers; an unknown value clears no alarm; a second run gives the same outputs |
-//! | `cuts` | the same, with snapshots taken and restored in between | own state is accepted; frames, events and estimates are those without a cut, bit for bit |
+//! | `cuts` | the same, with snapshots taken and restored in between | own state is accepted; frames, events and estimates equal those without a cut, bit for bit |
 //! | `snapshot` | a stored state with damaged numbers | rejected, or runs on with numbers, and its own state is accepted |
-//! | `configuration` | TOML; numbers of any size in any key | accepted: runs, and accepts its own state |
+//! | `configuration` | TOML; numbers of any size in any key | if accepted, it runs and accepts its own state |
 //! | `cell_model` | a cell model file | as for `configuration` |
-//! | `dbc` | a DBC file | what is written reads back the same |
-//! | `log`, `journal` | candump logs, CSV, journals | one by one and in batches give the same records |
+//! | `dbc` | a DBC file | a written DBC reads back unchanged |
+//! | `log`, `journal` | candump logs, CSV, journals | reading one by one and in batches gives the same records |
 //! | `table` | measured CSV of `fit`, `rul`, `gpr` | rows are numbers |
-//! | `obdb`, `bpx` | files of `import` | a cell model that is written is accepted |
-//! | `control` | a line on the control socket | what is written reads back the same |
+//! | `obdb`, `bpx` | files of `import` | a written cell model is accepted |
+//! | `control` | a line on the control socket | a written line reads back unchanged |
 //! | `store` | a database with changed bytes | opens, or reports why; works again afterwards |
 
 mod configuration;
@@ -23,10 +24,10 @@ mod store;
 mod texts;
 mod world;
 
-/// A door: any bytes in, a panic for a broken invariant.
+/// An entry point: takes arbitrary bytes and panics if an invariant is broken.
 pub type Door = fn(&[u8]);
 
-/// Every door with its name, which is that of its fuzz target and of its folder of seeds.
+/// All entry points. The name is also that of the fuzz target and of the folder of seeds.
 pub const DOORS: &[(&str, Door)] = &[
     ("core", core::core),
     ("cuts", core::cuts),
@@ -46,10 +47,13 @@ pub const DOORS: &[(&str, Door)] = &[
     ("bpx", texts::bpx),
 ];
 
-/// The door of a name.
+/// The entry point with the given name.
 ///
 /// # Panics
-/// When there is none.
+/// If no entry point has that name.
 pub fn door(name: &str) -> Door {
-    DOORS.iter().find(|(known, _)| *known == name).map_or_else(|| panic!("no door {name}"), |(_, door)| *door)
+    DOORS
+        .iter()
+        .find(|(known, _)| *known == name)
+        .map_or_else(|| panic!("unknown entry point {name}"), |(_, door)| *door)
 }

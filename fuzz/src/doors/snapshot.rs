@@ -1,4 +1,4 @@
-//! A stored state in which numbers and words were changed: rejected, or the monitor runs from it and its own state is accepted.
+//! A stored state with changed numbers and words is rejected, or the monitor runs from it and accepts its own state.
 
 use std::sync::OnceLock;
 
@@ -8,23 +8,23 @@ use super::core::{check, records};
 use super::source::Source;
 use super::world;
 
-/// Bytes of a drive that leaves something in every part of the state: use, rest, an alarm, a test, an answer.
+/// Bytes of a drive that fills every part of the state: use, rest, an alarm, a test, an answer.
 const DRIVE: &[u8] = &[
     7, 0xE8, 3, 6, 31, 6, 31, 15, 0, 7, 0x18, 0xFC, 6, 31, 6, 31, 8, 120, 0, 31, 23, 5, 14, 1, 0, 0, 0, 0, 0, 3, 0, 31,
 ];
 
-/// The state after that drive, in its stored form.
+/// The stored state after that drive.
 fn stored() -> &'static str {
     static STORED: OnceLock<String> = OnceLock::new();
     STORED.get_or_init(|| {
         let mut monitor = Monitor::new(world::config().monitor.clone());
         let mut out = Outputs::default();
         records(&mut Source::new(DRIVE)).iter().for_each(|record| monitor.handle(record, &mut out));
-        serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document")
+        serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON")
     })
 }
 
-/// The places of numbers in a JSON text.
+/// Positions of the numbers in a JSON text.
 fn numbers(text: &str) -> Vec<(usize, usize)> {
     let (mut found, mut begin, mut is_text) = (Vec::new(), None, false);
     for (at, byte) in text.bytes().enumerate() {
@@ -41,7 +41,7 @@ fn numbers(text: &str) -> Vec<(usize, usize)> {
     found
 }
 
-/// The state with some of its numbers replaced, or any bytes.
+/// The state with some numbers replaced, or arbitrary bytes.
 fn changed(source: &mut Source<'_>) -> Vec<u8> {
     if source.byte().is_multiple_of(16) {
         return source.rest().to_vec();
@@ -58,7 +58,7 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// See the module.
+/// See the module documentation.
 pub fn snapshot(data: &[u8]) {
     let mut source = Source::new(data);
     let downtimes = [Downtime::AsStamped, Downtime::Unknown, Downtime::Seconds(0.0), Downtime::Seconds(1e9)];
@@ -74,9 +74,9 @@ pub fn snapshot(data: &[u8]) {
         monitor.handle(record, &mut out);
         check(record, &out);
     }
-    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot is a document");
+    let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
     let mut again = Monitor::new(world::config().monitor.clone());
     let accepted = again.restore(snapshot, Downtime::AsStamped);
-    assert!(accepted.is_ok(), "its own state is refused: {accepted:?}");
+    assert!(accepted.is_ok(), "the monitor rejects its own state: {accepted:?}");
 }

@@ -1,6 +1,6 @@
-//! Takes bytes apart into values: numbers, choices, moments. After the end everything is zero, so that any input is whole.
+//! Splits bytes into values: numbers, choices, times. After the end every value is zero, so any input is complete.
 
-/// The bytes that are left.
+/// The remaining bytes.
 pub(super) struct Source<'a> {
     bytes: &'a [u8],
 }
@@ -14,7 +14,7 @@ impl<'a> Source<'a> {
         self.bytes.is_empty()
     }
 
-    /// All that is left.
+    /// Takes all remaining bytes.
     pub(super) fn rest(&mut self) -> &'a [u8] {
         std::mem::take(&mut self.bytes)
     }
@@ -40,7 +40,7 @@ impl<'a> Source<'a> {
         i16::from_le_bytes(self.array())
     }
 
-    /// One of a list.
+    /// An element of a list.
     pub(super) fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
         choices[usize::from(self.byte()) % choices.len()]
     }

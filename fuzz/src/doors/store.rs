@@ -1,4 +1,5 @@
-//! The store: a database or a state file with changed bytes is opened, or the reason is reported; afterwards it is written and read again.
+//! A database or a state file with changed bytes is opened, or the reason is reported. Afterwards the store is written
+//! and read again.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -20,18 +21,18 @@ const DRIVE: &[u8] = &[7, 0xE8, 3, 6, 31, 6, 31, 7, 0x18, 0xFC, 6, 31, 6, 31, 7,
 /// The files of a store.
 const FILES: [&str; 3] = ["packwatch.db", "state-a.json.zst", "state-b.json.zst"];
 
-/// The files of a daemon that has learned something.
+/// The files of a daemon that has learned values.
 fn stored() -> &'static [Vec<u8>; 3] {
     static STORED: OnceLock<[Vec<u8>; 3]> = OnceLock::new();
     STORED.get_or_init(|| {
         let folder = folder();
-        // Twice: for both states.
+        // Write twice, to fill both state files.
         (0..2).for_each(|_| write(folder.path()));
         FILES.map(|name| std::fs::read(folder.path().join(name)).expect("a file"))
     })
 }
 
-/// Opens the store, drives and stops as a daemon does.
+/// Opens the store, drives and stops, as a daemon does.
 fn write(path: &Path) {
     let config = world::config();
     let setting = PlaceSetting::At(path.to_owned());
@@ -51,7 +52,7 @@ fn write(path: &Path) {
     store.finish(&monitor, now);
 }
 
-/// See the module.
+/// See the module documentation.
 pub fn store(data: &[u8]) {
     let mut source = Source::new(data);
     let mut files = stored().clone();

@@ -1,4 +1,4 @@
-//! Texts that are taken as a whole: DBC, requests of the control socket, signal sets and BPX files.
+//! Texts that are parsed as a whole: DBC, requests of the control socket, signal sets and BPX files.
 
 use packwatch::can::dbc::Database;
 use packwatch::control::protocol::{AlarmList, CommandOutcome, Request, contents};
@@ -8,11 +8,11 @@ pub fn dbc(data: &[u8]) {
     let Ok(database) = Database::parse_bytes(data) else { return };
     let written = database.to_dbc();
     let again = Database::parse(&written)
-        .unwrap_or_else(|error| panic!("what is written does not read back: {error}\n{written}"));
-    assert_eq!(again.to_dbc(), written, "what is written reads back as something else");
+        .unwrap_or_else(|error| panic!("the written DBC does not read back: {error}\n{written}"));
+    assert_eq!(again.to_dbc(), written, "the written DBC reads back differently");
 }
 
-/// A line of a client, and of a daemon.
+/// A line sent by a client, and by a daemon.
 pub fn control(data: &[u8]) {
     if let Ok(request) = Request::parse(data) {
         let line = request.to_line();
@@ -34,7 +34,7 @@ pub fn obdb(data: &[u8]) {
     let _ = import(text, &ObdbSettings { source: "fuzz.json".to_owned(), ..ObdbSettings::default() });
 }
 
-/// A BPX file: the model that is made of it is accepted.
+/// A BPX file: the converted model must be accepted.
 #[cfg(feature = "lab")]
 pub fn bpx(data: &[u8]) {
     use packwatch::lab::import::bpx::{BpxSettings, import};
@@ -42,6 +42,6 @@ pub fn bpx(data: &[u8]) {
     let settings = BpxSettings { source: "fuzz.json".to_owned(), name: None };
     if let Ok(made) = import(text, &settings) {
         let read = super::files::with_file("cell.toml", made.text.as_bytes(), packwatch::config::cell_model::load);
-        assert!(read.is_ok(), "the written model is refused: {:?}\n{}", read.err(), made.text);
+        assert!(read.is_ok(), "the written model is rejected: {:?}\n{}", read.err(), made.text);
     }
 }

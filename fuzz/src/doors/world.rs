@@ -1,5 +1,5 @@
-//! The configuration that the doors of the core share: three cells, protected inputs, alarms of every kind, commands, a J1939 node and
-//! diagnostic requests.
+//! The configuration shared by the core's entry points: three cells, protected inputs, all kinds of alarms, commands, a
+//! J1939 node and diagnostic requests.
 
 use std::io::{Error, ErrorKind};
 use std::path::Path;
@@ -141,7 +141,7 @@ rule = "recharge_period_low"
 info = 1000
 "#;
 
-/// A configuration from texts.
+/// Loads a configuration from texts.
 pub(super) fn load(pack: &[u8], dbc: &str, cell: &[u8]) -> Result<Config, ConfigFaults> {
     let read = |path: &Path| match path.to_str() {
         Some("pack.toml") => Ok(pack.to_vec()),
