@@ -27,6 +27,7 @@ mod diagnostic;
 mod discover_cli;
 mod doctor;
 mod e2e_peer;
+mod examples;
 #[cfg(feature = "lab")]
 mod export_cli;
 mod fit_cli;
