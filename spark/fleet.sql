@@ -1,27 +1,27 @@
--- Questions to a fleet, as views over the tables of `packwatch fleet merge`; DuckDB and Spark SQL give the same answers.
+-- Views for fleet questions over the tables of `packwatch fleet merge`. DuckDB and Spark SQL give the same results.
 --
--- Before: views or tables `vehicles`, `half_cycles` and `alarms` over the files of these names. `log` is the vehicle, cells count from 0.
+-- Needs views or tables `vehicles`, `half_cycles` and `alarms` over the files of these names. `log` is the vehicle; cells count from 0.
 --
 -- | view | question |
 -- | --- | --- |
 -- | not_replayed | which vehicles could not be replayed, and why |
--- | usage | how is each vehicle used: cycles a day, charge, temperature |
--- | capacity_of_cells | what has each cell left |
+-- | usage | how is each vehicle used: cycles per day, charge, temperature |
+-- | capacity_of_cells | how much capacity does each cell have left |
 -- | capacity_by_cycles | how does capacity fall with equivalent full cycles: quantiles over cells |
--- | capacity_by_month | the same with months since the first record |
--- | resistance_by_cycles | how does resistance rise |
+-- | capacity_by_month | how does capacity fall with months since the first record |
+-- | resistance_by_cycles | how does resistance rise with equivalent full cycles |
 -- | alarms_by_rule | which alarms were raised, how often, in how many vehicles |
--- | first_alarms | when was each alarm raised first in a vehicle |
--- | alarm_leads | how long before its weakest cell fell below 80 % of the rated capacity did a vehicle have its first capacity alarm |
+-- | first_alarms | when was each alarm first raised in each vehicle |
+-- | alarm_leads | how long before the weakest cell fell below 80 % of the rated capacity was the first capacity alarm raised |
 -- | cell_outliers | which cells differ from their pack |
 -- | pack_outliers | which packs differ from the fleet |
 -- | packs_to_call_in | which packs need a workshop, and why |
--- | thresholds | what would a capacity threshold have cost: vehicles alarmed, and those of them that are above it again |
+-- | thresholds | what would a capacity threshold cost: vehicles alarmed, and alarmed vehicles that later rose above it again |
 
 CREATE OR REPLACE TEMPORARY VIEW not_replayed AS
 SELECT log, error FROM vehicles WHERE error IS NOT NULL;
 
--- Each half-cycle with the cell's capacity relative to the rated one.
+-- Each half-cycle with the cell's capacity relative to the rated capacity.
 CREATE OR REPLACE TEMPORARY VIEW relative_capacity AS
 SELECT
     h.log, cell, time, since_start_s, full_cycles, charge_ah, mean_temperature_c, capacity_ah, resistance_ratio, remaining_cycles_low,
@@ -98,7 +98,7 @@ CREATE OR REPLACE TEMPORARY VIEW cell_differences AS
 SELECT c.log, c.cell, c.capacity_ah, m.median_ah, c.capacity_ah / m.median_ah - 1 AS differs
 FROM capacity_of_cells c JOIN pack_medians m ON m.log = c.log;
 
--- Beyond three robust deviations (1.4826 median absolute deviations) of the pack, and 2 % at least.
+-- Outliers differ from the pack by more than three robust deviations (1.4826 median absolute deviations) and more than 2 %.
 CREATE OR REPLACE TEMPORARY VIEW cell_outliers AS
 SELECT d.log, d.cell, d.capacity_ah, d.median_ah, d.differs
 FROM cell_differences d
@@ -122,7 +122,7 @@ FROM pack_differences d
 CROSS JOIN (SELECT percentile_cont(0.5) WITHIN GROUP (ORDER BY abs(differs)) AS deviation FROM pack_differences) s
 WHERE abs(d.differs) > 3 * 1.4826 * s.deviation AND abs(d.differs) > 0.02;
 
--- Alarms as each vehicle's log ended.
+-- Alarms at the end of each vehicle's log.
 CREATE OR REPLACE TEMPORARY VIEW last_alarms AS
 SELECT log, rule, severity, cell, active FROM (
     SELECT

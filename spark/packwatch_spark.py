@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Replays a fleet on Spark: a task for each vehicle, by the same program as by hand.
+"""Replays a fleet on Spark: one task per vehicle, each running the packwatch program.
 
     spark-submit spark/packwatch_spark.py MANIFEST --config FILE --out DIR [--binary packwatch] [--estimates S] [OPTION...]
 
-MANIFEST is that of `packwatch fleet plan`. MANIFEST, FILE, DIR and the logs must have the same names on driver and executors: a folder that
-all of them see. Each task runs `packwatch fleet run` for its vehicle, which writes DIR/VEHICLE; what is complete is not replayed again, so
-a task that Spark repeats, or a job that is started again, costs nothing. Other options, such as --csv-sign=charge, go to it as they are. A vehicle that fails, also one in which the program crashes, is a
-row with its reason and does not end the job.
+MANIFEST comes from `packwatch fleet plan`. MANIFEST, FILE, DIR and the logs need the same paths on driver and executors, so use a shared
+folder. Each task runs `packwatch fleet run` for its vehicle, which writes DIR/VEHICLE. Complete vehicles are not replayed again, so a
+repeated task or a restarted job costs little. Other options, such as --csv-sign=charge, are passed on. If a vehicle fails, even by a
+crash of the program, its row has the reason and the job continues.
 
-Afterwards: `packwatch fleet merge DIR -o TABLES --manifest MANIFEST`. Printed: a line for each vehicle that failed, and the counts. Exit
-status 0 also where vehicles failed. `replay` is for programs: it returns the rows as a DataFrame.
+Afterwards run `packwatch fleet merge DIR -o TABLES --manifest MANIFEST`. Prints a line for each failed vehicle, and the counts. The exit
+status is 0 even if vehicles failed. To get the rows as a DataFrame in a program, call `replay`.
 """
 
 import argparse
@@ -24,7 +24,7 @@ SCHEMA = "vehicle string, outcome string, error string, days double, seconds dou
 
 
 def replay_vehicle(line: str, command: list[str]) -> dict:
-    """Replays the vehicle of one line of a manifest; `command` is that of `fleet run` without the manifest."""
+    """Replays the vehicle of one manifest line; `command` is `fleet run` without the manifest."""
     begun, vehicle = time.monotonic(), json.loads(line)["vehicle"]
     row = {"vehicle": vehicle, "outcome": "failed", "error": None, "days": 0.0}
     with tempfile.NamedTemporaryFile("w", prefix="packwatch-", suffix=".jsonl") as manifest:
@@ -35,14 +35,14 @@ def replay_vehicle(line: str, command: list[str]) -> dict:
         (found,) = json.loads(ran.stdout)["vehicles"]
         row |= {"outcome": found["outcome"], "error": found["record"]["error"], "days": found["record"]["days"]}
     else:
-        said = ran.stderr.strip()[-2000:] or "nothing was said"
+        said = ran.stderr.strip()[-2000:] or "no message"
         row["error"] = f"{os.path.basename(command[0])} ended with status {ran.returncode}: {said}"
     return row | {"seconds": time.monotonic() - begun}
 
 
 def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwatch", estimates: float | None = None,
            more: list[str] | None = None):  # fmt: skip
-    """A DataFrame with a row for each vehicle of these lines of a manifest; they are replayed when it is evaluated. Evaluate it once."""
+    """Returns a DataFrame with a row per vehicle of these manifest lines. Evaluating it replays them, so evaluate it once."""
     command = [binary, "fleet", "run", "--json", "--jobs", "1", "--config", config, "--out", out]
     if estimates is not None:
         command += ["--estimates", str(estimates)]
@@ -57,7 +57,7 @@ def replay(spark, lines: list[str], config: str, out: str, binary: str = "packwa
 
     # The executors' Python needs this module.
     spark.sparkContext.addPyFile(os.path.abspath(__file__))
-    # The largest first, a task each: the last tasks are short.
+    # The largest first, one task each, so that the last tasks are short.
     largest = sorted(lines, key=lambda line: -json.loads(line)["bytes"])
     numbered = spark.sparkContext.parallelize([(line,) for line in largest], max(1, len(largest)))
     return spark.createDataFrame(numbered, "line string").mapInArrow(tasks, SCHEMA)
@@ -83,7 +83,7 @@ def main() -> None:
     with open(options.manifest, encoding="utf-8") as file:
         lines = [line for line in file.read().splitlines() if line.strip()]
     if not lines:
-        sys.exit(f"{options.manifest}: no vehicle")
+        sys.exit(f"{options.manifest}: no vehicles")
     spark = SparkSession.builder.appName("packwatch fleet").getOrCreate()
     frame = replay(spark, lines, os.path.abspath(options.config), os.path.abspath(options.out), options.binary, options.estimates, more)
     rows = frame.collect()
@@ -91,7 +91,7 @@ def main() -> None:
         if row.error:
             print(f"failed: {row.vehicle}: {row.error}")
     counts = {word: sum(row.outcome == word for row in rows) for word in ("replayed", "complete", "failed")}
-    print(", ".join(f"{count} {word}" for word, count in counts.items()) + f"; {sum(row.days for row in rows):.1f} days in all")
+    print(", ".join(f"{count} {word}" for word, count in counts.items()) + f"; {sum(row.days for row in rows):.1f} days in total")
     spark.stop()
 
 

@@ -1,4 +1,4 @@
-//! Arguments that several functions take: paths, and where a configuration comes from.
+//! Arguments shared by several functions: paths, and the source of a configuration.
 
 use std::path::{Path, PathBuf};
 
@@ -20,19 +20,19 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
     }
 }
 
-/// A JSON text as Python's objects.
+/// Converts JSON text to Python objects.
 pub(crate) fn of_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("json")?.call_method1("loads", (text,))
 }
 
-/// Loads a configuration from its text; the files it names are in `folder`.
+/// Loads a configuration from text; the files it names are in `folder`.
 pub(crate) fn of_text(text: &str, folder: &Path) -> PyResult<Config> {
     let main = folder.join("configuration.toml");
     let read = |file: &Path| if file == main { Ok(text.as_bytes().to_vec()) } else { std::fs::read(file) };
     config::load_with(&ConfigFiles::alone(&main), &read).map_err(error::config)
 }
 
-/// Where the configuration of a single cell comes from.
+/// Source of the configuration of a single cell.
 pub(crate) fn cell_source(
     config: Option<PathBuf>,
     cell: Option<PathBuf>,
@@ -40,19 +40,19 @@ pub(crate) fn cell_source(
 ) -> PyResult<CellSource> {
     let (chemistry, rated_ah, voltage_min_v, voltage_max_v) = label;
     if chemistry.is_some() && (config.is_some() || cell.is_some()) {
-        return Err(error::data("chemistry must not be given together with config or cell, which state it"));
+        return Err(error::data("chemistry cannot be given with config or cell; give one of them"));
     }
     let label = [("rated_ah", rated_ah), ("voltage_min_v", voltage_min_v), ("voltage_max_v", voltage_max_v)];
     if chemistry.is_none()
         && let Some((name, _)) = label.iter().find(|(_, value)| value.is_some())
     {
-        return Err(error::data(format!("{name} must be given together with chemistry")));
+        return Err(error::data(format!("{name} needs chemistry")));
     }
     let label = chemistry.map(|chemistry| LabelKeys { chemistry, rated_ah, voltage_min_v, voltage_max_v });
     Ok(CellSource { config, cell, label })
 }
 
-/// Total size of files, bytes; those that cannot be read count nothing.
+/// Total size of files, bytes; unreadable files count as 0.
 pub(crate) fn bytes(files: &[PathBuf]) -> u64 {
     files.iter().filter_map(|path| std::fs::metadata(path).ok()).map(|found| found.len()).sum()
 }

@@ -1,7 +1,7 @@
-//! Arrays from Python: anything that NumPy sees as numbers, without a copy where it is contiguous, aligned and of the type already.
+//! Arrays from Python: anything that NumPy reads as numbers. Not copied if contiguous, aligned and of the right type.
 //!
-//! Masked reals and missing values are NaN. A whole number is never rounded and never wraps: one that is unknown, has a fraction or is
-//! out of range is a fault with its index. An array of anything but numbers is a fault with its dtype.
+//! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap: one that is unknown, has a fraction or is out of
+//! range is an error with its index. Arrays of other types are an error with the dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
@@ -12,14 +12,14 @@ use pyo3_arrow::PyArray;
 
 use crate::error::data;
 
-/// Numbers, row after row.
+/// Numbers in row-major order.
 #[derive(Debug)]
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
-    /// Values; they may be memory of Python's, which is kept until this is dropped.
+    /// Values; may be memory owned by Python, which is kept until this is dropped.
     pub(crate) values: ScalarBuffer<T::Native>,
-    /// Rows.
+    /// Number of rows.
     pub(crate) rows: usize,
-    /// Values of a row.
+    /// Number of values in a row.
     pub(crate) columns: usize,
     /// Whether the array has two dimensions.
     has_columns: bool,
@@ -33,12 +33,12 @@ pub(crate) type Words = Matrix<UInt32Type>;
 pub(crate) type Bytes = Matrix<UInt8Type>;
 
 impl<T: ArrowPrimitiveType> Matrix<T> {
-    /// One row.
+    /// Returns one row.
     pub(crate) fn row(&self, row: usize) -> &[T::Native] {
         &self.values[row * self.columns..][..self.columns]
     }
 
-    /// The matrix, which must have one column.
+    /// Requires one column.
     fn one_column(self, name: &str) -> PyResult<Self> {
         if self.columns == 1 {
             Ok(self)
@@ -47,58 +47,54 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
         }
     }
 
-    /// Index of a value, as NumPy writes it.
+    /// Index of a value in NumPy notation.
     fn index(&self, at: usize) -> String {
         let (row, column) = (at / self.columns.max(1), at % self.columns.max(1));
         if self.has_columns { format!("[{row}, {column}]") } else { format!("[{row}]") }
     }
 }
 
-/// Reals of one or two dimensions; `name` is the argument's.
+/// Converts to reals of one or two dimensions; `name` is the argument.
 pub(crate) fn reals(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
     matrix(name, &float64(name, values)?)
 }
 
-/// Reals of one column.
+/// Converts to reals of one column.
 pub(crate) fn column(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
     reals(name, values)?.one_column(name)
 }
 
-/// Whole numbers of one column.
+/// Converts to whole numbers of one column.
 pub(crate) fn words(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Words> {
     whole(name, "uint32", values, u32::MAX)?.one_column(name)
 }
 
-/// Bytes of one or two dimensions.
+/// Converts to bytes of one or two dimensions.
 pub(crate) fn bytes(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Bytes> {
     whole(name, "uint8", values, u8::MAX)
 }
 
 /// Checks that an array has as many rows as another.
 pub(crate) fn check_rows(name: &str, rows: usize, of: &str, expected: usize) -> PyResult<()> {
-    if rows == expected {
-        Ok(())
-    } else {
-        Err(data(format!("{name} has {rows} rows, {of} has {expected}: must agree")))
-    }
+    if rows == expected { Ok(()) } else { Err(data(format!("{name} has {rows} rows, must have {expected} as {of}"))) }
 }
 
-/// Values as a contiguous array of float64; masked ones are NaN. `name` is for the fault.
+/// Converts to a contiguous float64 array; masked values become NaN. `name` is used in errors.
 #[pyfunction]
 pub(crate) fn float64<'py>(name: &str, values: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
     let numpy = values.py().import("numpy")?;
-    let none = |error: PyErr| data(format!("{name}: no array of numbers: {error}"));
+    let none = |error: PyErr| data(format!("{name}: not an array of numbers: {error}"));
     let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
     check_numbers(name, &array)?;
     if !is_masked(&array)? {
-        // Of the values as given: a column of another library knows its own missing values.
+        // Use the values as given: a column of another library knows its missing values.
         return laid_out(values, "float64").map_err(none);
     }
     let filled = array.call_method1("astype", ("float64",)).and_then(|array| array.call_method1("filled", (f64::NAN,)));
     laid_out(&filled.map_err(none)?, "float64")
 }
 
-/// Whole numbers from 0 to `most`, the largest of `T`: as they are where they are of that dtype, else checked one by one.
+/// Whole numbers from 0 to `most`, the largest of `T`. Used unchanged if they have that dtype, else checked one by one.
 fn whole<T>(name: &str, dtype: &str, values: &Bound<'_, PyAny>, most: T::Native) -> PyResult<Matrix<T>>
 where
     T: ArrowPrimitiveType,
@@ -112,7 +108,7 @@ where
     }
     let found = reals(name, values)?;
     let converted = |(at, value): (usize, &f64)| {
-        // Exact: `as` keeps every whole number that both types have, and the comparison rejects all others, NaN too.
+        // Exact: `as` preserves whole numbers that both types have, and the comparison rejects all others, including NaN.
         let whole = Some(*value as u64).filter(|whole| *whole as f64 == *value);
         whole.and_then(|whole| T::Native::try_from(whole).ok()).ok_or_else(|| {
             data(format!("{name}{} = {value}, must be a whole number from 0 to {most}", found.index(at)))
@@ -127,12 +123,12 @@ fn is_masked(array: &Bound<'_, PyAny>) -> PyResult<bool> {
     array.py().import("numpy.ma")?.call_method1("isMaskedArray", (array,))?.extract()
 }
 
-/// Rejects an array of texts, times, complex numbers or records: NumPy and pandas convert some of them to reals without a word.
+/// Rejects arrays of texts, times, complex numbers or records, because NumPy and pandas silently convert some of them to reals.
 fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
     let dtype = array.getattr("dtype")?;
     let kind: String = dtype.getattr("kind")?.extract()?;
-    let refused = |what: String| Err(data(format!("{name} is an array of {what}, must be one of numbers")));
-    // Bool, signed, unsigned, real, and objects that each convert to a real.
+    let refused = |what: String| Err(data(format!("{name} is an array of {what}, must be an array of numbers")));
+    // Bool, signed, unsigned, real, and objects; each object must convert to a real.
     if !["b", "i", "u", "f", "O"].contains(&kind.as_str()) {
         return refused(dtype.str()?.to_string());
     }
@@ -150,13 +146,13 @@ fn check_numbers(name: &str, array: &Bound<'_, PyAny>) -> PyResult<()> {
 }
 
 fn laid_out<'py>(values: &Bound<'py, PyAny>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
-    // Layout that is needed: C order, aligned, a plain array and none of a subclass.
+    // Required layout: C order, aligned, a plain array and not a subclass.
     let array = values.py().import("numpy")?.call_method1("require", (values, dtype, "CAE"))?;
-    // A single number is an array of one.
+    // A single number becomes an array of one.
     if array.getattr("ndim")?.eq(0)? { array.call_method1("reshape", (-1,)) } else { Ok(array) }
 }
 
-/// A matrix of an array that has its dtype and the layout.
+/// Makes a matrix of an array that has the dtype and the layout.
 fn matrix<T: ArrowPrimitiveType>(name: &str, array: &Bound<'_, PyAny>) -> PyResult<Matrix<T>> {
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
     let (rows, columns) = match shape[..] {

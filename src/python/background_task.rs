@@ -1,7 +1,7 @@
-//! Long work: without the interpreter's lock, with a progress bar of tqdm where that is there, and ended by Ctrl-C.
+//! Long work: runs without the interpreter's lock, with a tqdm progress bar if installed, and stops on Ctrl-C.
 //!
-//! The work runs on a thread of its own and reports what it has done; the calling thread shows that, and asks Python for signals.
-//! After Ctrl-C, the next report ends the work: its stack is unwound, so that half-written files are removed.
+//! The work runs on its own thread and reports its progress. The calling thread shows it and asks Python for signals. After Ctrl-C, the
+//! next report ends the work by unwinding its stack, so that half-written files are removed.
 
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,13 +11,13 @@ use std::time::Duration;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// Between two looks at signals and progress.
+/// Period of checking signals and progress.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// Payload of the unwinding after Ctrl-C.
+/// Payload of the panic after Ctrl-C.
 struct Interrupted;
 
-/// What the work has done, and whether it must end.
+/// Progress of the work, and whether it must stop.
 #[derive(Debug, Default)]
 pub(crate) struct BackgroundTask {
     done: AtomicU64,
@@ -25,7 +25,7 @@ pub(crate) struct BackgroundTask {
 }
 
 impl BackgroundTask {
-    /// Adds to what has been done; does not return after Ctrl-C.
+    /// Adds to the progress; after Ctrl-C it does not return.
     pub(crate) fn advance(&self, amount: u64) {
         self.done.fetch_add(amount, Ordering::Relaxed);
         if self.must_end.load(Ordering::Relaxed) {
@@ -34,25 +34,25 @@ impl BackgroundTask {
     }
 }
 
-/// The bar to show.
+/// The progress bar to show.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Progress<'a> {
-    /// Whether there is to be one.
+    /// Whether to show a bar.
     pub(crate) is_shown: bool,
-    /// What is done when all is done; `None` = not known.
+    /// Amount of all work; `None` if unknown.
     pub(crate) total: Option<u64>,
-    /// Unit of that.
+    /// Unit of the amount.
     pub(crate) unit: &'a str,
 }
 
 impl Progress<'_> {
-    /// No bar.
+    /// Without a bar.
     pub(crate) fn hidden() -> Self {
         Self { is_shown: false, total: None, unit: "" }
     }
 }
 
-/// Runs work.
+/// Runs work on its own thread.
 pub(crate) fn run<T: Send>(
     py: Python<'_>,
     progress: Progress<'_>,
@@ -91,14 +91,14 @@ fn look(py: Python<'_>, bar: Option<&Bar>, state: &BackgroundTask) -> PyResult<(
     bar.map_or(Ok(()), |bar| bar.show(py, state))
 }
 
-/// A bar of tqdm.
+/// A tqdm bar.
 struct Bar {
     bar: Py<PyAny>,
     shown: AtomicU64,
 }
 
 impl Bar {
-    /// `None` where tqdm is not installed.
+    /// Creates a bar; `None` if tqdm is not installed.
     fn new(py: Python<'_>, progress: Progress<'_>) -> PyResult<Option<Self>> {
         let Ok(tqdm) = py.import("tqdm.auto") else { return Ok(None) };
         let options = PyDict::new(py);

@@ -1,4 +1,4 @@
-//! `CellModel`: open-circuit voltage and resistances of a cell, from a file, a text or a label.
+//! `CellModel`: open-circuit voltage and resistances of a cell, from a file or a label.
 
 use std::path::{Path, PathBuf};
 
@@ -32,7 +32,7 @@ impl CellModel {
         })
     }
 
-    /// The model of a cell of which only the label is known.
+    /// Returns the model of a cell from its label alone.
     #[staticmethod]
     #[pyo3(signature = (chemistry, rated_ah, *, voltage_min_v=None, voltage_max_v=None))]
     fn of_label(
@@ -100,12 +100,12 @@ impl CellModel {
         self.model().temperature_c.clone()
     }
 
-    /// The model at these SOC and this temperature: open-circuit voltage, series and branch resistances, time constants.
+    /// Returns the model at these SOC and this temperature: open-circuit voltage, series and branch resistances, time constants.
     #[pyo3(signature = (soc, temperature_c=25.0))]
     fn table(&self, soc: &Bound<'_, PyAny>, temperature_c: f64) -> PyResult<Table> {
         let (soc, model) = (arrays::column("soc", soc)?, self.model());
         if let Some(found) = soc.values.iter().find(|soc| !(0.0..=1.0).contains(*soc)) {
-            return Err(data(format!("soc: found {found}, must be fractions from 0 to 1")));
+            return Err(data(format!("soc contains {found}, must be fractions from 0 to 1")));
         }
         if !temperature_c.is_finite() {
             return Err(data(format!("temperature_c = {temperature_c}, must be a finite number")));
@@ -124,7 +124,7 @@ impl CellModel {
         Table::new(columns)
     }
 
-    /// The SOC of an open-circuit voltage, a fraction.
+    /// Returns the SOC at an open-circuit voltage, a fraction.
     #[pyo3(signature = (voltage_v, temperature_c=25.0))]
     fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> PyResult<f64> {
         if !voltage_v.is_finite() || !temperature_c.is_finite() {
@@ -135,12 +135,12 @@ impl CellModel {
         Ok(self.model().soc_of_ocv(voltage_v, temperature_c))
     }
 
-    /// The file's text, as `model export` writes it.
+    /// Returns the text of the cell model file, as `model export` writes it.
     fn text(&self) -> String {
         cell_model::text(&self.0, "Written by packwatch.")
     }
 
-    /// Writes the file, completely or not at all.
+    /// Writes the cell model file atomically.
     fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         py.detach(|| write(&path, &self.text()))
     }
@@ -150,7 +150,7 @@ impl CellModel {
     }
 }
 
-/// Writes a text, completely or not at all.
+/// Writes a text file atomically.
 pub(crate) fn write(path: &Path, text: &str) -> PyResult<()> {
     packwatch_lab::write_file(path, text.as_bytes()).map_err(file)
 }

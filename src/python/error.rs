@@ -1,4 +1,4 @@
-//! Exceptions: faults of a configuration, of data and arguments, of files. Each has the text of the command line.
+//! Exceptions: errors of configurations, of data and arguments, of files. Each has the same text as on the command line.
 
 use std::fmt::Display;
 
@@ -6,22 +6,22 @@ use packwatch_host::config::ConfigFaults;
 use packwatch_lab::error::{LabError, RequestError};
 use pyo3::PyErr;
 
-// Their bases are ValueError and OSError, besides the class they share: so they are defined in Python.
+// Defined in Python, because each has two bases: the common class, and ValueError or OSError.
 pyo3::import_exception!(packwatch._errors, ConfigError);
 pyo3::import_exception!(packwatch._errors, DataError);
 pyo3::import_exception!(packwatch._errors, FileError);
 
-/// A fault of data or arguments.
+/// An error of data or arguments.
 pub(crate) fn data(error: impl Display) -> PyErr {
     DataError::new_err(error.to_string())
 }
 
-/// A file that cannot be read or written.
+/// An error of reading or writing a file.
 pub(crate) fn file(error: impl Display) -> PyErr {
     FileError::new_err(error.to_string())
 }
 
-/// Faults of a configuration.
+/// The faults of a configuration.
 pub(crate) fn config(faults: ConfigFaults) -> PyErr {
     let text = faults.to_string();
     ConfigError::new_err((text, faults.0))

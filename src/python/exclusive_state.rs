@@ -1,7 +1,7 @@
-//! A monitor's state for one call at a time, whatever threads they come from.
+//! A monitor's state for one call at a time, from any thread.
 //!
-//! A call that waits for its turn holds no lock of the interpreter, and a signal ends the wait. Two calls fail instead of waiting: one
-//! that a signal handler makes while its own thread is in another, and any after a panic, which left the state half changed.
+//! A waiting call does not hold the interpreter's lock, and a signal ends the wait. Two kinds of calls fail instead of waiting: a call
+//! from a signal handler that interrupts a call on the same thread, and any call after a panic, which left the state inconsistent.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
@@ -13,14 +13,14 @@ use pyo3::prelude::*;
 use crate::error::data;
 use crate::monitor::State;
 
-/// A monitor's state, for one call at a time.
+/// A monitor's state for one call at a time.
 pub(crate) struct ExclusiveState {
     state: Mutex<State>,
-    /// Thread of the call whose turn it is.
+    /// Thread of the current call.
     holder: Mutex<Option<ThreadId>>,
 }
 
-/// The turn of one call.
+/// Exclusive access of one call.
 pub(crate) struct StateGuard<'a> {
     state: MutexGuard<'a, State>,
     owner: &'a ExclusiveState,
@@ -31,10 +31,10 @@ impl ExclusiveState {
         Self { state: Mutex::new(state), holder: Mutex::new(None) }
     }
 
-    /// Waits for the turn of this call.
+    /// Waits for exclusive access.
     ///
     /// # Errors
-    /// An earlier call has failed inside the library, this thread is in another call, or a signal handler raises an exception.
+    /// An earlier call failed inside the library, this thread is already in a call, or a signal handler raises an exception.
     pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_>> {
         loop {
             match self.state.try_lock() {
@@ -43,14 +43,14 @@ impl ExclusiveState {
                     return Ok(StateGuard { state, owner: self });
                 }
                 Err(TryLockError::Poisoned(_)) => {
-                    return Err(data("an earlier call failed inside packwatch: make a new Monitor"));
+                    return Err(data("an earlier call failed inside packwatch; create a new Monitor"));
                 }
                 Err(TryLockError::WouldBlock) if self.holder() == Some(thread::current().id()) => {
-                    return Err(data("the Monitor is at work in the call that this one interrupts"));
+                    return Err(data("the Monitor is in use by the call that this signal handler interrupts"));
                 }
                 Err(TryLockError::WouldBlock) => {
                     py.check_signals()?;
-                    // Between two looks at whether it is this call's turn: short beside a call's own overhead in Python, long beside a look.
+                    // Polling period: shorter than the overhead of a Python call, longer than a check.
                     py.detach(|| thread::sleep(Duration::from_millis(1)));
                 }
             }
@@ -82,7 +82,7 @@ impl DerefMut for StateGuard<'_> {
 
 impl Drop for StateGuard<'_> {
     fn drop(&mut self) {
-        // Before the state is free: the next holder sets its own.
+        // Before the state is released, because the next holder sets its own.
         self.owner.set_holder(None);
     }
 }

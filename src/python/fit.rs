@@ -1,4 +1,4 @@
-//! `fit`: a cell model from measured files.
+//! `fit`: fits a cell model to measured files.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -21,17 +21,17 @@ pub(crate) struct Fit {
 
 #[pymethods]
 impl Fit {
-    /// The cell model file, as `fit --out` writes it.
+    /// Returns the text of the cell model file, as `fit --out` writes it.
     fn text(&self) -> String {
         lab_fit::text(&self.request, &self.outcome)
     }
 
-    /// Writes the cell model file, completely or not at all.
+    /// Writes the cell model file atomically.
     fn write(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         py.detach(|| write(&path, &self.text()))
     }
 
-    /// The document that `fit --json` prints, as a dictionary.
+    /// The document of `fit --json`, as a dictionary.
     #[getter]
     fn document<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         of_json(py, &lab_fit::document(&self.outcome, self.seconds).to_string())
@@ -53,7 +53,7 @@ impl Fit {
         self.outcome.notes.clone()
     }
 
-    /// What the model is good for.
+    /// What the model can be used for.
     #[getter]
     fn verdict(&self) -> Vec<String> {
         self.outcome.verdict.clone()
@@ -105,7 +105,7 @@ pub(crate) fn fit(
     let begin = Instant::now();
     let shown = Progress { is_shown: progress, total: None, unit: "step" };
     let outcome = background_task::run(py, shown, |work| {
-        // A step is a file read or a pass of the fit.
+        // A progress step is a file read or a pass of the fit.
         lab_fit::run(&request, |progress: FitProgress| match progress {
             FitProgress::Read(..) | FitProgress::Pass(..) => work.advance(1),
         })

@@ -1,4 +1,4 @@
-//! `GaussianProcess`: regression on arrays, with the model files of `gpr`.
+//! `GaussianProcess`: regression on arrays; reads and writes the model files of `gpr`.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -46,7 +46,7 @@ impl GaussianProcess {
         let names = names.unwrap_or_else(|| (1..=inputs.columns).map(|number| format!("x{number}")).collect());
         if names.len() != inputs.columns {
             return Err(data(format!(
-                "names has {} names, inputs has {} columns: must agree",
+                "names has {} names, inputs has {} columns; give one name per column",
                 names.len(),
                 inputs.columns
             )));
@@ -79,7 +79,7 @@ impl GaussianProcess {
         Ok(Self(TrainedModel { output: output_name.to_owned(), inputs: names, model: model.map_err(data)? }))
     }
 
-    /// Loads a model that `gpr train` or `save` has written.
+    /// Loads a model written by `gpr train` or `save`.
     #[staticmethod]
     #[pyo3(signature = (path, *, threads=None))]
     fn load(py: Python<'_>, path: PathBuf, threads: Option<usize>) -> PyResult<Self> {
@@ -87,7 +87,7 @@ impl GaussianProcess {
         loaded.map(Self).map_err(of_library)
     }
 
-    /// Writes the model, completely or not at all; it holds the rows it learned from.
+    /// Writes the model atomically, including its training rows.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         py.detach(|| self.0.save(&path)).map_err(of_library)
     }
@@ -98,7 +98,7 @@ impl GaussianProcess {
         check_known("inputs", &inputs)?;
         if inputs.columns != self.0.inputs.len() {
             let (found, allowed) = (inputs.columns, self.0.inputs.len());
-            return Err(data(format!("inputs has {found} columns, must have {allowed} as the model has")));
+            return Err(data(format!("inputs has {found} columns, must have {allowed} as in the model")));
         }
         let predictions = py.detach(|| self.0.model.predict(&inputs.values)).map_err(data)?;
         Table::new(vec![
@@ -137,7 +137,7 @@ fn check_known(name: &str, values: &arrays::Reals) -> PyResult<()> {
     match values.values.iter().position(|value| !value.is_finite()) {
         Some(at) => {
             let (row, found) = (at / values.columns.max(1), values.values[at]);
-            Err(data(format!("{name}[{row}] has {found}, must be finite numbers")))
+            Err(data(format!("{name}[{row}] contains {found}, must be finite numbers")))
         }
         None => Ok(()),
     }

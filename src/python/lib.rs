@@ -1,17 +1,17 @@
-//! The Python module `packwatch._packwatch`: the library that the command line uses too, as classes and functions.
+//! The Python module `packwatch._packwatch`: the library behind the command line as classes and functions.
 //!
-//! In: paths, NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Out: Arrow tables, texts and dictionaries, the
-//! same as the command line writes. A value that is not known is null or NaN, never a default number. Bad input is a Python exception
-//! (`packwatch._errors`) with the text that the command line prints. Long work runs without the interpreter's lock, and Ctrl-C ends it.
+//! Input: paths, NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Output: Arrow tables, texts and
+//! dictionaries, the same as the command line writes. Unknown values are null or NaN, never a default number. Bad input raises a Python
+//! exception (`packwatch._errors`) with the text of the command line. Long work runs without the interpreter's lock, and Ctrl-C stops it.
 //!
-//! | file | what is in it |
+//! | file | contents |
 //! | --- | --- |
 //! | `monitor.rs`, `replay.rs` | rows, frames and logs through the monitor |
-//! | `outputs.rs`, `table.rs` | what comes out: estimates, events, frames as Arrow tables |
+//! | `outputs.rs`, `table.rs` | estimates, events and frames as Arrow tables |
 //! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
 //! | `cell_model.rs`, `measured.rs` | cell models, measured files |
-//! | `arrays.rs`, `error.rs`, `arguments.rs` | arrays in, exceptions, arguments shared |
-//! | `background_task.rs`, `exclusive_state.rs` | progress and Ctrl-C, one call of a monitor at a time |
+//! | `arrays.rs`, `error.rs`, `arguments.rs` | arrays from Python, exceptions, shared arguments |
+//! | `background_task.rs`, `exclusive_state.rs` | progress and Ctrl-C; one call of a monitor at a time |
 
 mod arguments;
 mod arrays;

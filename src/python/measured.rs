@@ -1,4 +1,4 @@
-//! `read`: a measured file as a table, in our CSV or in the Battery Data Format.
+//! `read`: reads a measured file, in packwatch's CSV or in the Battery Data Format, as a table.
 
 use std::path::PathBuf;
 use std::sync::Arc;

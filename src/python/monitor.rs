@@ -1,8 +1,8 @@
 //! `Monitor`: rows or frames in, tables out.
 //!
-//! A row becomes the frames that would have carried it, with the resolution of the configured signals, as in a replay of a CSV file:
-//! the same rows give the same estimates as `packwatch replay`. After Ctrl-C, what was taken stays taken: its outputs come with those of
-//! the next call.
+//! Rows become the frames that would have carried them, with the resolution of the configured signals, as in a replay of a CSV file. So
+//! the same rows give the same estimates as `packwatch replay`. After Ctrl-C, inputs already processed stay processed; their outputs come
+//! with the next call.
 
 use std::path::{Path, PathBuf};
 
@@ -22,7 +22,7 @@ use crate::error::{config as config_error, data};
 use crate::exclusive_state::ExclusiveState;
 use crate::outputs::{Columns, Outputs, Wanted};
 
-/// Rows between two reports of progress.
+/// Rows between two progress reports.
 const REPORT_EVERY: usize = 16_384;
 /// Bit 31 of an identifier marks an extended one, as in a DBC and in SocketCAN.
 const EXTENDED: u32 = 0x8000_0000;
@@ -36,7 +36,7 @@ pub(crate) struct Monitor {
     is_pack_total: bool,
 }
 
-/// What the inputs so far have made of it.
+/// State after the inputs so far.
 pub(crate) struct State {
     driver: MonitorDriver,
     columns: Columns,
@@ -46,7 +46,7 @@ pub(crate) struct State {
 
 #[pymethods]
 impl Monitor {
-    /// A monitor that knows nothing of its pack yet.
+    /// Creates a monitor without learned values.
     #[new]
     #[pyo3(signature = (config=None, *, text=None, folder=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None,
                         voltage_max_v=None, sleep_gap_s=30.0, estimates_period_s=0.0))]
@@ -72,37 +72,37 @@ impl Monitor {
         let is_cell = source != CellSource::default();
         let config = match &text {
             Some(_) if is_cell => {
-                return Err(data("text must not be given together with config, cell or chemistry"));
+                return Err(data("text cannot be given with config, cell or chemistry; give one of them"));
             }
             Some(text) => of_text(text, folder.as_deref().unwrap_or(Path::new("")))?,
             None if folder.is_some() => {
-                return Err(data("folder must be given together with text, whose files are there"));
+                return Err(data("folder needs text; it is the folder of the files that text names"));
             }
-            None if !is_cell => return Err(data("no configuration: config, text, cell or chemistry must be given")),
+            None if !is_cell => return Err(data("no configuration; give config, text, cell or chemistry")),
             None => py.detach(|| source.load()).map_err(config_error)?,
         };
         Ok(Self::of(&config, sleep_gap_s, wanted))
     }
 
-    /// Cells in series.
+    /// Number of cells in series.
     #[getter]
     fn cells(&self) -> u16 {
         self.cells
     }
 
-    /// Names of the interfaces, by their numbers.
+    /// Names of the interfaces by number.
     #[getter]
     fn interfaces(&self) -> Vec<String> {
         self.interfaces.clone()
     }
 
-    /// Values of rows that no frame of the configuration can carry, so far.
+    /// Number of values so far that no frame of the configuration can carry.
     #[getter]
     fn uncarried_values(&self, py: Python<'_>) -> PyResult<usize> {
         Ok(self.state.wait(py)?.driver.uncarried_values)
     }
 
-    /// Takes rows.
+    /// Processes rows.
     #[pyo3(signature = (time_s, current_a, voltage_v, temperature_c=None, *, progress=false))]
     fn rows(
         &self,
@@ -124,7 +124,7 @@ impl Monitor {
         self.work(py, progress, time_s.rows, |state, work| state.take_rows(&time_s, &input, work))
     }
 
-    /// Takes frames.
+    /// Processes frames.
     #[pyo3(signature = (time_s, can_id, data, *, length=None, interface=None, progress=false))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
     fn frames(
@@ -149,7 +149,7 @@ impl Monitor {
             let length = length.as_ref().map_or(payloads.columns, |length| length.values[row] as usize);
             frame(row, can_id.values[row], payloads.row(row), length)
         };
-        // Before the first is taken: a fault in a row must not leave half of them behind.
+        // Check all frames before the first is processed, so that an error does not leave half of them processed.
         let frames = (0..time_s.rows).map(frame).collect::<PyResult<Vec<Frame>>>()?;
         self.work(py, progress, time_s.rows, |state, work| {
             for (row, frame) in frames.iter().enumerate() {
@@ -161,7 +161,7 @@ impl Monitor {
         })
     }
 
-    /// The record continues at `time_s` after a gap of unknown length.
+    /// Continues the record at `time_s` after a gap of unknown length.
     fn gap(&self, py: Python<'_>, time_s: f64) -> PyResult<Outputs> {
         if !time_s.is_finite() {
             return Err(data(format!("time_s = {time_s}, must be a finite number")));
@@ -171,7 +171,7 @@ impl Monitor {
         state.finish(py, &self.interfaces)
     }
 
-    /// Ends the record: its last samples become estimates.
+    /// Ends the record; the last samples become estimates.
     fn finish(&self, py: Python<'_>) -> PyResult<Outputs> {
         let mut state = self.state.wait(py)?;
         state.driver.finish();
@@ -203,7 +203,7 @@ impl Monitor {
         found.map(BusIndex).ok_or_else(|| data(format!("interface {name:?}, must be one of {allowed}")))
     }
 
-    /// Work on rows, and its tables.
+    /// Processes rows and returns the tables.
     fn work(
         &self,
         py: Python<'_>,
@@ -231,7 +231,7 @@ impl State {
         }
     }
 
-    /// The time of an input. Estimates that would not become rows are not made: that takes time.
+    /// Begins an input at `time_s`. Skips estimates that would not become rows, to save time.
     fn begin(&mut self, time_s: f64) -> Timestamp {
         let time = Timestamp::from_secs(time_s);
         self.driver.out.want_estimates = self.columns.wants_estimates(self.wanted, time, self.cells);
@@ -259,7 +259,7 @@ impl RowInput {
         self.temperature_c.iter().try_for_each(|of| check_rows("temperature_c", of.rows, "time_s", rows))?;
         let found = self.voltage_v.columns;
         if found != voltages {
-            return Err(data(format!("voltage_v has {found} columns, must have {voltages} as the configuration has")));
+            return Err(data(format!("voltage_v has {found} columns, must have {voltages} as in the configuration")));
         }
         let most = usize::from(u16::MAX);
         let sensors = self.temperature_c.as_ref().map_or(0, |of| of.columns);
@@ -269,7 +269,7 @@ impl RowInput {
         Ok(())
     }
 
-    /// The channels of a row, without values.
+    /// Channels of a row, without values.
     fn channels(&self) -> Vec<(Channel, Option<f64>)> {
         let numbers = |count: usize| 0..u16::try_from(count).unwrap_or(u16::MAX);
         let cells = numbers(self.voltage_v.columns).map(|cell| Channel::CellVoltage(CellIndex(cell)));
@@ -284,7 +284,7 @@ impl RowInput {
         channels.into_iter().map(|channel| (channel, None)).collect()
     }
 
-    /// Writes the values of a row.
+    /// Writes the values of a row to its channels.
     fn fill(&self, row: usize, values: &mut [(Channel, Option<f64>)]) {
         let temperatures = self.temperature_c.as_ref().map_or(&[][..], |of| of.row(row));
         let all = self.current_a.row(row).iter().chain(self.voltage_v.row(row)).chain(temperatures);
@@ -298,7 +298,7 @@ fn report(row: usize, work: &BackgroundTask) {
     }
 }
 
-/// Times, which must be known.
+/// Converts times, which must be finite.
 fn times(time_s: &Bound<'_, PyAny>) -> PyResult<Reals> {
     let time_s = arrays::column("time_s", time_s)?;
     match time_s.values.iter().position(|time_s| !time_s.is_finite()) {
@@ -309,10 +309,10 @@ fn times(time_s: &Bound<'_, PyAny>) -> PyResult<Reals> {
 
 fn frame(row: usize, id: u32, payload: &[u8], length: usize) -> PyResult<Frame> {
     let can_id = if id & EXTENDED == 0 { CanId::standard(id) } else { CanId::extended(id & !EXTENDED) };
-    let allowed = "must be at most 0x7FF, or at most 0x1FFFFFFF with bit 31 set for an extended one";
+    let allowed = "must be at most 0x7FF, or with bit 31 set for an extended identifier at most 0x1FFFFFFF";
     let can_id = can_id.ok_or_else(|| data(format!("can_id[{row}] = {id:#X}, {allowed}")))?;
     let payload = payload.get(..length).ok_or_else(|| {
-        data(format!("length[{row}] = {length}, must be at most {} as data has columns", payload.len()))
+        data(format!("length[{row}] = {length}, must be at most {}, the number of columns of data", payload.len()))
     })?;
     let frame = if length <= 8 { Frame::classic(can_id, payload) } else { Frame::fd(can_id, false, false, payload) };
     frame.ok_or_else(|| {

@@ -1,4 +1,4 @@
-//! What a monitor puts out, collected in columns.
+//! Collects the outputs of a monitor in columns.
 
 use std::sync::Arc;
 
@@ -12,19 +12,19 @@ use pyo3::prelude::*;
 use crate::error::data;
 use crate::table::{Table, reals};
 
-/// Reals of an estimate: all columns but time, cell and whether it was accepted.
+/// Number of real columns of an estimate: all but time, cell and acceptance.
 const REALS: usize = ESTIMATE_COLUMNS.len() - 3;
 
-/// Tables of what came out.
+/// Tables of the outputs.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Outputs {
     /// Estimates, with the columns of `replay --estimates`.
     #[pyo3(get)]
     estimates: Py<Table>,
-    /// Events: time, name, and the document that `replay --events` writes.
+    /// Events: time, name, and the document as in `replay --events`.
     #[pyo3(get)]
     events: Py<Table>,
-    /// Frames that would be sent.
+    /// Frames to be sent.
     #[pyo3(get)]
     frames: Py<Table>,
 }
@@ -37,7 +37,7 @@ impl Outputs {
     }
 }
 
-/// Columns that grow.
+/// Growing columns.
 #[derive(Default)]
 pub(crate) struct Columns {
     estimates: EstimateColumns,
@@ -45,15 +45,15 @@ pub(crate) struct Columns {
     frames: Vec<Transmit>,
 }
 
-/// Which outputs are wanted.
+/// Selection of outputs.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Wanted {
-    /// At most one estimate per cell in each period, ns; 0 = every one, `None` = none.
+    /// At most one estimate per cell in each period, ns; 0 = all, `None` = none.
     pub(crate) period_ns: Option<i64>,
 }
 
 impl Wanted {
-    /// Of a period in seconds.
+    /// From a period in seconds.
     pub(crate) fn new(period_s: Option<f64>) -> PyResult<Self> {
         let allowed = |period_s: f64| (0.0..=1e9).contains(&period_s);
         match period_s {
@@ -66,13 +66,13 @@ impl Wanted {
 }
 
 impl Columns {
-    /// Takes outputs and empties them.
+    /// Adds outputs and clears them.
     pub(crate) fn take(&mut self, wanted: Wanted, out: &mut CoreOutputs) {
         self.add(wanted, out);
         out.clear();
     }
 
-    /// Takes outputs.
+    /// Adds outputs.
     pub(crate) fn add(&mut self, wanted: Wanted, out: &CoreOutputs) {
         if let Some(period_ns) = wanted.period_ns {
             out.estimates.iter().for_each(|estimate| self.estimates.add(period_ns, estimate));
@@ -81,7 +81,7 @@ impl Columns {
         self.frames.extend_from_slice(&out.frames);
     }
 
-    /// Whether an estimate of `time` may become a row; of a pack of `cells`.
+    /// Whether an estimate at `time` of a pack of `cells` cells may become a row.
     pub(crate) fn wants_estimates(&self, wanted: Wanted, time: Timestamp, cells: usize) -> bool {
         match wanted.period_ns {
             None => false,
@@ -90,7 +90,7 @@ impl Columns {
         }
     }
 
-    /// The tables; `interfaces` are the names by number. The columns are empty afterwards.
+    /// Returns the tables and clears the columns; `interfaces` are the names by number.
     pub(crate) fn finish(&mut self, py: Python<'_>, interfaces: &[String]) -> PyResult<Outputs> {
         Ok(Outputs {
             estimates: self.estimates.finish()?.into_py(py)?,
@@ -106,10 +106,10 @@ struct EstimateColumns {
     cell: Vec<u16>,
     reals: [Vec<f64>; REALS],
     accepted: Vec<bool>,
-    /// Time of the record's first estimate, and the period of each cell's last row.
+    /// Time of the record's first estimate.
     first: Option<Timestamp>,
     periods: Vec<Option<i64>>,
-    /// The period of the last row, and how many cells have one in it.
+    /// The latest period, and the number of cells with a row in it.
     latest: Option<(i64, usize)>,
 }
 
@@ -143,7 +143,7 @@ impl EstimateColumns {
         self.reals.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
     }
 
-    /// Whether it is its cell's first of a period since the record's start. After the clock went back, periods begin again.
+    /// Whether it is the first estimate of its cell in a period since the start of the record. If the clock went back, periods restart.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);
@@ -160,7 +160,7 @@ impl EstimateColumns {
         begins
     }
 
-    /// Whether an estimate of `time` may become a row.
+    /// Whether an estimate at `time` may become a row.
     fn wants(&self, period_ns: i64, time: Timestamp, cells: usize) -> bool {
         let (Some(first), Some((latest, done))) = (self.first, self.latest) else { return true };
         done < cells || time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns) != latest

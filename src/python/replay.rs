@@ -1,4 +1,4 @@
-//! `replay`: logs through the monitor, as the command does, with the results in tables.
+//! `replay`: replays logs through the monitor like the command, with results in tables.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -16,7 +16,7 @@ use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
 
-// The signatures below and of `Monitor` have it as a literal, which Python shows.
+// The signatures below and of `Monitor` repeat it as a literal, which Python shows.
 const _: () = assert!(SLEEP_GAP_S == 30.0);
 
 /// Results of a replay.
@@ -25,13 +25,13 @@ pub(crate) struct Replay {
     /// Estimates, events, frames.
     #[pyo3(get)]
     outputs: Py<Outputs>,
-    /// The summary that `replay --json` prints.
+    /// The summary of `replay --json`.
     json: String,
 }
 
 #[pymethods]
 impl Replay {
-    /// The summary as the text that `replay --json` prints.
+    /// Returns the summary as JSON text, as `replay --json` prints it.
     fn json(&self) -> &str {
         &self.json
     }
@@ -58,7 +58,7 @@ impl Replay {
     }
 }
 
-/// Replays logs, one after another, as one record.
+/// Replays logs as one record.
 #[pyfunction]
 #[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=30.0,
                     estimates_period_s=0.0, progress=false))]

@@ -1,4 +1,4 @@
-//! `rul`: remaining useful life of measured capacity histories.
+//! `rul`: forecasts the remaining useful life of measured capacity histories.
 
 use std::path::PathBuf;
 
@@ -11,14 +11,14 @@ use crate::arguments::{List, of_json};
 use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{data, of_library};
 
-/// An end of life: Ah, or a text like "70 %".
+/// An end of life: Ah, or a text such as "70 %".
 #[derive(FromPyObject)]
 pub(crate) enum End {
     AmpereHours(f64),
     Text(String),
 }
 
-/// Forecasts the remaining life at the end of histories, or at parts of the life.
+/// Forecasts the remaining life at the end of histories, or at points of the life.
 #[pyfunction]
 #[pyo3(signature = (files, end_of_life, *, at=None, alpha=0.2))]
 pub(crate) fn rul<'py>(
@@ -31,7 +31,7 @@ pub(crate) fn rul<'py>(
     let files = files.0;
     let thresholds = end_of_life.0.into_iter().map(End::threshold).collect::<PyResult<Vec<Threshold>>>()?;
     if let Some(part) = at.iter().flatten().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
-        return Err(data(format!("at and alpha: found {part}, must be above 0 and below 1")));
+        return Err(data(format!("at or alpha = {part}, must be above 0 and below 1")));
     }
     for (name, is_empty) in [
         ("files", files.is_empty()),
@@ -49,7 +49,7 @@ pub(crate) fn rul<'py>(
     of_json(py, &document)
 }
 
-/// The document: forecasts at the end, or judged ones at parts of the life.
+/// Builds the document: forecasts at the end, or scored forecasts at points of the life.
 fn document(
     files: &[PathBuf],
     thresholds: &[Threshold],

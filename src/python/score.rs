@@ -1,4 +1,4 @@
-//! `score`: measured files against truth.
+//! `score`: compares estimates with the truth of measured files.
 
 use std::path::PathBuf;
 
@@ -9,18 +9,18 @@ use crate::arguments::{List, bytes, cell_source, of_json};
 use crate::background_task::{self, Progress};
 use crate::error::{data, of_library, of_request};
 
-/// Scores of files in cases.
+/// Scores of files and cases.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Score(ScoreReport);
 
 #[pymethods]
 impl Score {
-    /// The document that `score --json` prints, with the line feed at its end.
+    /// Returns the document of `score --json`, including the final line feed.
     fn json(&self) -> PyResult<String> {
         self.0.json().map_err(data)
     }
 
-    /// The tables that `score` prints.
+    /// Returns the tables of `score`.
     fn table(&self) -> String {
         self.0.table()
     }
@@ -42,7 +42,7 @@ impl Score {
     }
 }
 
-/// Runs measured files through the core and compares the estimates with the truth.
+/// Replays measured files and compares the estimates with the truth.
 #[pyfunction]
 #[pyo3(signature = (files, *, config=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None, voltage_max_v=None,
                     learn=None, start=None, remove=None, soc_error_points=None, soc_std_points=None,
@@ -80,7 +80,7 @@ pub(crate) fn score(
     progress: bool,
 ) -> PyResult<Score> {
     if seeds.is_some() && window.is_none() {
-        return Err(data("seeds must be given together with window"));
+        return Err(data("seeds needs window"));
     }
     let usual = ScoreRequest::default();
     let request = ScoreRequest {

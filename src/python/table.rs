@@ -1,4 +1,4 @@
-//! A table of results: an Arrow table that any library takes without a copy, and columns as NumPy arrays.
+//! A table of results: an Arrow table that other libraries read without a copy, and columns as NumPy arrays.
 
 use std::sync::Arc;
 
@@ -15,12 +15,12 @@ use pyo3_arrow::ffi::{ArrayIterator, to_schema_pycapsule, to_stream_pycapsule};
 
 use crate::error::data;
 
-/// Columns of equal length, by name.
+/// Columns of equal length by name.
 #[pyclass(frozen, module = "packwatch")]
 #[derive(Debug)]
 pub(crate) struct Table(RecordBatch);
 
-/// A column of reals; NaN becomes null.
+/// Makes a column of reals; NaN becomes null.
 pub(crate) fn reals(values: Vec<f64>) -> ArrayRef {
     let nulls = values.iter().any(|value| value.is_nan());
     let nulls = nulls.then(|| values.iter().map(|value| !value.is_nan()).collect::<NullBuffer>());
@@ -28,7 +28,7 @@ pub(crate) fn reals(values: Vec<f64>) -> ArrayRef {
 }
 
 impl Table {
-    /// A table of columns of one length.
+    /// Makes a table of columns of equal length.
     pub(crate) fn new(columns: Vec<(&str, ArrayRef)>) -> PyResult<Self> {
         let field = |(name, array): &(&str, ArrayRef)| Field::new(*name, array.data_type().clone(), true);
         let schema = Schema::new(columns.iter().map(field).collect::<Vec<_>>());
@@ -36,12 +36,12 @@ impl Table {
         RecordBatch::try_new(Arc::new(schema), arrays).map(Self).map_err(data)
     }
 
-    /// The table as a Python object.
+    /// Converts the table to a Python object.
     pub(crate) fn into_py(self, py: Python<'_>) -> PyResult<Py<Self>> {
         Py::new(py, self)
     }
 
-    /// Rows.
+    /// Number of rows.
     pub(crate) fn rows(&self) -> usize {
         self.0.num_rows()
     }
@@ -53,7 +53,7 @@ impl Table {
 
 #[pymethods]
 impl Table {
-    /// The names of the columns.
+    /// Names of the columns.
     #[getter]
     fn column_names(&self) -> Vec<String> {
         self.0.schema().fields().iter().map(|field| field.name().clone()).collect()
@@ -71,7 +71,7 @@ impl Table {
         self.0.column_by_name(name).is_some()
     }
 
-    /// A column as a NumPy array: without a copy where no value is null; null reads as NaN.
+    /// Returns a column as a NumPy array, without a copy if it has no nulls; null becomes NaN.
     fn __getitem__<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyAny>> {
         let missing = || PyKeyError::new_err(format!("no column {name}, found {}", self.column_names().join(",")));
         let array = self.0.column_by_name(name).ok_or_else(missing)?;
@@ -94,12 +94,12 @@ impl Table {
         }
     }
 
-    /// The table as a `pyarrow.Table`, without a copy.
+    /// Returns a `pyarrow.Table` without a copy.
     fn to_pyarrow<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         slf.py().import("pyarrow")?.call_method1("table", (slf,))
     }
 
-    /// The table as a `pandas.DataFrame`; null reads as NaN.
+    /// Returns a `pandas.DataFrame`; null becomes NaN.
     fn to_pandas<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         let (py, columns) = (slf.py(), PyDict::new(slf.py()));
         for name in slf.get().column_names() {
@@ -126,7 +126,7 @@ impl Table {
     }
 }
 
-/// Memory as a NumPy array, which keeps it.
+/// Wraps memory in a NumPy array, which keeps it alive.
 fn numpy<'py>(py: Python<'py>, memory: Buffer, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("numpy")?.call_method1("frombuffer", (PyArrowBuffer::new(memory), dtype))
 }

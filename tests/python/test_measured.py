@@ -55,7 +55,7 @@ def test_a_masked_column_in_memory_is_unknown_and_a_text_is_refused():
     table = {"Test Time / s": [0.0, 1.0], "Voltage / V": np.ma.array([3.9, 9.9], mask=[False, True]), "Current / A": [1, 2]}
     columns = pw.from_bdf(table)
     np.testing.assert_array_equal(columns["voltage_v"], [3.9, np.nan])
-    with pytest.raises(pw.DataError, match="Current / A is an array of <U1, must be one of numbers"):
+    with pytest.raises(pw.DataError, match="Current / A is an array of <U1, must be an array of numbers"):
         pw.from_bdf(table | {"Current / A": ["1", "2"]})
 
 

@@ -109,7 +109,7 @@ def test_a_configuration_is_a_text_and_cells_are_columns(tmp_path):
     assert set(out["cell"]) == {0, 2}, "no estimate without a voltage"
     last = {cell: out["soc"][out["cell"] == cell][-1] for cell in (0, 2)}
     assert last[0] > last[2] > 0.0
-    with pytest.raises(pw.DataError, match=r"voltage_v has 1 columns, must have 3 as the configuration has"):
+    with pytest.raises(pw.DataError, match=r"voltage_v has 1 columns, must have 3 as in the configuration"):
         monitor.rows(time_s, time_s, time_s)
 
 
@@ -193,16 +193,16 @@ def test_a_label_is_enough(record):
     ("call", "text"),
     [
         (lambda m: m.rows([0.0, np.nan], [1, 1], [4, 4]), "time_s[1] = NaN, must be a finite number"),
-        (lambda m: m.rows([0.0, 1.0], [1], [4, 4]), "current_a has 1 rows, time_s has 2: must agree"),
-        (lambda m: m.rows([0.0], [1], [4], [25, 26]), "temperature_c has 2 rows, time_s has 1: must agree"),
+        (lambda m: m.rows([0.0, 1.0], [1], [4, 4]), "current_a has 1 rows, must have 2 as time_s"),
+        (lambda m: m.rows([0.0], [1], [4], [25, 26]), "temperature_c has 2 rows, must have 1 as time_s"),
         (lambda m: m.rows([[[0.0]]], [1], [4]), "time_s has 3 dimensions, must have 1 or 2"),
-        (lambda m: m.rows(["x"], [1], [4]), "time_s is an array of <U1, must be one of numbers"),
-        (lambda m: m.rows(["1.0"], [1], [4]), "time_s is an array of <U3, must be one of numbers"),
-        (lambda m: m.rows(np.array(["1.0"], dtype=object), [1], [4]), "time_s is an array of str, must be one of numbers"),
-        (lambda m: m.rows([[0.0], [1.0, 2.0]], [1], [4]), "time_s: no array of numbers: ValueError: "),
-        (lambda m: m.rows(pd.Series(pd.date_range("2024-01-01", periods=1, tz="UTC")), [1], [4]), "time_s is an array of Timestamp, must be one of numbers"),
-        (lambda m: m.rows([0.0], [1j], [4]), "current_a is an array of complex128, must be one of numbers"),
-        (lambda m: m.rows(np.array(["2024-01-01"], dtype="datetime64[ns]"), [1], [4]), "time_s is an array of datetime64[ns], must be one of numbers"),
+        (lambda m: m.rows(["x"], [1], [4]), "time_s is an array of <U1, must be an array of numbers"),
+        (lambda m: m.rows(["1.0"], [1], [4]), "time_s is an array of <U3, must be an array of numbers"),
+        (lambda m: m.rows(np.array(["1.0"], dtype=object), [1], [4]), "time_s is an array of str, must be an array of numbers"),
+        (lambda m: m.rows([[0.0], [1.0, 2.0]], [1], [4]), "time_s: not an array of numbers: ValueError: "),
+        (lambda m: m.rows(pd.Series(pd.date_range("2024-01-01", periods=1, tz="UTC")), [1], [4]), "time_s is an array of Timestamp, must be an array of numbers"),
+        (lambda m: m.rows([0.0], [1j], [4]), "current_a is an array of complex128, must be an array of numbers"),
+        (lambda m: m.rows(np.array(["2024-01-01"], dtype="datetime64[ns]"), [1], [4]), "time_s is an array of datetime64[ns], must be an array of numbers"),
         (lambda m: m.rows([0.0], [[1, 2]], [4]), "current_a has 2 columns, must have 1"),
         (lambda m: m.frames([0.0], [2**32 + 0x100], [[1, 2]]), "can_id[0] = 4294967552, must be a whole number from 0 to 4294967295"),
         (lambda m: m.frames([0.0, 1.0], [1, np.nan], [[1], [2]]), "can_id[1] = NaN, must be a whole number from 0 to 4294967295"),
@@ -212,14 +212,14 @@ def test_a_label_is_enough(record):
         (lambda m: m.frames([0.0], [1], [[1, 300]]), "data[0, 1] = 300, must be a whole number from 0 to 255"),
         (lambda m: m.frames([0.0], [1], [[1, 2]], length=[-1]), "length[0] = -1, must be a whole number from 0 to 4294967295"),
         (lambda m: m.frames([0.0], [0x800], [[1, 2]]), "can_id[0] = 0x800, must be at most 0x7FF, or"),
-        (lambda m: m.frames([0.0], [1], [[1, 2]], length=[3]), "length[0] = 3, must be at most 2 as data has columns"),
+        (lambda m: m.frames([0.0], [1], [[1, 2]], length=[3]), "length[0] = 3, must be at most 2, the number of columns of data"),
         (lambda m: m.frames([0.0], [1], [[1]], interface="can7"), 'interface "can7", must be one of vcan0'),
         (lambda m: m.gap(float("inf")), "time_s = inf, must be a finite number"),
-        (lambda m: pw.Monitor(), "no configuration: config, text, cell or chemistry must be given"),
-        (lambda m: pw.Monitor(PAPER, folder="config"), "folder must be given together with text"),
-        (lambda m: pw.Monitor(PAPER, rated_ah=2.6), "rated_ah must be given together with chemistry"),
-        (lambda m: pw.Monitor(cell=CELL, voltage_min_v=2.5), "voltage_min_v must be given together with chemistry"),
-        (lambda m: pw.Monitor(text="", chemistry="lfp-graphite", rated_ah=2.6), "text must not be given together with config, cell or chemistry"),
+        (lambda m: pw.Monitor(), "no configuration; give config, text, cell or chemistry"),
+        (lambda m: pw.Monitor(PAPER, folder="config"), "folder needs text"),
+        (lambda m: pw.Monitor(PAPER, rated_ah=2.6), "rated_ah needs chemistry"),
+        (lambda m: pw.Monitor(cell=CELL, voltage_min_v=2.5), "voltage_min_v needs chemistry"),
+        (lambda m: pw.Monitor(text="", chemistry="lfp-graphite", rated_ah=2.6), "text cannot be given with config, cell or chemistry"),
         (lambda m: pw.Monitor(PAPER, sleep_gap_s=0), "sleep_gap_s = 0, must be above 0"),
         (lambda m: pw.Monitor(PAPER, estimates_period_s=-1), "estimates_period_s = -1, must be 0 to 1e9, or None"),
     ],
@@ -300,7 +300,7 @@ def test_a_signal_handler_cannot_use_the_monitor_that_it_interrupts():
     before = signal.signal(signal.SIGALRM, lambda *_: monitor.uncarried_values)
     signal.setitimer(signal.ITIMER_REAL, 0.2)
     try:
-        with pytest.raises(pw.DataError, match="the Monitor is at work in the call that this one interrupts"):
+        with pytest.raises(pw.DataError, match="the Monitor is in use by the call that this signal handler interrupts"):
             monitor.rows(*rows)
     finally:
         signal.signal(signal.SIGALRM, before)
@@ -336,7 +336,7 @@ def test_after_a_failure_inside_the_monitor_is_not_used_again():
     # No thread has so much stack: its start panics.
     environment = os.environ | {"RUST_MIN_STACK": str(2**62)}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, env=environment)
-    text = "an earlier call failed inside packwatch: make a new Monitor"
+    text = "an earlier call failed inside packwatch; create a new Monitor"
     assert done.stdout.splitlines() == ["PanicException", text, text, text], done.stderr
 
 

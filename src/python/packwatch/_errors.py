@@ -1,4 +1,4 @@
-"""Exceptions of packwatch. Each has the text that the command line prints."""
+"""Exceptions of packwatch. Each has the text of the command line."""
 
 
 class PackwatchError(Exception):
@@ -6,10 +6,10 @@ class PackwatchError(Exception):
 
 
 class ConfigError(PackwatchError, ValueError):
-    """A configuration or a cell model with faults."""
+    """A configuration or a cell model is invalid."""
 
     faults: list[str]
-    """The faults, one line each: ``pack.toml:14: pack.cells = 0, must be 1 to 1024``."""
+    """The faults, one per line: ``pack.toml:14: pack.cells = 0, must be 1 to 1024``."""
 
     def __init__(self, text: str, faults: list[str]) -> None:
         super().__init__(text)
@@ -17,8 +17,8 @@ class ConfigError(PackwatchError, ValueError):
 
 
 class DataError(PackwatchError, ValueError):
-    """Data or arguments that cannot be used."""
+    """Data or arguments cannot be used."""
 
 
 class FileError(PackwatchError, OSError):
-    """A file that cannot be read or written."""
+    """A file cannot be read or written."""

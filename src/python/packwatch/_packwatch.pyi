@@ -1,4 +1,4 @@
-"""The compiled part: see ``packwatch``."""
+"""The compiled part of ``packwatch``."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -10,7 +10,7 @@ import numpy.typing as npt
 _Path: TypeAlias = str | PathLike[str]
 _Paths: TypeAlias = _Path | Sequence[_Path]
 _Numbers: TypeAlias = Any
-"""Anything that NumPy takes as numbers: arrays, Arrow arrays, columns of a table, lists. Masked and missing reals are NaN."""
+"""Anything that NumPy reads as numbers: arrays, Arrow arrays, columns of a table, lists. Masked and missing reals become NaN."""
 
 __all__ = [
     "BDF_COLUMNS",
@@ -36,7 +36,7 @@ BDF_COLUMNS: list[tuple[str, str, str]]
 
 @final
 class Table:
-    """Columns of equal length, by name: an Arrow table by the PyCapsule interface, without a copy."""
+    """Columns of equal length by name: an Arrow table that other libraries read without a copy (PyCapsule interface)."""
 
     @property
     def column_names(self) -> list[str]:
@@ -44,38 +44,38 @@ class Table:
     def __len__(self) -> int: ...
     def __contains__(self, name: str, /) -> bool: ...
     def __getitem__(self, name: str, /) -> npt.NDArray[Any]:
-        """A column: without a copy where no value is null; null reads as NaN."""
+        """Returns a column, without a copy if it has no nulls; null becomes NaN."""
     def to_pyarrow(self) -> Any:
-        """A ``pyarrow.Table``, without a copy."""
+        """Returns a ``pyarrow.Table`` without a copy."""
     def to_pandas(self) -> Any:
-        """A ``pandas.DataFrame``; null reads as NaN."""
+        """Returns a ``pandas.DataFrame``; null becomes NaN."""
     def __arrow_c_schema__(self) -> Any: ...
     def __arrow_c_stream__(self, requested_schema: Any | None = None) -> Any: ...
 
 @final
 class Outputs:
-    """What a monitor has put out."""
+    """The outputs of a monitor."""
 
     @property
     def estimates(self) -> Table:
-        """An estimate per cell and voltage, with the columns of ``packwatch replay --estimates``."""
+        """Estimates per cell and voltage, with the columns of ``packwatch replay --estimates``."""
     @property
     def events(self) -> Table:
-        """``time_s``, ``event`` (its name) and ``document`` (JSON, as ``packwatch replay --events`` writes it)."""
+        """Events: ``time_s``, ``event`` (its name) and ``document`` (JSON, as in ``packwatch replay --events``)."""
     @property
     def frames(self) -> Table:
-        """Frames that would be sent: ``time_s``, ``interface``, ``can_id`` (bit 31: extended), ``data``."""
+        """Frames to be sent: ``time_s``, ``interface``, ``can_id`` (bit 31: extended), ``data``."""
 
 @final
 class Monitor:
     """The monitor of a pack: rows or frames in, estimates out.
 
-    The configuration is a file (``config``), a text (``text``, whose files are in ``folder``), or the built-in one of a single cell
-    with a cell model (``cell``) or what is on a label (``chemistry``, ``rated_ah``). Of each cell, at most one estimate per
-    ``estimates_period_s`` is kept: 0 = every one, ``None`` = none; periods begin again where the clock goes back.
+    The configuration is a file (``config``), a text (``text``, whose files are in ``folder``), or a built-in one for a single cell with a
+    cell model (``cell``) or a label (``chemistry``, ``rated_ah``). At most one estimate per cell and ``estimates_period_s`` is kept; 0 keeps
+    all, ``None`` none. Periods restart if the clock goes back.
 
-    Calls from several threads take turns. After Ctrl-C, the rows or frames that were taken stay taken, and their outputs come with those
-    of the next call. After a failure inside packwatch (``PanicException``), every call raises :class:`DataError`.
+    Calls from several threads wait for each other. After Ctrl-C, rows or frames already processed stay processed, and their outputs come
+    with the next call. After a failure inside packwatch (``PanicException``), every call raises :class:`DataError`.
     """
 
     def __new__(
@@ -94,13 +94,13 @@ class Monitor:
     ) -> Monitor: ...
     @property
     def cells(self) -> int:
-        """Cells in series."""
+        """Number of cells in series."""
     @property
     def interfaces(self) -> list[str]:
         """Names of the interfaces."""
     @property
     def uncarried_values(self) -> int:
-        """Values of rows that no configured frame can carry, so far."""
+        """Number of values so far that no configured frame can carry."""
     def rows(
         self,
         time_s: _Numbers,
@@ -110,7 +110,7 @@ class Monitor:
         *,
         progress: bool = False,
     ) -> Outputs:
-        """Takes rows: positive current is discharge, NaN is unknown; a column of ``voltage_v`` per cell, of ``temperature_c`` per sensor."""
+        """Processes rows. Positive current is discharge, NaN is unknown. ``voltage_v`` has a column per cell, ``temperature_c`` per sensor."""
     def frames(
         self,
         time_s: _Numbers,
@@ -121,11 +121,11 @@ class Monitor:
         interface: str | None = None,
         progress: bool = False,
     ) -> Outputs:
-        """Takes frames of one interface: bit 31 of ``can_id`` marks an extended one; ``data`` has a row of bytes per frame."""
+        """Processes frames of one interface. Bit 31 of ``can_id`` marks an extended identifier; ``data`` has a row of bytes per frame."""
     def gap(self, time_s: float) -> Outputs:
-        """The record continues at ``time_s`` after a gap of unknown length."""
+        """Continues the record at ``time_s`` after a gap of unknown length."""
     def finish(self) -> Outputs:
-        """Ends the record: its last samples become estimates."""
+        """Ends the record; the last samples become estimates."""
 
 @final
 class Replay:
@@ -141,24 +141,24 @@ class Replay:
     def frames(self) -> Table: ...
     @property
     def summary(self) -> dict[str, Any]:
-        """The summary that ``packwatch replay --json`` prints."""
+        """The summary of ``packwatch replay --json``."""
     def json(self) -> str:
-        """The same as text."""
+        """The summary as JSON text."""
 
 @final
 class Score:
-    """Scores of files in cases."""
+    """Scores of files and cases."""
 
     @property
     def document(self) -> dict[str, Any]:
-        """The document that ``packwatch score --json`` prints."""
+        """The document of ``packwatch score --json``."""
     @property
     def scores(self) -> list[dict[str, Any]]:
-        """Its part per file and case."""
+        """The scores of the document, one per file and case."""
     def json(self) -> str:
-        """The bytes that ``packwatch score --json`` prints."""
+        """The output of ``packwatch score --json``."""
     def table(self) -> str:
-        """The bytes that ``packwatch score`` prints."""
+        """The output of ``packwatch score``."""
 
 @final
 class Fit:
@@ -166,7 +166,7 @@ class Fit:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The document that ``packwatch fit --json`` prints."""
+        """The document of ``packwatch fit --json``."""
     @property
     def capacity_ah(self) -> float: ...
     @property
@@ -175,11 +175,11 @@ class Fit:
     def notes(self) -> list[str]: ...
     @property
     def verdict(self) -> list[str]:
-        """What the model is good for."""
+        """What the model can be used for."""
     def text(self) -> str:
-        """The cell model file."""
+        """Returns the text of the cell model file."""
     def write(self, path: _Path) -> None:
-        """Writes the cell model file, completely or not at all."""
+        """Writes the cell model file atomically."""
 
 @final
 class CellModel:
@@ -190,7 +190,7 @@ class CellModel:
     def of_label(
         chemistry: str, rated_ah: float, *, voltage_min_v: float | None = None, voltage_max_v: float | None = None
     ) -> CellModel:
-        """The model of a cell of which only the label is known."""
+        """Returns the model of a cell from its label alone."""
     @property
     def name(self) -> str: ...
     @property
@@ -206,19 +206,19 @@ class CellModel:
         """SOC breakpoints, fractions."""
     @property
     def temperature_c(self) -> list[float]:
-        """Temperature breakpoints."""
+        """Temperature breakpoints, degrees C."""
     def table(self, soc: _Numbers, temperature_c: float = 25.0) -> Table:
-        """``ocv_v``, ``r0_ohm`` and of each branch ``r1_ohm``, ``tau1_s`` ... at these SOC."""
+        """Returns ``ocv_v``, ``r0_ohm`` and for each branch ``r1_ohm``, ``tau1_s`` and so on at these SOC."""
     def soc_of_ocv(self, voltage_v: float, temperature_c: float = 25.0) -> float:
-        """The SOC of an open-circuit voltage."""
+        """Returns the SOC at an open-circuit voltage, a fraction."""
     def text(self) -> str:
-        """The file's text."""
+        """Returns the text of the cell model file."""
     def write(self, path: _Path) -> None:
-        """Writes the file, completely or not at all."""
+        """Writes the cell model file atomically."""
 
 @final
 class GaussianProcess:
-    """A Gaussian process, as ``packwatch gpr`` fits it."""
+    """A Gaussian process, as fitted by ``packwatch gpr``."""
 
     @staticmethod
     def fit(
@@ -236,14 +236,14 @@ class GaussianProcess:
         threads: int | None = None,
         progress: bool = False,
     ) -> GaussianProcess:
-        """Fits a process; ``inputs`` has a row per row of ``output``."""
+        """Fits a process. ``inputs`` has as many rows as ``output``."""
     @staticmethod
     def load(path: _Path, *, threads: int | None = None) -> GaussianProcess:
-        """Loads a model of ``packwatch gpr train`` or of :meth:`save`."""
+        """Loads a model written by ``packwatch gpr train`` or :meth:`save`."""
     def save(self, path: _Path) -> None:
-        """Writes the model, completely or not at all."""
+        """Writes the model atomically."""
     def predict(self, inputs: _Numbers) -> Table:
-        """``mean``, ``std`` of a measurement, and its 95 % interval ``low_95``, ``high_95``."""
+        """Returns ``mean`` and ``std`` of a measurement, and its 95 % interval ``low_95``, ``high_95``."""
     @property
     def inputs(self) -> list[str]: ...
     @property
@@ -254,10 +254,10 @@ class GaussianProcess:
     def hyperparameters(self) -> list[tuple[str, float]]: ...
 
 def float64(name: str, values: _Numbers) -> npt.NDArray[np.float64]:
-    """Values as a contiguous array; masked ones are NaN. ``name`` is for the text of a :class:`packwatch.DataError`."""
+    """Returns a contiguous array; masked values become NaN. A :class:`packwatch.DataError` names the array ``name``."""
 
 def read(path: _Path, *, bdf_positive: Literal["charge", "discharge"] = "charge") -> Table:
-    """Reads a measured file, in our CSV or in the Battery Data Format.
+    """Reads a measured file, in packwatch's CSV or in the Battery Data Format.
 
     The table has ``time_s``, ``current_a`` (positive = discharge), ``voltage_v``, ``temperature_c``, ``discharged_ah``, ``part``, ``type``.
     """
@@ -274,7 +274,7 @@ def replay(
     estimates_period_s: float | None = 0.0,
     progress: bool = False,
 ) -> Replay:
-    """Replays logs, one after another, as ``packwatch replay`` does."""
+    """Replays logs as one record, like ``packwatch replay``."""
 
 def score(
     files: _Paths,
@@ -305,9 +305,9 @@ def score(
     plots: _Path | None = None,
     progress: bool = False,
 ) -> Score:
-    """Scores measured files against truth, as ``packwatch score`` does; what is not given is as there.
+    """Scores measured files against the truth, like ``packwatch score``; defaults are the same.
 
-    ``rated_ah``, ``voltage_min_v`` and ``voltage_max_v`` go with ``chemistry``, ``seeds`` with ``window``.
+    ``rated_ah``, ``voltage_min_v`` and ``voltage_max_v`` need ``chemistry``; ``seeds`` needs ``window``.
     """
 
 def fit(
@@ -327,10 +327,10 @@ def fit(
     first_cycles: int | None = None,
     progress: bool = False,
 ) -> Fit:
-    """Fits a cell model to measured files, as ``packwatch fit`` does.
+    """Fits a cell model to measured files, like ``packwatch fit``.
 
-    ``branches`` is 1 to 3; ``tau_s`` has a value per branch. ``tau_s`` and ``temperatures_c`` rise, ``soc_nodes`` from 0 to 1.
-    ``first_cycles`` goes without ``ocv`` and ``capacity_ah``.
+    ``branches`` is 1 to 3; ``tau_s`` has a value per branch. ``tau_s`` and ``temperatures_c`` are ascending, ``soc_nodes`` ascends from
+    0 to 1. ``first_cycles`` cannot be given with ``ocv`` or ``capacity_ah``.
     """
 
 def rul(
@@ -340,4 +340,4 @@ def rul(
     at: Sequence[float] | None = None,
     alpha: float = 0.2,
 ) -> dict[str, Any]:
-    """The document of ``packwatch rul --json``; ``at`` are parts of the life, fractions."""
+    """Returns the document of ``packwatch rul --json``; ``at`` are points of the life, fractions."""

@@ -1,4 +1,4 @@
-"""Tables of the Battery Data Format that are in memory already, as ``batterydf`` loads them."""
+"""Converts tables of the Battery Data Format in memory, as loaded by ``batterydf``."""
 
 from typing import Any, Literal
 
@@ -11,17 +11,17 @@ from ._packwatch import BDF_COLUMNS, float64
 REQUIRED = ("time_s", "current_a", "voltage_v")
 """Columns that the format requires."""
 SIGNED = ("current_a", "discharged_ah")
-"""Columns whose sign differs where positive is charge."""
+"""Columns whose sign is reversed if positive current is charge."""
 
 
 def from_bdf(table: Any, *, positive: Literal["charge", "discharge"] = "charge") -> dict[str, npt.NDArray[np.float64]]:
-    """Columns of a table of the Battery Data Format with our names and signs.
+    """Returns the columns of a Battery Data Format table with packwatch's names and signs.
 
-    ``table`` is anything that gives a column by its name: a DataFrame of pandas or polars, a table of pyarrow, a dictionary.
-    The format does not state the sign of the current; ``positive`` says which way it flows.
+    ``table`` is anything that gives a column by its name: a pandas or polars DataFrame, a pyarrow table, a dictionary. The format does not
+    state the sign of the current; ``positive`` does.
 
     Raises:
-        DataError: a required column is missing, a column is no numbers, or ``positive`` is another word.
+        DataError: a required column is missing, a column has no numbers, or ``positive`` is invalid.
     """
     if positive not in ("charge", "discharge"):
         raise DataError(f"positive {positive!r}, must be charge or discharge")
