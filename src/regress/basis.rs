@@ -1,10 +1,10 @@
-//! The mean function and its generalised least squares.
+//! The mean function and its generalised least-squares coefficients.
 //!
-//! In: `G` (below). Out: coefficients with covariance. Functions that the rows cannot separate are an error.
+//! Input: `G` (below). Output: coefficients with covariance. Functions that the rows cannot separate are an error.
 //!
-//! With W a square root of the inverse covariance, the coefficients are those of ordinary least squares of `W y` on `W H`.
-//! Every form of the process gives `G = [y H]' K^-1 [y H]`; it determines the coefficients, their covariance and the
-//! squared norm of the residual.
+//! With W a square root of the inverse covariance, the coefficients are the ordinary least-squares solution of `W y` on `W H`.
+//! Every form of the process provides `G = [y H]' K^-1 [y H]`, which determines the coefficients, their covariance and the squared norm
+//! of the residual.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +17,7 @@ use super::linear_algebra::solve_upper;
 pub enum Basis {
     /// Zero.
     Zero,
-    /// One constant.
+    /// A constant.
     Constant,
     /// A constant and a slope for every input.
     Linear,
@@ -39,7 +39,7 @@ impl Basis {
     }
 }
 
-/// Coefficients with their covariance.
+/// Coefficients and their covariance.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Coefficients {
     pub beta: Vec<f64>,
@@ -50,12 +50,12 @@ pub(super) struct Coefficients {
 }
 
 impl Coefficients {
-    /// From `G`, symmetric, row after row, of size (1 + coefficients)^2, target first.
+    /// Solves `G`: symmetric, row-major, of size (1 + coefficients)^2, target first.
     pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, RegressionError> {
         let width = size + 1;
         let fault =
             || RegressionError::range("basis", format!("{size} functions"), "functions that the rows can separate");
-        // Cholesky factor of the basis' part, scaled by its diagonal.
+        // Cholesky factor of the basis block, scaled by its diagonal.
         let scale: Vec<f64> = (1..width).map(|k| g[k * width + k].sqrt()).collect();
         if scale.iter().any(|s| !(*s > 0.0 && s.is_finite())) {
             return Err(fault());
@@ -82,8 +82,8 @@ impl Coefficients {
         Ok(Self { beta, covariance, squared_norm: squared_norm.max(0.0) })
     }
 
-    /// Solves the factor's upper half for the targets and the functions in `right`: weights of the targets without the
-    /// functions' share, and those of the functions.
+    /// Solves the factor's upper half for the targets and the functions in `right`. Returns the weights of the targets without the
+    /// contribution of the functions, and the weights of the functions.
     pub(super) fn weights(&self, factor: &[f64], n: usize, mut right: Vec<f64>) -> (Vec<f64>, Vec<f64>) {
         solve_upper(factor, n, &mut right);
         let functions = right.split_off(n);
@@ -93,12 +93,12 @@ impl Coefficients {
         (right, functions)
     }
 
-    /// Value of the mean function at a row.
+    /// Returns the mean function at a row.
     pub(super) fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
-    /// Variance by the uncertainty of the coefficients; `rest` = h(x) - H' K^-1 k(x).
+    /// Variance due to the uncertainty of the coefficients; `rest` = h(x) - H' K^-1 k(x).
     pub(super) fn variance(&self, rest: &[f64]) -> f64 {
         let size = self.beta.len();
         (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn coefficients_agree_with_least_squares() {
-        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance, last one off by 1.
+        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance; the last y is off by 1.
         let rows = [(2.0, 0.0), (5.0, 1.0), (8.0, 2.0), (12.0, 3.0)];
         let mut g = vec![0.0; 9];
         for (y, x) in rows {
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn functions_that_the_rows_cannot_separate_are_rejected() {
+    fn inseparable_functions_are_rejected() {
         let g = [3.0, 1.0, 2.0, 1.0, 1.0, 2.0, 2.0, 2.0, 4.0];
         assert!(Coefficients::solve(&g, 2).is_err());
     }

@@ -1,30 +1,29 @@
-//! Width of the interval that contains a given part of the measurements.
+//! Calibrates the width of the interval that contains a given fraction of the measurements.
 //!
-//! A Gaussian interval has its nominal coverage only if the residuals are Gaussian and as wide as the model predicts,
-//! everywhere. Measured residuals seldom are: those of a cell's voltage are twice as wide at rest as during a charge. So
-//! training rows calibrate it: each of a seeded choice is predicted without itself, which gives a ratio |residual| /
-//! standard deviation. *Spread* at a row is the mean ratio of its nearest rows, shrunk towards and relative to that of
-//! all; the factor is the quantile of ratio / spread (with the correction of split conformal prediction for few rows).
-//! Half the interval is factor x spread x standard deviation. Held-out rows are not used. Too few rows give the Gaussian
-//! interval.
+//! A Gaussian interval has its nominal coverage only if the residuals are Gaussian and have the predicted width everywhere. Measured
+//! residuals rarely do: those of a cell's voltage are twice as wide at rest as during a charge. So training rows calibrate the interval.
+//! Each row of a seeded selection is predicted from all others, which gives a ratio |residual| / standard deviation. The *spread* at a
+//! row is the mean ratio of its nearest rows, shrunk towards the mean of all and divided by it. The factor is the quantile of
+//! ratio / spread (with the correction of split conformal prediction for few rows). The half width of the interval is
+//! factor x spread x standard deviation. Held-out rows are not used. With too few rows, the interval stays Gaussian.
 
 use super::kd_tree::KdTree;
 use super::scale::StandardisedRows;
 
 /// Nominal coverage of the interval.
 pub(super) const LEVEL: f64 = 0.95;
-/// Half width of the Gaussian interval of that level, in standard deviations.
+/// Half width of the Gaussian interval of that level, standard deviations.
 pub const GAUSSIAN: f64 = 1.959_963_984_540_054;
-/// Rows that are left out, one at a time; the factor's own standard error is then below 1 %.
+/// Rows to leave out, one at a time; the standard error of the factor is then below 1 %.
 pub(super) const CALIBRATION_ROWS: usize = 8000;
-/// Weight of the mean of all rows in the spread at a row, in rows.
+/// Weight of the overall mean in the spread at a row, in rows.
 const SHRINKAGE: f64 = 20.0;
 
-/// The factor and the spread.
+/// The factor, and the data of the spread.
 #[derive(Debug, Clone)]
 pub(super) struct Calibration {
     pub factor: f64,
-    /// Rows that were left out, by number, and their ratios.
+    /// Numbers of the rows left out, and their ratios.
     pub rows: Vec<u32>,
     pub ratios: Vec<f64>,
     near: usize,
@@ -33,19 +32,19 @@ pub(super) struct Calibration {
 }
 
 impl Calibration {
-    /// Gaussian intervals.
+    /// Returns a Gaussian calibration.
     pub(super) fn none() -> Self {
         Self { factor: GAUSSIAN, rows: vec![], ratios: vec![], near: 0, mean: 1.0, tree: None }
     }
 
-    /// From rows and their ratios when predicted without themselves. Without rows: Gaussian.
+    /// Calibrates with rows and their leave-one-out ratios. Without rows, the interval is Gaussian.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
-        // Most rows of the spread at a row; otherwise a twentieth of them.
+        // Rows in the spread at a row: a twentieth of all, at most 200.
         let near = (ratios.len() / 20).min(200);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
         let tree =
-            // Fewest rows of the spread at a row; with fewer it is 1 everywhere.
+            // If fewer than 20 rows would enter the spread, it is 1 everywhere.
             (near >= 20 && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;
@@ -53,14 +52,14 @@ impl Calibration {
         let mut relative: Vec<f64> = calibration.ratios.iter().enumerate().map(relative).collect();
         relative.sort_by(f64::total_cmp);
         let rank = ((relative.len() + 1) as f64 * LEVEL).ceil() as usize;
-        // Too few rows: the Gaussian factor stays.
+        // With too few rows, the Gaussian factor stays.
         if rank > 0 && rank <= relative.len() {
             calibration.factor = relative[rank - 1];
         }
         calibration
     }
 
-    /// Width of the residuals at a standardised row, relative to the model's over all rows.
+    /// Width of the residuals at a standardised row, relative to the mean over all rows.
     fn spread(&self, row: &[f64], excluded: Option<usize>) -> f64 {
         let Some(tree) = &self.tree else { return 1.0 };
         let near = tree.nearest(row, self.near, self.ratios.len(), excluded);
@@ -68,7 +67,7 @@ impl Calibration {
         (sum + SHRINKAGE * self.mean) / (near.len() as f64 + SHRINKAGE) / self.mean
     }
 
-    /// Half of the interval at a standardised row, in standard deviations of a measurement.
+    /// Half width of the interval at a standardised row, standard deviations of a measurement.
     pub(super) fn half_width(&self, row: &[f64]) -> f64 {
         self.factor * self.spread(row, None)
     }
@@ -97,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn few_rows_give_one_factor_for_all_and_too_few_the_gaussian_one() {
+    fn few_rows_give_common_factor_and_fewer_gaussian() {
         let ratios: Vec<f64> = (1..=200).map(|k| f64::from(k) / 100.0).collect();
         let of = |n: usize| Calibration::new(&data(200), (0..n as u32).collect(), ratios[..n].to_vec());
         assert_eq!((of(200).factor, of(200).half_width(&[7.0])), (1.91, 1.91));
@@ -105,14 +104,14 @@ mod tests {
     }
 
     #[test]
-    fn intervals_are_wider_where_residuals_are() {
+    fn intervals_are_wider_where_residuals_are_wider() {
         // Ratios between 0 and 1 in the first half, between 0 and 3 in the second.
         let ratio = |k: u32| f64::from(k * 7919 % 1000) / 1000.0 * if k < 2000 { 1.0 } else { 3.0 };
         let calibration = Calibration::new(&data(4000), (0..4000).collect(), (0..4000).map(ratio).collect());
         let (narrow, wide) = (calibration.half_width(&[800.0]), calibration.half_width(&[3100.0]));
         assert!((0.90..1.1).contains(&narrow) && (2.6..2.95).contains(&wide), "{narrow}, {wide}");
         let held = |from: u32, half: f64| (from..from + 2000).filter(|k| ratio(*k) <= half).count();
-        // Shrinkage leaves the narrow half a little too wide and the wide one too narrow; together they hold 95 %.
+        // Shrinkage makes the narrow half slightly too wide and the wide half too narrow; together they contain 95 %.
         let (first, second) = (held(0, narrow), held(2000, wide));
         assert!(second >= 1760 && (3740..=3860).contains(&(first + second)), "{first}, {second}");
     }

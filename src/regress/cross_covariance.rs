@@ -1,19 +1,19 @@
-//! The kernel over pairs of rows, in blocks.
+//! Evaluates the kernel over pairs of rows, in blocks.
 //!
-//! In: rows, column after column, and a point. Out: squared differences and kernel values. Inputs are checked before.
+//! Input: rows, column-major, and a point. Output: squared differences and kernel values. Inputs are checked by the caller.
 
 use super::plan::{Covariance, Work};
 
-/// Pairs evaluated at a time: their memory fits the near cache.
+/// Pairs per block; their memory fits the nearest cache.
 pub(super) const BLOCK_PAIRS: usize = 1024;
 
-/// Row-major to column-major.
+/// Converts row-major to column-major.
 pub(super) fn by_column(inputs: &[f64], dimensions: usize) -> Vec<f64> {
     (0..dimensions).flat_map(|d| inputs.iter().skip(d).step_by(dimensions).copied()).collect()
 }
 
 impl Covariance {
-    /// Covariance of one point with the rows `first..` of `columns`, into `out`.
+    /// Writes the covariance of one point with the rows `first..` of `columns` to `out`.
     pub(super) fn cross(
         &self,
         columns: &[f64],
@@ -30,7 +30,7 @@ impl Covariance {
     }
 }
 
-/// Squared differences of the rows `from..from + count` to a point, input after input, into `out`.
+/// Writes the squared differences of the rows `from..from + count` to a point to `out`, input by input.
 pub(super) fn squares(columns: &[f64], from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
     let n = columns.len() / point.len();
     out.resize(count * point.len(), 0.0);

@@ -1,12 +1,12 @@
 //! Errors of rows, settings and saved models.
 
-/// Reason why there is no model or no prediction.
+/// Reason why a model or a prediction failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RegressionError {
-    /// A text that is not a kernel.
+    /// The text is not a kernel.
     #[error("kernel {text:?}, column {column}: found {found}, allowed: {allowed}")]
     Kernel {
-        /// The whole text.
+        /// The complete text.
         text: String,
         /// Column of the error, from 1.
         column: usize,
@@ -15,17 +15,17 @@ pub enum RegressionError {
         /// Allowed text.
         allowed: String,
     },
-    /// A number that is not finite among the rows.
+    /// A number in the rows is not finite.
     #[error("line {line}: {what} = {found}, must be a finite number")]
     NotFinite {
-        /// Line of the file, or the row from 1.
+        /// Line of the file, or number of the row from 1.
         line: u64,
         /// `input 2` or `target`.
         what: String,
         /// The value.
         found: f64,
     },
-    /// A setting or a length out of its range.
+    /// A setting or a length is out of range.
     #[error("{what} = {found}, must be {allowed}")]
     OutOfRange {
         /// Name of the quantity.
@@ -35,16 +35,16 @@ pub enum RegressionError {
         /// Allowed range.
         allowed: String,
     },
-    /// A covariance matrix without a Cholesky factor, even with the largest jitter.
+    /// A covariance matrix has no Cholesky factor, even with the largest jitter.
     #[error("covariance matrix is not positive definite, even with {jitter:e} of the signal variance on its diagonal")]
     NotPositiveDefinite {
-        /// Largest jitter tried, as part of the signal variance.
+        /// Largest jitter tried, as a fraction of the signal variance.
         jitter: f64,
     },
     /// The progress callback cancelled the fit.
     #[error("cancelled")]
     Cancelled,
-    /// An unusable saved model.
+    /// A saved model cannot be used.
     #[error("saved model: {0}")]
     Saved(String),
     /// The threads could not be started.

@@ -1,7 +1,7 @@
-//! Gaussian process over all pairs of rows: no approximation, n^3 time, n^2 memory.
+//! Exact Gaussian process over all pairs of rows: n^3 time, n^2 memory.
 //!
-//! In: standardised rows and hyperparameters. Out: likelihood, gradient, predictions. A matrix that is not positive
-//! definite with the largest jitter is an error.
+//! Input: standardised rows and hyperparameters. Output: likelihood, gradient, predictions. A matrix that is not positive definite even
+//! with the largest jitter is an error.
 //!
 //! With `K = k(X, X) + noise` and `a = K^-1 (y - H beta)`:
 //!
@@ -22,7 +22,7 @@ use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, so
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Queries of one block of a prediction.
+/// Queries per block of a prediction.
 const BLOCK_QUERIES: usize = 256;
 
 /// State for predictions.
@@ -31,18 +31,18 @@ pub(super) struct Posterior {
     pub data: StandardisedRows,
     pub covariance: Covariance,
     pub coefficients: Coefficients,
-    /// Inputs, column after column.
+    /// Inputs, column-major.
     columns: Vec<f64>,
-    /// Cholesky factor, lower, column after column.
+    /// Lower Cholesky factor, column-major.
     factor: Vec<f64>,
     /// `K^-1 (y - H beta)`.
     alpha: Vec<f64>,
-    /// `K^-1 H`, column after column.
+    /// `K^-1 H`, column-major.
     basis_solved: Vec<f64>,
-    /// Minus the log likelihood.
+    /// Negative log likelihood.
     pub value: f64,
     pub jitter: Jitter,
-    /// Jitter on the diagonal, as part of the prior variance.
+    /// Jitter on the diagonal, as a fraction of the prior variance.
     used_jitter: f64,
 }
 
@@ -72,7 +72,7 @@ impl Posterior {
         Ok(Self { data, covariance, coefficients, columns, factor, alpha, basis_solved, value, jitter, used_jitter })
     }
 
-    /// Derivative of minus the log likelihood by every parameter.
+    /// Derivatives of the negative log likelihood by every parameter.
     pub(super) fn gradient(&self) -> Vec<f64> {
         let n = self.data.len();
         let par = parallelism();
@@ -134,7 +134,7 @@ impl Posterior {
         all
     }
 
-    /// Mean at a row, and the part of its basis that the rows do not explain.
+    /// Mean at a row, and the part of its basis that the training rows do not explain.
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
         let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n], cross);
@@ -142,7 +142,7 @@ impl Posterior {
         (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha, cross), rest)
     }
 
-    /// For some rows: residual and variance of the measurement, predicted from all other rows (with the present coefficients).
+    /// Leave-one-out residual and measurement variance of some rows, with the present coefficients.
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());
@@ -159,11 +159,11 @@ impl Posterior {
     }
 }
 
-/// The covariance of all measurements, lower triangle.
+/// Fills the lower triangle with the covariance of all measurements.
 fn fill(covariance: &Covariance, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
     let diagonal = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
-    // Columns one thread takes at a time.
+    // At most 8 columns per task.
     matrix.par_chunks_mut(n).enumerate().with_max_len(8).for_each_init(Default::default, |scratch, (j, column)| {
         column[j] = diagonal;
         covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);

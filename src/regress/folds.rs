@@ -1,7 +1,7 @@
 //! k-fold cross-validation: every row is predicted by a model fitted without it.
 //!
-//! In: rows, settings, number of folds. Out: predictions of all rows, and their errors in units of the target. A number
-//! of folds out of range is an error, as are the errors of a fit.
+//! Input: rows, settings, number of folds. Output: predictions of all rows, and their errors in units of the target. Fails if the number
+//! of folds is out of range, or if a fit fails.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -14,18 +14,18 @@ use super::model::{Hyperparameter, Prediction, fit};
 use super::scale::check;
 use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 
-/// Outcome of one fold.
+/// Result of one fold.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fold {
-    /// Rows it held out.
+    /// Number of held-out rows.
     pub held_out: usize,
-    /// Time of the fit, s, by the caller's clock.
+    /// Time of the fit by the caller's clock, s.
     pub fit_s: f64,
     /// Time of the predictions, s.
     pub predict_s: f64,
     /// Fitted hyperparameters.
     pub hyperparameters: Vec<Hyperparameter>,
-    /// Log marginal likelihood of its training rows.
+    /// Log marginal likelihood of the training rows.
     pub log_marginal_likelihood: f64,
     /// Half width of the 95 % interval in standard deviations.
     pub interval_factor: f64,
@@ -33,10 +33,10 @@ pub struct Fold {
     pub jitter: Jitter,
 }
 
-/// Outcome of a cross-validation.
+/// Result of a cross-validation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folds {
-    /// Prediction of every row, in the order of the rows, by the model of the fold that held it out.
+    /// Prediction of every row in order, by the model of the fold that held it out.
     pub predictions: Vec<Prediction>,
     /// Fold that held out each row, from 0.
     pub fold_of_row: Vec<usize>,
@@ -51,15 +51,15 @@ pub struct PredictionScore {
     pub rmse: f64,
     /// Mean absolute error.
     pub mean_absolute_error: f64,
-    /// Part of the rows inside the 95 % interval.
+    /// Fraction of the rows inside the 95 % interval.
     pub coverage_95: f64,
-    /// Part of the rows within 1.96 standard deviations of a measurement: what a Gaussian interval would hold.
+    /// Fraction of the rows within 1.96 standard deviations of a measurement: the coverage of a Gaussian interval.
     pub gaussian_coverage_95: f64,
     /// Mean width of the 95 % interval.
     pub mean_width_95: f64,
 }
 
-/// Errors of predictions of known targets, of the same length.
+/// Scores predictions against targets of the same length.
 pub fn score(predictions: &[Prediction], targets: &[f64]) -> PredictionScore {
     let count = predictions.len() as f64;
     let mean = |of: &dyn Fn(&Prediction, f64) -> f64| {
@@ -77,7 +77,7 @@ pub fn score(predictions: &[Prediction], targets: &[f64]) -> PredictionScore {
     }
 }
 
-/// Fold that holds out each row: a seeded shuffle in parts of equal size, to within a row.
+/// Assigns each row to the fold that holds it out: a seeded shuffle into folds whose sizes differ by at most one row.
 pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..rows).collect();
     order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
@@ -86,7 +86,7 @@ pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     fold_of_row
 }
 
-/// Cross-validates; `clock` gives seconds from any origin, for the times of the folds.
+/// Cross-validates. `clock` returns seconds from any origin, for the times of the folds.
 pub fn cross_validate(
     rows: &TrainingRows,
     settings: &GprSettings,

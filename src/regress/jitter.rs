@@ -1,22 +1,22 @@
-//! Jitter: an addition to the diagonal of a covariance matrix that has no Cholesky factor.
+//! Jitter: an addition to the diagonal of a covariance matrix without a Cholesky factor.
 //!
-//! In: a factorisation to try. Out: the smallest sufficient jitter, as part of the signal variance, or an error.
+//! Input: a factorisation to try. Output: the smallest sufficient jitter as a fraction of the signal variance, or an error.
 
 use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-/// Jitter of successive tries, as part of the signal variance.
+/// Jitter of successive tries, as a fraction of the signal variance.
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];
 pub(super) const LAST: f64 = 1e-4;
 
-/// Jitter of matrices that were not positive definite.
+/// Summary of the jitter of matrices that were not positive definite.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Matrices with jitter in the final model's likelihood. Jitter in predictions is not counted.
+    /// Number of matrices with jitter in the final model's likelihood. Jitter in predictions is not counted.
     pub matrices: usize,
-    /// Largest jitter, as part of the signal variance.
+    /// Largest jitter, as a fraction of the signal variance.
     pub largest: f64,
 }
 
@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn jitter_grows_to_its_last_value() {
+    fn jitter_grows_until_last_try() {
         let mut tries = Vec::new();
         let fault = until_positive(|added| {
             tries.push(added);

@@ -1,9 +1,9 @@
-//! Nearest rows to a point by a k-d tree, optionally among the rows before a given one.
+//! A k-d tree: finds the nearest rows to a point, optionally among the rows before a given one.
 //!
-//! In: rows, weights of the inputs, a point. Out: row numbers, nearest first. Inputs are finite (checked before).
+//! Input: rows, weights of the inputs, a point. Output: row numbers, nearest first. Inputs are finite (checked by the caller).
 //!
-//! Distances are Euclidean in weighted inputs. Of two rows at equal distance the one with the lower number is taken, so
-//! that the result does not depend on the layout of the tree.
+//! Distances are Euclidean in weighted inputs. At equal distance, the lower row number is taken, so that the result does not depend on
+//! the layout of the tree.
 
 use std::collections::BinaryHeap;
 
@@ -11,9 +11,9 @@ use std::collections::BinaryHeap;
 #[derive(Debug, Clone)]
 pub(super) struct KdTree {
     weights: Vec<f64>,
-    /// Weighted inputs, rows in the order of the leaves.
+    /// Weighted inputs; rows in leaf order.
     points: Vec<f64>,
-    /// Number of each of those rows.
+    /// Row numbers in leaf order.
     numbers: Vec<u32>,
     nodes: Vec<TreeNode>,
 }
@@ -22,15 +22,15 @@ pub(super) struct KdTree {
 struct TreeNode {
     first: usize,
     end: usize,
-    /// Lowest number of a row below this node.
+    /// Lowest row number below this node.
     minimum: u32,
-    /// Axis, position of the cut, right child (the left one follows the node); `None` = a leaf.
+    /// Axis, position of the cut, and right child (the left child follows the node); `None` = a leaf.
     cut: Option<(usize, f64, usize)>,
 }
 
-/// Heap of the nearest rows so far, the farthest on top.
+/// Heap of the nearest rows so far; the farthest is on top.
 struct NearestHeap {
-    /// Bits of the squared distance, which order as the distances do (none is negative), and the row.
+    /// Bits of the squared distance, and the row. For non-negative distances, the bits have the same order.
     heap: BinaryHeap<(u64, u32)>,
     wanted: usize,
 }
@@ -50,7 +50,7 @@ impl NearestHeap {
 }
 
 impl KdTree {
-    /// A tree over rows of `weights.len()` inputs.
+    /// Builds a tree over rows of `weights.len()` inputs.
     pub(super) fn new(inputs: &[f64], weights: &[f64]) -> Self {
         let d = weights.len();
         let weighted: Vec<f64> = inputs.iter().enumerate().map(|(at, x)| x * weights[at % d]).collect();
@@ -75,7 +75,7 @@ impl KdTree {
             ends.1 - ends.0
         };
         let axis = (0..d).max_by(|a, b| spread(*a).total_cmp(&spread(*b))).unwrap_or(0);
-        // Largest number of rows of a leaf.
+        // At most 16 rows per leaf.
         if rows.len() <= 16 || spread(axis) <= 0.0 {
             return;
         }
@@ -89,7 +89,7 @@ impl KdTree {
         self.nodes[here].cut = Some((axis, place, right_child));
     }
 
-    /// The `wanted` nearest rows with numbers below `before` and other than `excluded`, nearest first.
+    /// Returns the `wanted` nearest rows with numbers below `before` and other than `excluded`, nearest first.
     pub(super) fn nearest(&self, point: &[f64], wanted: usize, before: usize, excluded: Option<usize>) -> Vec<u32> {
         let point: Vec<f64> = point.iter().zip(&self.weights).map(|(x, w)| x * w).collect();
         let before = u32::try_from(before).unwrap_or(u32::MAX);
@@ -134,11 +134,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_tree_agrees_with_an_exhaustive_search() {
+    fn tree_agrees_with_exhaustive_search() {
         let mut state = 1_u64;
         let mut draw = || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-            // Coarse, so that there are equal distances and equal rows.
+            // Coarse values, to get equal distances and equal rows.
             f64::from((state >> 40) as u32 % 25)
         };
         let inputs: Vec<f64> = (0..3 * 700).map(|_| draw()).collect();
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_rows_do_not_recurse_without_end() {
+    fn equal_rows_end_recursion() {
         let tree = KdTree::new(&[1.0; 5000], &[1.0]);
         assert_eq!(tree.nearest(&[1.0], 3, 5000, Some(1)), [0, 2, 3]);
     }

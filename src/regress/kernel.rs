@@ -1,6 +1,6 @@
-//! Covariance functions as text and as a tree: five shapes, their sums and products.
+//! Covariance functions as text and as a tree: five shapes, and their sums and products.
 //!
-//! In: text. Out: a [`Kernel`], or an error with the column; a kernel is written back as text.
+//! Input: text. Output: a [`Kernel`], or an error with the column. A kernel can be formatted as text again.
 //!
 //! With r the distance in units of the length scale(s):
 //!
@@ -12,9 +12,8 @@
 //! | `squared_exponential` | exp(-r^2 / 2) |
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
-//! Operators have their usual precedence in `a + b * (c + d)`; in names a dash stands for an underscore. Every shape has
-//! its own length scales, and its own standard deviation where it can be identified (in a product, only the first factor
-//! has one).
+//! Operators have their usual precedence, as in `a + b * (c + d)`. In names, a dash stands for an underscore. Every shape has its own
+//! length scales and, where it can be identified, its own standard deviation (in a product, only the first factor has one).
 
 use std::fmt;
 use std::str::FromStr;
@@ -23,15 +22,15 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-/// Deepest nesting of brackets: text is read by recursion.
+/// Deepest nesting of brackets; the parser is recursive.
 const MAX_DEPTH: usize = 16;
-/// Most shapes in one kernel: each has parameters of its own.
+/// Most shapes in one kernel; each has its own parameters.
 const MAX_SHAPES: usize = 16;
 
 /// One covariance function of the distance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// Rough: the Ornstein-Uhlenbeck process.
+    /// Rough: an Ornstein-Uhlenbeck process.
     Exponential,
     /// Once differentiable.
     Matern32,
@@ -44,7 +43,7 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// All of them.
+    /// All shapes.
     pub const ALL: [Self; 5] =
         [Self::Exponential, Self::SquaredExponential, Self::Matern32, Self::Matern52, Self::RationalQuadratic];
 
@@ -60,7 +59,7 @@ impl Shape {
     }
 }
 
-/// A covariance function: shapes, sums and products. Read from text with `parse`, written with `to_string`.
+/// A covariance function: shapes, sums and products. Parse it with `parse`, format it with `to_string`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Kernel {
@@ -167,7 +166,7 @@ impl KernelParser<'_> {
         }
         let start = self.rest.trim_start();
         let word = start.split(|c: char| !c.is_ascii_alphanumeric() && c != '_' && c != '-').next().unwrap_or("");
-        // Kernels have no minus sign: a dash also joins words.
+        // Kernels have no minus sign, so a dash can join words.
         let name = word.replace('-', "_");
         let Some(shape) = Shape::ALL.into_iter().find(|shape| shape.name() == name) else {
             let names: Vec<&str> = Shape::ALL.iter().map(|shape| shape.name()).collect();
@@ -194,7 +193,7 @@ impl KernelParser<'_> {
     }
 }
 
-/// Merges sums inside a sum, and products inside a product.
+/// Flattens sums in a sum, and products in a product.
 fn flat(nodes: Vec<Node>, is_sum: bool) -> Vec<Node> {
     let mut all = Vec::new();
     for node in nodes {
@@ -212,7 +211,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_survives_reading_and_writing() {
+    fn kernel_text_round_trips() {
         for (text, written) in [
             ("exponential", "exponential"),
             (
@@ -230,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn text_that_is_no_kernel_is_rejected_with_its_column() {
+    fn invalid_kernel_text_is_rejected_with_column() {
         for (text, column, found) in [
             ("", 1, "the end"),
             ("gaussian", 1, "gaussian"),

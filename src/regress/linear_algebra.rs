@@ -1,13 +1,13 @@
-//! Dense linear algebra on slices, column after column, with the threads of the present pool.
+//! Dense linear algebra on column-major slices, with the threads of the current pool.
 //!
-//! In and out: plain numbers. A matrix that is not positive definite is reported by [`cholesky`]; NaN stays NaN.
+//! Input and output: plain numbers. [`cholesky`] reports a matrix that is not positive definite; NaN stays NaN.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{MatMut, MatRef, Par};
 
-/// Parallelism of the present thread pool, for faer.
+/// Parallelism of the current thread pool, for faer.
 pub(super) fn parallelism() -> Par {
     match rayon::current_num_threads() {
         0 | 1 => Par::Seq,
@@ -15,7 +15,7 @@ pub(super) fn parallelism() -> Par {
     }
 }
 
-/// Factorises in place; `false` = not positive definite.
+/// Factorises in place; returns `false` if the matrix is not positive definite.
 pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     let par = parallelism();
     let mut memory = MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default()));

@@ -1,9 +1,9 @@
-//! Quasi-Newton minimisation (BFGS) of a smooth function of few variables inside a box.
+//! Quasi-Newton minimisation (BFGS) of a smooth function of a few variables within bounds.
 //!
-//! In: a start, bounds, a function with its gradient. Out: the lowest point found.
+//! Input: a start, bounds, a function with its gradient. Output: the lowest point found.
 //!
-//! A variable at a bound whose gradient points outward stays there for the step. The step is shortened until the function
-//! falls enough (Armijo), and is projected onto the box. A point without a value counts as infinitely high.
+//! A variable at a bound whose gradient points outward stays fixed for the step. The step is shortened until the function decreases
+//! enough (Armijo), and is projected onto the bounds. A point without a value counts as infinite.
 
 /// Value and gradient of the objective; `None` = no value at this point.
 pub(super) type Evaluation = Option<(f64, Vec<f64>)>;
@@ -23,11 +23,11 @@ pub(super) struct SearchLimits<'a> {
     pub low: &'a [f64],
     pub high: &'a [f64],
     pub max_iterations: usize,
-    /// The search ends after two successive steps that lower the value by less than this.
+    /// Stop after two successive steps that lower the value by less than this.
     pub tolerance: f64,
 }
 
-/// Minimises from `start`; the objective's own errors end the search. `Ok(None)` = no value at the start.
+/// Minimises from `start`. Errors of the objective end the search. `Ok(None)` = no value at the start.
 pub(super) fn minimise<E>(
     start: &[f64],
     limits: &SearchLimits,
@@ -75,20 +75,20 @@ fn line_search<E>(
     if longest == 0.0 {
         return Ok(None);
     }
-    // Longest first step of a search, and of any step, in one variable. Variables are logarithms: a factor of 7.
+    // Limits of the first step and of any step in one variable. Variables are logarithms, so 2 is a factor of 7.
     let mut step = (2.0 / longest).min(1.0);
-    // Most reductions of one step.
+    // At most 12 reductions of a step.
     for _ in 0..12 {
         let x: Vec<f64> =
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();
         let slope: f64 = (0..x.len()).map(|k| at.gradient[k] * (x[k] - at.x[k])).sum();
         let found = objective(&x)?;
         if let Some((value, gradient)) = found.filter(is_finite) {
-            // Smallest decrease of a step, as part of its linear prediction.
+            // Smallest decrease of a step, as a fraction of its linear prediction.
             if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // The minimum of the parabola through both points, within limits.
+            // Minimum of the parabola through both points, within limits.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {
@@ -98,7 +98,7 @@ fn line_search<E>(
     Ok(None)
 }
 
-/// Approximation of the inverse of the second derivatives.
+/// Approximate inverse Hessian.
 struct InverseHessian {
     matrix: Vec<f64>,
     size: usize,
@@ -165,19 +165,19 @@ mod tests {
     }
 
     #[test]
-    fn the_search_follows_the_valley_to_its_minimum() {
+    fn search_follows_valley_to_minimum() {
         let found = minimum(&[-1.2, 1.0], &[-5.0, -5.0], &[5.0, 5.0]);
         assert!((found.x[0] - 1.0).abs() < 1e-5 && (found.x[1] - 1.0).abs() < 1e-5, "{found:?}");
     }
 
     #[test]
-    fn the_search_stays_in_the_box() {
+    fn search_stays_within_bounds() {
         let found = minimum(&[-1.2, 1.0], &[-5.0, -5.0], &[0.5, 5.0]);
         assert!(found.x[0] == 0.5 && (found.x[1] - 0.25).abs() < 1e-6, "{found:?}");
     }
 
     #[test]
-    fn a_point_without_a_value_shortens_the_step() {
+    fn missing_value_shortens_step() {
         let limits = SearchLimits { low: &[-5.0], high: &[50.0], max_iterations: 100, tolerance: 1e-14 };
         let objective = |x: &[f64]| -> Result<Evaluation, ()> {
             Ok((x[0] < 3.0).then(|| ((x[0] - 2.9).powi(2), vec![2.0 * (x[0] - 2.9)])))

@@ -1,7 +1,6 @@
 //! A fitted process: fit, predictions, hyperparameters.
 //!
-//! In: checked rows and settings. Out: a [`Model`] with predictions in units of the target. Rows and settings out of range
-//! are errors.
+//! Input: checked rows and settings. Output: a [`Model`] that predicts in units of the target. Rows and settings out of range are errors.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -23,18 +22,17 @@ use super::search::{SearchMonitor, descend, first_start, log_bounds, random_star
 use super::settings::{FitProgress, Form, GprSettings, ProgressCallback, TrainingRows};
 use super::{exact, nearest};
 
-/// Rows whose factors the search of [`Form::Nearest`] sums over; the effect of this choice on the hyperparameters is far
-/// too small to show in a prediction.
+/// Rows over which the search of [`Form::Nearest`] sums. Using more does not change predictions noticeably.
 const SEARCH_ROWS: usize = 6000;
 /// Most threads.
 const MAX_THREADS: usize = 1024;
-/// Searches besides the first.
+/// Most additional searches.
 const MAX_RESTARTS: usize = 1000;
 
-/// One hyperparameter: length scales in (standardised) inputs, standard deviations in units of the target.
+/// One hyperparameter. Length scales are in (standardised) inputs, standard deviations in units of the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hyperparameter {
-    /// Name, such as `matern32_1.length_scale_2`: the first shape of the kernel, second input.
+    /// Name, for example `matern32_1.length_scale_2`: first shape of the kernel, second input.
     pub name: String,
     /// Its value.
     pub value: f64,
@@ -43,14 +41,14 @@ pub struct Hyperparameter {
 /// Prediction at one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prediction {
-    /// Mean of function and measurement.
+    /// Mean of the function and of a measurement.
     pub mean: f64,
-    /// Variance of the function's value, which more rows would lower.
+    /// Variance of the function's value; more rows reduce it.
     pub function_variance: f64,
-    /// Variance of a new measurement: the function's and the noise.
+    /// Variance of a new measurement: function plus noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval for 95 % of new measurements, see [`Model::interval_factor`]: not 1.96 standard
-    /// deviations when residuals are not Gaussian or not as wide everywhere.
+    /// Lower end of the interval for 95 % of new measurements, see [`Model::interval_factor`]. It differs from 1.96 standard deviations if
+    /// residuals are not Gaussian or their width varies.
     pub low_95: f64,
     /// Its upper end.
     pub high_95: f64,
@@ -59,27 +57,27 @@ pub struct Prediction {
 /// A fitted process.
 #[derive(Debug)]
 pub struct Model {
-    /// What it is.
+    /// Structure of the model.
     pub spec: ModelSpec,
     pub(super) scale: Scale,
-    /// Logarithms, in standardised units.
+    /// Logarithms of the hyperparameters, in standardised units.
     pub(super) theta: Vec<f64>,
     pub(super) posterior: Posterior,
-    /// How its fit ended.
+    /// Result of the fit.
     pub outcome: FitOutcome,
     pub(super) calibration: Calibration,
     pub(super) pool: ThreadPool,
 }
 
-/// Structure of a model, without its numbers.
+/// Structure of a model without its numbers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpec {
-    /// Its kernel.
+    /// Covariance function.
     pub kernel: Kernel,
-    /// Its mean function.
+    /// Mean function.
     pub basis: Basis,
-    /// Whether every input has a length scale of its own.
+    /// Whether every input has its own length scale.
     pub ard: bool,
     /// Exact, or by nearest neighbours.
     pub form: Form,
@@ -87,15 +85,15 @@ pub struct ModelSpec {
     pub dimensions: usize,
 }
 
-/// Outcome of the fit.
+/// Result of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FitOutcome {
-    /// Log likelihood, in standardised targets.
+    /// Log likelihood of the standardised targets.
     pub log_likelihood: f64,
     /// Jitter on diagonals.
     pub jitter: Jitter,
-    /// Steps of the best search, over all its choices of neighbours.
+    /// Steps of the best search, over all its neighbour selections.
     pub iterations: usize,
 }
 
@@ -120,7 +118,7 @@ impl Posterior {
         }
     }
 
-    /// Residual and variance of the measurement of some rows, each predicted from the others.
+    /// Leave-one-out residual and measurement variance of some rows.
     fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.left_out(rows)),
@@ -135,7 +133,7 @@ impl Posterior {
     }
 }
 
-/// Fits a process to rows. Calls `watcher` after every step; it can end the fit.
+/// Fits a process to rows. Calls `watcher` after every step; `watcher` can cancel the fit.
 pub fn fit(
     rows: &TrainingRows,
     settings: &GprSettings,
@@ -147,14 +145,14 @@ pub fn fit(
     job.finish(theta, iterations)
 }
 
-/// A fit: settings, standardised rows and plan.
+/// A fit in progress: settings, standardised rows and plan.
 struct FitJob<'a> {
     settings: &'a GprSettings,
     scale: Scale,
     data: StandardisedRows,
     plan: Plan,
     pool: ThreadPool,
-    /// Typical standard deviation of an (otherwise) standardised input.
+    /// Typical standard deviation of an input; 1 if standardised.
     spread: f64,
 }
 
@@ -165,7 +163,7 @@ impl<'a> FitJob<'a> {
         let scale = Scale::of(rows, settings.standardise, settings.basis);
         let natural = Scale::of(rows, true, settings.basis);
         if let Some(what) = natural.too_wide() {
-            return Err(RegressionError::range(&what, "values whose mean or variance overflows", "of a smaller size"));
+            return Err(RegressionError::range(&what, "values whose mean or variance overflows", "smaller"));
         }
         let logs: f64 = natural.deviations.iter().zip(&scale.deviations).map(|(d, unit)| (d / unit).ln()).sum();
         let d = rows.dimensions;
@@ -197,7 +195,7 @@ impl<'a> FitJob<'a> {
         Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / p.role.unit(&self.scale)).ln()).collect())
     }
 
-    /// Result of the best search, and its steps.
+    /// Returns the result of the best search, and its steps.
     fn search(&self, watcher: &mut ProgressCallback) -> Result<(Vec<f64>, usize), RegressionError> {
         let searches = self.settings.restarts + 1;
         let mut best: Option<Minimum> = None;
@@ -227,11 +225,11 @@ impl<'a> FitJob<'a> {
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
-    /// One search; chooses neighbours again until the metric is stable.
+    /// Runs one search; selects neighbours again until the metric is stable.
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
-        // Most choices of neighbours while the length scales move.
+        // At most 4 neighbour selections while the length scales change.
         for _ in 0..4 {
             let metric = self.metric(&start);
             let Some(mut minimum) = self.one_round(&start, &metric, (&low, &high), monitor)? else { break };
@@ -313,13 +311,13 @@ impl<'a> FitJob<'a> {
     }
 }
 
-/// At most `most` row numbers, evenly from `0..n` (rows of [`Form::Nearest`] are in random order).
+/// Returns at most `most` row numbers, evenly from `0..n` (rows of [`Form::Nearest`] are in random order).
 fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
     let count = n.min(most);
     (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()
 }
 
-/// Whether two metrics are nearly proportional, and so rank rows alike.
+/// Whether two metrics are nearly proportional, so that they rank rows alike.
 fn is_same_metric(a: &[f64], b: &[f64]) -> bool {
     let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
     let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
@@ -344,7 +342,7 @@ fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionE
 }
 
 impl Model {
-    /// Predicts rows of inputs, row after row.
+    /// Predicts rows of inputs in row-major order.
     pub fn predict(&self, inputs: &[f64]) -> Result<Vec<Prediction>, RegressionError> {
         let d = self.spec.dimensions;
         if !inputs.len().is_multiple_of(d) {
@@ -390,21 +388,21 @@ impl Model {
         }
     }
 
-    /// Fitted hyperparameters; the noise is the last. The same order serves as a start ([`GprSettings::start`]).
+    /// Fitted hyperparameters; the noise is last. [`GprSettings::start`] uses the same order.
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
         let named = plan.parameters.into_iter().zip(&self.theta);
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * p.role.unit(&self.scale) }).collect()
     }
 
-    /// Natural logarithm of the density of the training targets, in their units (of the nearest form: of its own density).
+    /// Natural logarithm of the density of the training targets in their units. For [`Form::Nearest`], its approximate density.
     pub fn log_marginal_likelihood(&self) -> f64 {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals have their
-    /// mean width: 1.96 for Gaussian residuals. With [`GprSettings::calibrate`] it comes from training rows predicted
-    /// without themselves, and the interval is wider or narrower by such rows nearby.
+    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals have their mean width; 1.96 for Gaussian
+    /// residuals. With [`GprSettings::calibrate`] it comes from leave-one-out predictions of training rows, and nearby rows widen or narrow
+    /// the interval.
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }

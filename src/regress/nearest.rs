@@ -1,22 +1,22 @@
-//! Gaussian process by nearest neighbours (Vecchia's approximation; Vecchia 1988, Datta et al. 2016).
+//! Gaussian process with nearest neighbours (Vecchia's approximation; Vecchia 1988, Datta et al. 2016).
 //!
-//! In a seeded random order, the density of all rows is the product of the densities of each row given its predecessors.
-//! This approximation uses the nearest `m` predecessors. That is a proper density, exact for `m` = all; each factor needs
-//! one Cholesky factor of size `m`, for any number of rows. The conditioning is on measurements, including their noise.
+//! In a seeded random order, the density of all rows is the product of the densities of each row given its predecessors. The
+//! approximation uses only the nearest `m` predecessors. It is a proper density and exact for `m` = all. Each term needs a Cholesky
+//! factor of size `m`, regardless of the number of rows. Terms condition on measurements, including their noise.
 //!
-//! One factor, with K the covariance of neighbours and row (last), `q = K^-1 e_last`, `A = K^-1 [y H]` and
+//! For one term, with K the covariance of the neighbours and the row (last), `q = K^-1 e_last`, `A = K^-1 [y H]` and
 //! `a = A (1, -beta)'`: the conditional variance is `1/q_n`, the residual `a_n/q_n`, so
 //!
 //! `-log p = -1/2 ln q_n + 1/2 a_n^2 / q_n + 1/2 ln 2 pi`,
 //! `-d log p = c q' dK q - (a_n/q_n) q' dK a`, with `c = 1/2 (1 + a_n^2/q_n) / q_n`;
 //!
-//! the coefficients beta are those of generalised least squares, where the derivative by them is 0.
+//! beta are the generalised least-squares coefficients, where the derivative by them is 0.
 //!
-//! The search for hyperparameters may use a seeded choice of the factors (each with neighbours among all rows), which is
-//! an unbiased estimate of the sum. The neighbours are chosen again when the length scales have moved.
+//! The search for hyperparameters may use a seeded subset of the terms (each with neighbours among all rows), which gives an unbiased
+//! estimate of the sum. It selects neighbours again when the length scales have changed.
 //!
-//! In: standardised rows and hyperparameters. Out: likelihood, gradient, predictions. A matrix that is not positive
-//! definite with the largest jitter is an error.
+//! Input: standardised rows and hyperparameters. Output: likelihood, gradient, predictions. A matrix that is not positive definite even
+//! with the largest jitter is an error.
 
 use std::f64::consts::TAU;
 
@@ -30,42 +30,42 @@ use super::linear_algebra::add;
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Rows per task; sums are the same for any number of threads.
+/// Rows per task; fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 64;
 
-/// Factors: rows and their neighbours.
+/// The terms: rows and their neighbours.
 #[derive(Debug, Clone)]
 pub(super) struct ConditionalFactors {
     pub rows: Vec<u32>,
     neighbours: Vec<Vec<u32>>,
 }
 
-/// Sums over factors.
+/// Sums over the terms.
 pub(super) struct LikelihoodSums {
-    /// Minus the log density.
+    /// Negative log density.
     pub value: f64,
     pub gradient: Vec<f64>,
     pub coefficients: Coefficients,
     pub jitter: Jitter,
 }
 
-/// A batch of factors, with their contribution to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
+/// A batch of terms with their contribution to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
 struct FactorBatch {
     factors: Vec<ConditionalFactor>,
     g: Vec<f64>,
     log: f64,
 }
 
-/// Result of the first pass for the second.
+/// Result of the first pass, used by the second.
 struct ConditionalFactor {
     q: Vec<f64>,
-    /// `K^-1` on targets and basis, column after column.
+    /// `K^-1` applied to targets and basis, column-major.
     a: Vec<f64>,
     jitter: f64,
 }
 
 impl ConditionalFactors {
-    /// Neighbours of the given rows among the rows before each.
+    /// Finds the neighbours of the given rows among the rows before each.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
         let tree = KdTree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
@@ -73,7 +73,7 @@ impl ConditionalFactors {
         Self { rows, neighbours }
     }
 
-    /// Minus the log density of the rows given their neighbours, its gradient (if requested) and the coefficients.
+    /// Returns the negative log density of the rows given their neighbours, its gradient (if requested) and the coefficients.
     pub(super) fn sums(
         &self,
         data: &StandardisedRows,
@@ -132,11 +132,11 @@ impl ConditionalFactors {
     }
 }
 
-/// Memory of one thread.
+/// Working memory of one thread.
 struct Scratch<'a> {
     data: &'a StandardisedRows,
     covariance: &'a Covariance,
-    /// Squared differences of all pairs (lower triangle, column after column), and one pair of equal rows at the end.
+    /// Squared differences of all pairs (lower triangle, column-major), and one pair of equal rows at the end.
     squares: Vec<f64>,
     matrix: Vec<f64>,
     weights: Vec<f64>,
@@ -224,8 +224,8 @@ impl<'a> Scratch<'a> {
     }
 }
 
-/// Cholesky factor (lower, column after column) of the kernel's lower triangle with prior and noise on the diagonal;
-/// returns the jitter, as part of the prior variance.
+/// Factorises the kernel's lower triangle with prior and noise on the diagonal (lower Cholesky factor, column-major). Returns the
+/// jitter as a fraction of the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
@@ -239,13 +239,13 @@ fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covar
     })
 }
 
-/// In place, lower, column after column; `false` = not positive definite.
+/// Factorises in place, lower, column-major; returns `false` if not positive definite.
 #[inline(always)]
 fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     for j in 0..n {
         let (before, rest) = matrix.split_at_mut(j * n);
         let column = &mut rest[j..n];
-        // Four columns at a time: the loads and stores of this column dominate the cost.
+        // Four columns at a time, because loads and stores of this column dominate the cost.
         let mut k = 0;
         while k + 4 <= j {
             let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];
@@ -316,7 +316,7 @@ impl Posterior {
         Self { data, covariance, coefficients, neighbours, tree }
     }
 
-    /// Mean and variance of the function at standardised rows; row `excluded[k]` is left out of query `k`.
+    /// Mean and variance of the function at standardised rows; query `k` leaves out row `excluded[k]`.
     pub(super) fn predict(
         &self,
         queries: &[f64],

@@ -1,9 +1,9 @@
-//! A kernel prepared for evaluation: its parameters in one vector, its values over a block of pairs of rows, and the
-//! derivative of any weighted sum of them by every parameter (reverse mode, exact).
+//! A kernel prepared for evaluation: its parameters in one vector, its values over a block of row pairs, and the exact derivatives of
+//! any weighted sum of the values by every parameter (reverse mode).
 //!
-//! A block of pairs comes as *squares*: for every input a stripe of `count` squared differences. Parameters are natural
-//! logarithms: of length scales, of `alpha`, of standard deviations (signal, then the noise, which is always the last).
-//! Inputs are not checked: a NaN stays a NaN.
+//! A block of pairs is given as *squares*: for every input a stripe of `count` squared differences. Parameters are natural logarithms of
+//! length scales, of `alpha`, and of standard deviations (signal, then the noise, which is always last). Inputs are not checked: NaN stays
+//! NaN.
 
 use faer::traits::pulp::Arch;
 
@@ -21,13 +21,13 @@ pub(super) enum ParameterRole {
 }
 
 impl ParameterRole {
-    /// Its unit in standardised targets.
+    /// Unit in standardised targets.
     pub(super) fn unit(self, scale: &Scale) -> f64 {
         if matches!(self, Self::Signal | Self::Noise) { scale.target_deviation } else { 1.0 }
     }
 }
 
-/// One parameter: kind and name in reports.
+/// One parameter: kind and reported name.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Parameter {
     pub role: ParameterRole,
@@ -37,7 +37,7 @@ pub(super) struct Parameter {
 #[derive(Debug, Clone)]
 struct Leaf {
     shape: Shape,
-    /// Index of the first length scale; one for all inputs, or one each.
+    /// Index of the first length scale; one for all inputs, or one per input.
     lengths: usize,
     alpha: Option<usize>,
     signal: Option<usize>,
@@ -50,7 +50,7 @@ enum PlanStep {
     Product(Vec<usize>),
 }
 
-/// The kernel's tree in the order of evaluation, and its parameters.
+/// The kernel's tree in evaluation order, and its parameters.
 #[derive(Debug, Clone)]
 pub(super) struct Plan {
     pub dimensions: usize,
@@ -60,32 +60,32 @@ pub(super) struct Plan {
     pub parameters: Vec<Parameter>,
 }
 
-/// A plan at given parameters: the covariance of the function at two rows.
+/// A plan with parameter values: the covariance of the function at two rows.
 #[derive(Debug, Clone)]
 pub(super) struct Covariance {
     pub plan: Plan,
-    /// Parameters of the leaves in the form that the loops use.
+    /// Parameters of the leaves in the form used by the loops.
     leaves: Vec<LeafValues>,
     /// Variance of the function at a point.
     pub prior_variance: f64,
-    /// Variance of the noise of a measurement.
+    /// Variance of the measurement noise.
     pub noise_variance: f64,
 }
 
 #[derive(Debug, Clone)]
 struct LeafValues {
-    /// 1 / length^2 of every input.
+    /// 1 / length^2 for every input.
     inverse_squares: Vec<f64>,
     alpha: f64,
     variance: f64,
 }
 
-/// Memory of one evaluation, reused from block to block.
+/// Working memory of an evaluation, reused between blocks.
 #[derive(Debug, Default)]
 pub(super) struct Work {
     values: Vec<Vec<f64>>,
     adjoints: Vec<Vec<f64>>,
-    /// Of each leaf: derivative of the value by the squared distance, and by ln alpha.
+    /// For each leaf: derivatives of the value by the squared distance and by ln alpha.
     slopes: Vec<Vec<f64>>,
     alphas: Vec<Vec<f64>>,
 }
@@ -98,7 +98,7 @@ impl Plan {
         plan
     }
 
-    /// Adds a node after its children; `scaled` = it has a standard deviation of its own.
+    /// Adds a node after its children; `scaled` = it has its own standard deviation.
     fn add(&mut self, node: &Node, scaled: bool) -> usize {
         let step = match node {
             Node::Leaf(shape) => PlanStep::Leaf(self.add_leaf(*shape, scaled)),
@@ -144,7 +144,7 @@ impl Plan {
 }
 
 impl Covariance {
-    /// The covariance at these parameters.
+    /// Evaluates the plan at these parameters.
     pub(super) fn new(plan: Plan, theta: &[f64]) -> Self {
         let leaves = plan.leaves.iter().map(|leaf| plan.leaf_values(leaf, theta)).collect();
         let noise_variance = (2.0 * theta[plan.parameters.len() - 1]).exp();
@@ -154,19 +154,19 @@ impl Covariance {
         covariance
     }
 
-    /// Weights of the inputs in the distance between rows: by the shortest length scale of each.
+    /// Weights of the inputs in the distance between rows, from the shortest length scale of each.
     pub(super) fn metric(&self) -> Vec<f64> {
         let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.plan.dimensions).map(of).collect()
     }
 
-    /// The kernel over a block of pairs.
+    /// Evaluates the kernel over a block of pairs.
     pub(super) fn evaluate<'w>(&self, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
         self.forward(squares, count, work, false);
         &work.values[self.plan.steps.len() - 1][..count]
     }
 
-    /// Adds to `gradient` the derivative of `sum of weight * kernel` over a block of pairs by every parameter but the noise.
+    /// Adds the derivatives of `sum of weight * kernel` over a block of pairs to `gradient`, by every parameter except the noise.
     pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();
         self.forward(squares, count, work, true);
@@ -231,7 +231,7 @@ impl Covariance {
 
 #[inline(always)]
 fn dot_product(a: &[f64], b: &[f64]) -> f64 {
-    // Eight sums, so that the compiler can vectorise them.
+    // Eight partial sums, so that the compiler can vectorise them.
     let mut sums = [0.0; 8];
     let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
     let rest: f64 = a_chunks.remainder().iter().zip(b_chunks.remainder()).map(|(x, y)| x * y).sum();
@@ -252,7 +252,7 @@ fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl F
     }
 }
 
-/// A factor's adjoint is the product's, times all other factors.
+/// Adjoint of a factor: the product's adjoint times all other factors.
 fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     let (below, here) = work.adjoints.split_at_mut(at);
     for child in children {
@@ -279,9 +279,9 @@ fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
     });
 }
 
-/// Replaces squared distances by values; fills slopes and alphas if they have elements.
+/// Replaces squared distances by kernel values; fills slopes and alphas unless empty.
 fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
-    /// Keeps the division by a distance finite; the slope is then multiplied by squares that are 0.
+    /// Keeps the division by a distance finite; the slope is multiplied by zero squares afterwards.
     const TINY: f64 = 1e-150;
     let (s, a) = (values.variance, values.alpha);
     match shape {
@@ -348,7 +348,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shapes_have_their_closed_forms() {
+    fn shapes_match_closed_forms() {
         for (name, expected) in [
             ("exponential", (-1.5_f64).exp()),
             ("matern32", (1.0 + 1.5 * 3.0_f64.sqrt()) * (-1.5 * 3.0_f64.sqrt()).exp()),
@@ -413,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn every_parameter_can_be_identified() {
+    fn only_identifiable_parameters_exist() {
         let names = |text: &str| -> Vec<String> {
             let plan = Plan::new(&text.parse().expect(text), 1, false);
             plan.parameters.into_iter().filter(|p| p.role == ParameterRole::Signal).map(|p| p.name).collect()

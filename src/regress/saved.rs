@@ -1,8 +1,8 @@
 //! Saves models as text and loads them.
 //!
-//! Two lines of JSON: a header with the version and a checksum of the second line, then the model: its rows
-//! (standardised), hyperparameters and outcome. Loading recomputes everything else, which takes n^3 operations for an exact
-//! model. A damaged text or one of another version is an error.
+//! The text has two lines of JSON: a header with the version and a checksum of the second line, and the model: its (standardised) rows,
+//! hyperparameters and outcome. Loading recomputes everything else, in n^3 operations for an exact model. A damaged text or another
+//! version is an error.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +17,7 @@ use super::{exact, nearest};
 
 /// Format name in the header.
 const FORMAT: &str = "packwatch gaussian process";
-/// Version of the format; others are rejected.
+/// Version of the format; loading rejects others.
 const VERSION: u32 = 1;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -37,19 +37,19 @@ struct Body {
     outcome: FitOutcome,
     inputs: Vec<f64>,
     targets: Vec<f64>,
-    /// Coefficients and their covariance, where loading does not recompute them.
+    /// Coefficients and their covariance, if loading does not recompute them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Rows left out for the intervals, and their ratios.
+    /// Rows left out to calibrate the intervals, and their ratios.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     ratios: Vec<f64>,
 }
 
-/// FNV-1a, 64 bits: detects damage, is no signature.
+/// FNV-1a with 64 bits: detects damage; it is not a signature.
 fn checksum(text: &str) -> String {
     let hash = text
         .bytes()
@@ -62,7 +62,7 @@ fn damaged(what: impl std::fmt::Display) -> RegressionError {
 }
 
 impl Model {
-    /// The model as text, two lines.
+    /// Returns the model as text of two lines.
     pub fn save(&self) -> Result<String, RegressionError> {
         let data = self.posterior.data();
         let mut body = Body {
@@ -89,13 +89,13 @@ impl Model {
 
     /// Loads a model from its text, with a pool of `thread_count` threads.
     pub fn load(text: &str, thread_count: usize) -> Result<Self, RegressionError> {
-        let (header, rest) = text.split_once('\n').ok_or_else(|| damaged("one line only, must be two"))?;
+        let (header, rest) = text.split_once('\n').ok_or_else(|| damaged("has one line, must have two"))?;
         let header: Header = serde_json::from_str(header).map_err(|e| damaged(format!("line 1: {e}")))?;
         if header.format != FORMAT {
             return Err(RegressionError::Saved(format!("line 1: format = {:?}, must be {FORMAT:?}", header.format)));
         }
         if header.version != VERSION {
-            let newer = if header.version > VERSION { "; a newer packwatch wrote it" } else { "" };
+            let newer = if header.version > VERSION { "; written by a newer version of packwatch" } else { "" };
             return Err(RegressionError::Saved(format!(
                 "line 1: version = {}, must be {VERSION}{newer}",
                 header.version
@@ -113,7 +113,7 @@ impl Model {
 }
 
 impl Body {
-    /// Checks that lengths match and numbers are finite, so that no index is out of bounds later.
+    /// Checks lengths and finite numbers, so that no index is out of bounds later.
     fn check(&self) -> Result<(), RegressionError> {
         let (d, n) = (self.spec.dimensions, self.targets.len());
         let same = |what: &str, found: usize, expected: usize| {
@@ -132,7 +132,7 @@ impl Body {
         self.spec.form.check(n).map_err(damaged)?;
         if matches!(self.spec.form, Form::Nearest { .. }) {
             same("coefficients", self.beta.len(), size)?;
-            same("their covariance", self.beta_covariance.len(), size * size)?;
+            same("covariance of the coefficients", self.beta_covariance.len(), size * size)?;
         }
         let scale = &self.scale;
         let numbers = [&self.inputs, &self.targets, &self.theta, &scale.means, &scale.deviations, &self.beta];

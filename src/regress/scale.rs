@@ -1,6 +1,6 @@
-//! Checks rows; standardises inputs and targets by mean and standard deviation.
+//! Checks rows, and standardises inputs and targets by mean and standard deviation.
 //!
-//! In: rows. Out: standardised rows. Bad lengths and numbers are errors with the row's line.
+//! Input: rows. Output: standardised rows. Wrong lengths and bad numbers are errors with the line of the row.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ pub(super) struct Scale {
     pub target_deviation: f64,
 }
 
-/// Rejects rows of wrong lengths or with numbers that are not finite.
+/// Rejects rows of wrong lengths or with non-finite numbers.
 pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     let (d, n) = (rows.dimensions, rows.targets.len());
     if d == 0 || d > MAX_DIMENSIONS {
@@ -49,10 +49,10 @@ pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     }
 }
 
-/// Mean and standard deviation; deviation 1 where the values do not differ.
+/// Mean and standard deviation; the deviation of equal values is 1.
 fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = values.clone().count() as f64;
-    // Relative to the first value: the sum of many equal ones would not be exact.
+    // Relative to the first value, because the sum of many equal values would not be exact.
     let first = values.clone().next().unwrap_or(0.0);
     let mean = first + values.clone().map(|v| v - first).sum::<f64>() / count;
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
@@ -80,7 +80,7 @@ impl StandardisedRows {
 }
 
 impl Scale {
-    /// The scale of checked rows. With the zero basis the target is not shifted.
+    /// Scale of checked rows. The zero basis does not shift the target.
     pub(super) fn of(rows: &TrainingRows, standardise: bool, basis: Basis) -> Self {
         let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
         let inputs: Vec<(f64, f64)> =
@@ -94,7 +94,7 @@ impl Scale {
         }
     }
 
-    /// The first column whose mean or deviation overflows: `input 2` or `target`.
+    /// First column whose mean or deviation overflows: `input 2` or `target`.
     pub(super) fn too_wide(&self) -> Option<String> {
         let target = (!self.target_deviation.is_finite() || !self.target_mean.is_finite()).then(|| "target".to_owned());
         let is_wide = |(mean, deviation): (&f64, &f64)| !mean.is_finite() || !deviation.is_finite();
@@ -117,12 +117,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_long_column_of_one_value_is_flat() {
+    fn long_constant_column_has_unit_scale() {
         assert_eq!(moments(std::iter::repeat_n(0.1, 1_000_000)), (0.1, 1.0));
     }
 
     #[test]
-    fn a_number_that_is_not_finite_is_rejected_with_its_line() {
+    fn non_finite_number_is_rejected_with_line() {
         let (inputs, targets) = ([1.0, 2.0, 3.0, f64::NAN], [1.0, 2.0]);
         let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[12, 19] };
         assert_eq!(check(&rows).expect_err("NaN").to_string(), "line 19: input 2 = NaN, must be a finite number");

@@ -1,7 +1,7 @@
 //! Hyperparameters by maximum marginal likelihood: starts, bounds and the search from each start.
 //!
-//! In: a plan and an objective over the logarithms of its parameters. Out: the best point, or none where the objective has
-//! no value at the start.
+//! Input: a plan and an objective over the logarithms of its parameters. Output: the best point, or `None` if the objective has no value at
+//! the start.
 
 use std::ops::ControlFlow;
 
@@ -18,14 +18,14 @@ fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
         ParameterRole::Length => [(1e-4, 1e4), (0.05, 5.0)],
         ParameterRole::Alpha => [(1e-2, 1e3), (0.2, 5.0)],
-        // A larger value acts as a mean function, along a ridge that slows the search.
+        // Larger values act as a mean function, along a ridge that slows the search.
         ParameterRole::Signal => [(1e-3, 2e1), (0.3, 3.0)],
-        // A lower bound that keeps the matrix of a smooth kernel positive definite under rounding.
+        // The lower bound keeps the matrix of a smooth kernel positive definite despite rounding.
         ParameterRole::Noise => [(1e-4, 1e1), (0.03, 0.8)],
     }
 }
 
-/// Logarithms of bounds; `spread` is the standard deviation of the inputs (1 when they are standardised).
+/// Logarithms of the bounds; `spread` is the standard deviation of the inputs (1 if standardised).
 pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     let of = |parameter: &Parameter| {
         let [(low, high), _] = ranges(parameter.role);
@@ -35,7 +35,7 @@ pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     plan.parameters.iter().map(of).unzip()
 }
 
-/// The start when none is given: length scales of one standard deviation, noise 30 % of the targets' deviation.
+/// Default start: length scales of one standard deviation, noise 30 % of the targets' deviation.
 pub(super) fn first_start(plan: &Plan, spread: f64) -> Vec<f64> {
     let signals = plan.parameters.iter().filter(|p| p.role == ParameterRole::Signal).count().max(1);
     let of = |parameter: &Parameter| match parameter.role {
@@ -78,7 +78,7 @@ impl SearchMonitor<'_, '_> {
     }
 }
 
-/// Searches from one start. A matrix that cannot be factorised counts as no value there.
+/// Searches from one start. A matrix that cannot be factorised counts as a missing value.
 pub(super) fn descend(
     start: &[f64],
     (low, high): (&[f64], &[f64]),
@@ -86,10 +86,10 @@ pub(super) fn descend(
     monitor: &mut SearchMonitor,
     mut objective: impl FnMut(&[f64]) -> Result<(f64, Vec<f64>), RegressionError>,
 ) -> Result<Option<Minimum>, RegressionError> {
-    // The search works per row, so that the first step has the length of the gradient.
+    // Work per row, so that the first step has the length of the gradient.
     let rows = monitor.rows as f64;
     let scale = 1.0 / rows;
-    // Decrease of the negative log likelihood per row below which a search ends, twice in succession.
+    // The search ends after two successive decreases of the negative log likelihood per row below this tolerance.
     let limits = SearchLimits { low, high, max_iterations, tolerance: 5e-6 * rows * scale };
     let evaluate = |theta: &[f64]| -> Result<Evaluation, RegressionError> {
         match objective(theta) {

@@ -1,6 +1,6 @@
-//! Training rows, settings of a fit, its progress, and their limits.
+//! Training rows, settings of a fit, its progress, and limits.
 //!
-//! In: what the caller gives. [`fit`](super::fit) checks all of it and rejects values out of range.
+//! Input: values from the caller. [`fit`](super::fit) checks them all and rejects values out of range.
 
 use std::ops::ControlFlow;
 
@@ -10,23 +10,23 @@ use super::basis::Basis;
 use super::error::RegressionError;
 use super::kernel::Kernel;
 
-/// Most inputs of a row.
+/// Most inputs per row.
 pub const MAX_DIMENSIONS: usize = 256;
-/// Most rows of an exact fit: its matrix alone is then 3.2 GB, and a search needs three of them.
+/// Most rows of an exact fit: the matrix then has 3.2 GB, and a search needs three of them.
 pub const MAX_EXACT_ROWS: usize = 20_000;
-/// Most neighbours of a row.
+/// Most neighbours per row.
 pub const MAX_NEIGHBOURS: usize = 500;
 
-/// Rows to learn from.
+/// Rows to train on.
 #[derive(Debug, Clone, Copy)]
 pub struct TrainingRows<'a> {
-    /// Inputs, row after row.
+    /// Inputs, row-major.
     pub inputs: &'a [f64],
-    /// Inputs of one row.
+    /// Number of inputs per row.
     pub dimensions: usize,
     /// Value to predict, one per row.
     pub targets: &'a [f64],
-    /// Line of each row in its file, for errors; empty = rows are counted from 1.
+    /// Line of each row in its file, for errors; empty = rows count from 1.
     pub lines: &'a [u64],
 }
 
@@ -36,8 +36,8 @@ pub struct TrainingRows<'a> {
 pub enum Form {
     /// No approximation.
     Exact,
-    /// Each row is conditioned on its nearest among the rows before it in a seeded order (Vecchia's approximation), a
-    /// prediction on the nearest of all.
+    /// Each row is conditioned on its nearest rows among those before it in a seeded order (Vecchia's approximation); a prediction is
+    /// conditioned on the nearest of all rows.
     Nearest {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
@@ -45,10 +45,10 @@ pub enum Form {
 }
 
 impl Form {
-    /// Checks its numbers, and that of the rows, against the limits.
+    /// Checks its numbers and the number of rows against the limits.
     pub(super) fn check(self, rows: usize) -> Result<(), RegressionError> {
         let (what, found, most, advice) = match self {
-            Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; take the form nearest"),
+            Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; use the form nearest"),
             Self::Nearest { neighbours } => ("neighbours", neighbours, MAX_NEIGHBOURS, ""),
         };
         if (1..=most).contains(&found) {
@@ -65,28 +65,28 @@ pub struct GprSettings {
     pub kernel: Kernel,
     /// Mean function.
     pub basis: Basis,
-    /// A length scale for every input instead of one for all.
+    /// Whether every input has its own length scale.
     pub ard: bool,
-    /// Inputs are brought to mean 0 and standard deviation 1; length scales are then in standard deviations.
+    /// Whether inputs are standardised to mean 0 and standard deviation 1; length scales are then in standard deviations.
     pub standardise: bool,
     /// Exact, or by nearest neighbours.
     pub form: Form,
-    /// Searches from seeded random starts in addition to the first.
+    /// Additional searches from seeded random starts.
     pub restarts: usize,
     /// Seed of starts, order and folds.
     pub seed: u64,
-    /// Most steps of one search; 0 = the start is the result.
+    /// Most steps of one search; 0 = keep the start.
     pub max_iterations: usize,
-    /// Hyperparameters to start from, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters); empty = derived from the rows.
+    /// Initial hyperparameters in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters); empty = derived from the rows.
     pub start: Vec<f64>,
-    /// Calibrates the 95 % interval by nearby training rows, each predicted without itself; else Gaussian.
+    /// Whether nearby training rows, each predicted from all others, calibrate the 95 % interval; otherwise it is Gaussian.
     pub calibrate: bool,
-    /// Threads, 1 or more.
+    /// Number of threads, at least 1.
     pub threads: usize,
 }
 
 impl GprSettings {
-    /// A constant basis, one length scale, standardised inputs, one search; exact up to 2,000 rows.
+    /// Default settings: constant basis, one length scale, standardised inputs, one search; exact up to 2,000 rows.
     pub fn new(kernel: Kernel, rows: usize) -> Self {
         Self {
             kernel,
@@ -111,7 +111,7 @@ pub struct FitProgress {
     pub fold: usize,
     /// Number of folds.
     pub folds: usize,
-    /// Present search, from 1.
+    /// Current search, from 1.
     pub search: usize,
     /// Number of searches.
     pub searches: usize,
@@ -119,9 +119,9 @@ pub struct FitProgress {
     pub iteration: usize,
     /// Most steps of a search.
     pub max_iterations: usize,
-    /// Best log marginal likelihood of this search per row, in standardised targets.
+    /// Best log marginal likelihood of this search per row, for standardised targets.
     pub log_likelihood_per_row: f64,
 }
 
-/// Callback after each step of a search; `Break` ends the fit with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+/// Callback after each step of a search; `Break` cancels the fit with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
 pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

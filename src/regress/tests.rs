@@ -1,4 +1,4 @@
-//! Both forms against each other and against finite differences; whole fits.
+//! Compares both forms with each other and with finite differences; tests whole fits.
 
 use std::ops::ControlFlow;
 
@@ -37,7 +37,7 @@ fn theta(plan: &Plan) -> Vec<f64> {
     (0..plan.parameters.len()).map(|k| -0.3 + 0.4 * (k as f64 * 2.3).sin()).collect()
 }
 
-/// Compares a gradient with differences of the value.
+/// Compares a gradient with finite differences of the value.
 fn check_gradient(plan: &Plan, name: &str, of: impl Fn(&[f64]) -> (f64, Vec<f64>)) {
     let at = theta(plan);
     let (_, gradient) = of(&at);
@@ -51,7 +51,7 @@ fn check_gradient(plan: &Plan, name: &str, of: impl Fn(&[f64]) -> (f64, Vec<f64>
 }
 
 #[test]
-fn gradients_of_both_forms_agree_with_finite_differences() {
+fn gradients_agree_with_finite_differences_in_both_forms() {
     for (kernel, basis, ard) in
         [(KERNELS[0], Basis::Constant, true), (KERNELS[1], Basis::Zero, false), (KERNELS[2], Basis::Linear, true)]
     {
@@ -87,7 +87,7 @@ fn assert_close(found: &[Prediction], expected: &[Prediction], within: f64) {
 }
 
 #[test]
-fn the_nearest_form_with_all_rows_agrees_with_the_exact_form() {
+fn nearest_with_all_rows_agrees_with_exact() {
     for basis in [Basis::Zero, Basis::Constant, Basis::Linear] {
         let fixed = |settings: &mut GprSettings| {
             (settings.basis, settings.max_iterations, settings.calibrate) = (basis, 0, false);
@@ -95,7 +95,7 @@ fn the_nearest_form_with_all_rows_agrees_with_the_exact_form() {
         let exact = fitted(Form::Exact, fixed);
         let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
-        // A prediction conditions on one row more than a factor.
+        // A prediction conditions on one more row than a term.
         let nearest = fitted(Form::Nearest { neighbours: 120 }, fixed);
         let likelihoods = (nearest.log_marginal_likelihood(), exact.log_marginal_likelihood());
         assert!((likelihoods.0 - likelihoods.1).abs() < 1e-5, "{likelihoods:?}");
@@ -104,7 +104,7 @@ fn the_nearest_form_with_all_rows_agrees_with_the_exact_form() {
 }
 
 #[test]
-fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
+fn left_out_rows_match_model_fitted_without_them() {
     let data = data(50, Basis::Zero);
     let plan = Plan::new(&"matern32".parse().expect("a kernel"), 2, false);
     let at = theta(&plan);
@@ -122,7 +122,7 @@ fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
 }
 
 #[test]
-fn the_search_recovers_noise_and_function() {
+fn search_recovers_noise_and_function() {
     for form in [Form::Exact, Form::Nearest { neighbours: 25 }] {
         let model = fitted(form, |settings| settings.restarts = 1);
         let hyperparameters = model.hyperparameters();
@@ -138,7 +138,7 @@ fn the_search_recovers_noise_and_function() {
 }
 
 #[test]
-fn without_a_search_the_given_start_is_the_model() {
+fn zero_steps_keep_given_start() {
     let start = [0.7, 1.4, 0.9, 0.2];
     let model = fitted(Form::Exact, |settings| {
         (settings.ard, settings.max_iterations) = (true, 0);
@@ -150,7 +150,7 @@ fn without_a_search_the_given_start_is_the_model() {
 }
 
 #[test]
-fn results_do_not_depend_on_the_number_of_threads() {
+fn results_do_not_depend_on_threads() {
     for form in [Form::Nearest { neighbours: 20 }, Form::Exact] {
         let of = |threads| {
             let model = fitted(form, |settings| settings.threads = threads);
@@ -162,7 +162,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn equal_rows_with_hardly_any_noise_need_jitter_and_it_is_counted() {
+fn equal_rows_with_little_noise_count_jitter() {
     let inputs: Vec<f64> = (0..40).map(|k| f64::from(k / 4) * 1e-3).collect();
     let targets: Vec<f64> = inputs.iter().map(|x| x.sin()).collect();
     let rows = TrainingRows { inputs: &inputs, dimensions: 1, targets: &targets, lines: &[] };
@@ -178,7 +178,7 @@ fn equal_rows_with_hardly_any_noise_need_jitter_and_it_is_counted() {
 }
 
 #[test]
-fn a_model_survives_saving_and_loading() {
+fn saved_model_loads_unchanged() {
     for form in [Form::Exact, Form::Nearest { neighbours: 20 }] {
         let model = fitted(form, |settings| settings.basis = Basis::Linear);
         let text = model.save().expect("can be written");
@@ -195,8 +195,10 @@ fn a_model_survives_saving_and_loading() {
 fn damaged_and_newer_models_are_rejected() {
     let text = fitted(Form::Nearest { neighbours: 20 }, |settings| settings.max_iterations = 0).save().expect("text");
     let refused = |text: &str| Model::load(text, 1).expect_err("not sound").to_string();
-    assert!(refused("").contains("one line only"));
-    assert!(refused(&text.replace("\"version\":1", "\"version\":2")).contains("version = 2, must be 1; a newer"));
+    assert!(refused("").contains("has one line"));
+    assert!(
+        refused(&text.replace("\"version\":1", "\"version\":2")).contains("version = 2, must be 1; written by a newer")
+    );
     assert!(refused(&text.replace("packwatch gaussian process", "something")).contains("format = "));
     assert!(refused(&text.replacen("\"theta\":[", "\"theta\":[1", 1)).contains("damaged: checksum"));
     assert!(refused(&text[..text.len() / 2]).contains("damaged: checksum"));
@@ -205,7 +207,7 @@ fn damaged_and_newer_models_are_rejected() {
 }
 
 #[test]
-fn the_callback_can_cancel_the_fit() {
+fn callback_cancels_fit() {
     let (inputs, targets) = wavy_plane(100, 5);
     let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
     let settings = GprSettings::new("exponential".parse().expect("a kernel"), 100);
@@ -219,7 +221,7 @@ fn the_callback_can_cancel_the_fit() {
 }
 
 #[test]
-fn cross_validation_holds_every_row_out_once() {
+fn cross_validation_holds_out_every_row_once() {
     let (inputs, targets) = wavy_plane(203, 5);
     let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
     let mut settings = GprSettings::new("matern52".parse().expect("a kernel"), 203);
@@ -267,7 +269,7 @@ fn numbers_too_large_to_square_are_rejected() {
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }] {
         let model = fitted(form, |_| ());
         let predicted = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
-        // Either so distant that the prior applies, or rejected by row.
+        // Either so distant that the prior applies, or rejected with the row.
         match predicted {
             Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
             Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),
@@ -278,5 +280,5 @@ fn numbers_too_large_to_square_are_rejected() {
     let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
     let settings = GprSettings::new("exponential".parse().expect("a kernel"), 30);
     let fault = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect_err("too large").to_string();
-    assert_eq!(fault, "input 1 = values whose mean or variance overflows, must be of a smaller size");
+    assert_eq!(fault, "input 1 = values whose mean or variance overflows, must be smaller");
 }

@@ -1,16 +1,15 @@
-//! Exponential and logarithm without branches, so that the compiler can vectorise them.
+//! Branch-free exponential and logarithm, which the compiler can vectorise.
 //!
-//! In and out: plain numbers, accurate to a few 1e-16 of the result over the stated range; outside the range the result
-//! has no meaning. The loops that call them run inside
-//! `pulp`'s dispatcher (faer brings it), which selects the widest instructions of the machine at run time; no operation
-//! is fused, so the results are the same on every machine.
+//! Input and output: plain numbers, accurate to a few 1e-16 of the result in the stated range; outside it, the result is meaningless.
+//! The calling loops run inside `pulp`'s dispatcher (part of faer), which selects the widest instructions of the machine at run time. No
+//! operation is fused, so the results are the same on every machine.
 
 use std::f64::consts::LOG2_E;
 
-/// ln 2 in two parts: the first has so few bits that its multiples by an exponent are exact.
+/// ln 2 in two parts. The first has so few bits that its products with an exponent are exact.
 const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
 const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
-/// Added to a small number, it leaves the nearest integer in the low bits.
+/// Adding this to a small number leaves the nearest integer in the low bits.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
 /// 1/k! for k = 13 down to 0.
 const EXP_SERIES: [f64; 14] = [
@@ -33,7 +32,7 @@ const EXP_SERIES: [f64; 14] = [
 /// exp(x) for x <= 0.
 #[inline(always)]
 pub(crate) fn exp(x: f64) -> f64 {
-    // Lower limit of the argument of exp: about 1e-304, far from the subnormal numbers.
+    // Lower limit of the argument of exp; the result, about 1e-304, is far above the subnormal numbers.
     let x = x.max(-700.0);
     let rounded = x * LOG2_E + ROUNDER;
     let whole = rounded - ROUNDER;
@@ -50,7 +49,7 @@ pub(crate) fn exp(x: f64) -> f64 {
 pub(crate) fn ln(x: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     let bits = x.to_bits();
-    // The exponent as a number, by way of the bits of 2^52 + exponent.
+    // Convert the exponent to a number through the bits of 2^52 + exponent.
     let exponent = f64::from_bits((bits >> 52) | 0x4330_0000_0000_0000) - (4_503_599_627_370_496.0 + 1023.0);
     let mantissa = f64::from_bits((bits & MANTISSA) | 0x3ff0_0000_0000_0000);
     let halve = mantissa > std::f64::consts::SQRT_2;
