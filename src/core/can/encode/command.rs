@@ -1,7 +1,8 @@
-//! The received command frame: another ECU acknowledges or clears alarms, or reports that the pack was replaced.
+//! The received command frame, with which another ECU acknowledges or clears alarms, or reports that the pack was
+//! replaced.
 //!
-//! In: a frame whose end-to-end protection the caller has checked. Out: the command, "all" as `None`. A code without a
-//! meaning is an error: a command is applied as a whole or not at all.
+//! In: a frame whose end-to-end protection the caller has checked. Out: the command, with "all" as `None`. An undefined
+//! code is an error: a command is applied completely or not at all.
 
 use super::layout::LayoutMessage;
 use super::message::{PlanFaults, RULES};
@@ -19,11 +20,11 @@ pub enum Command {
     Acknowledge,
     /// Clears latched alarms whose cause has ended.
     Clear,
-    /// Reports another pack in the vehicle.
+    /// Reports that another pack is in the vehicle.
     PackReplaced,
 }
 
-/// A command and its alarms; `None` = all.
+/// A command and the alarms it selects; `None` = all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
     /// Kind.
@@ -36,12 +37,12 @@ pub struct CommandFields {
     pub cell: Option<CellIndex>,
 }
 
-/// Why a frame is not a command.
+/// Reason why a frame is not a command.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct CommandFault(String);
 
-/// The command frame, ready for reading.
+/// The command frame, prepared for decoding.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommandPlan {
     id: CanId,
@@ -59,7 +60,7 @@ pub struct CommandPlan {
 struct SelectorSignal {
     name: &'static str,
     plan: SignalPlan,
-    /// The code for all alarms.
+    /// The code that selects all alarms.
     all: Option<u64>,
     /// Other valid codes.
     codes: std::ops::RangeInclusive<u64>,
@@ -69,7 +70,7 @@ impl CommandPlan {
     /// Finds the message and its signals.
     ///
     /// # Errors
-    /// All that is missing or cannot be read, by name.
+    /// Every message or signal that is missing or cannot be decoded, by name.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
         let name = LayoutMessage::Command.message();
         let message = database.message(name).ok_or_else(|| PlanFaults(vec![format!("message {name} is missing")]))?;
@@ -94,20 +95,20 @@ impl CommandPlan {
         self.id
     }
 
-    /// End-to-end protection the frame must have.
+    /// End-to-end protection that the frame must have.
     pub fn protection(&self) -> Option<Protection> {
         self.protection
     }
 
-    /// Authentication the frame must have.
+    /// Authentication that the frame must have.
     pub fn authentication(&self) -> Option<Authentication> {
         self.secoc
     }
 
-    /// Reads a command. Neither protection nor authenticator is checked.
+    /// Decodes a command. Checks neither protection nor authenticator.
     ///
     /// # Errors
-    /// When it is another message, too short, or has a code without meaning.
+    /// The frame is another message, is too short, or has an undefined code.
     pub fn decode(&self, frame: &Frame) -> Result<CommandFields, CommandFault> {
         if frame.id() != self.id || frame.kind() == FrameKind::Remote {
             return Err(CommandFault("is not the command message".to_owned()));
@@ -116,7 +117,7 @@ impl CommandPlan {
         if payload.len() < self.len {
             return Err(CommandFault(format!("has {} bytes, must have {}", payload.len(), self.len)));
         }
-        // Every signal lies within the message: none is missing here.
+        // Every signal lies within the message, so decoding cannot fail here.
         let command = match self.command.raw(payload).unwrap_or(0) {
             1 => Command::Acknowledge,
             2 => Command::Clear,
@@ -158,7 +159,7 @@ impl SelectorSignal {
     }
 }
 
-/// A signal that is always present, and the code of "all" in its value table.
+/// Finds a signal that is always present, and the code of "all" in its value table.
 fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(SignalPlan, Option<u64>)> {
     let mut fault = |what: String| faults.push(format!("signal {}.{name}{what}", message.name));
     let Some(signal) = message.signal(name) else {
@@ -167,9 +168,9 @@ fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(Si
     };
     let all = signal.values.iter().find(|(_, word)| word == "all").and_then(|(code, _)| u64::try_from(*code).ok());
     match signal.layout.plan() {
-        Ok(_) if !signal.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
+        Ok(_) if !signal.conditions.is_empty() => fault(": multiplexed, must always be present".to_owned()),
         Ok(plan) if plan.bytes_needed() > usize::from(message.len_bytes) => {
-            fault(format!(": reaches past the message's {} bytes", message.len_bytes));
+            fault(format!(": extends beyond the message's {} bytes", message.len_bytes));
         }
         Ok(plan) => return Some((plan, all)),
         Err(error) => fault(format!(": {error}")),
@@ -194,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_has_a_kind_and_selects_alarms() {
+    fn command_decodes_kind_and_selected_alarms() {
         let fields = plan().decode(&frame([2, 14, 3, 95])).unwrap();
         let wanted =
             CommandFields { command: Command::Clear, rule: Some(14), severity: Some(3), cell: Some(CellIndex(95)) };
@@ -206,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_code_without_meaning_is_refused() {
+    fn undefined_code_is_rejected() {
         for (codes, signal, code) in [
             ([0, 31, 0, 2047], "Command", 0),
             ([4, 31, 0, 2047], "Command", 4),
@@ -219,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn another_message_and_a_short_one_are_refused() {
+    fn other_and_short_messages_are_rejected() {
         let refusal = |frame: &Frame| plan().decode(frame).unwrap_err().to_string();
         let other = Frame::classic(CanId::Standard(1714), &[0xFF; 8]).unwrap();
         assert_eq!(refusal(&other), "is not the command message");

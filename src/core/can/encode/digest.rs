@@ -1,8 +1,8 @@
-//! The digest frame: all raised alarms as a count and a checksum, the state of every rule, and one threshold in full
+//! The digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in full
 //! precision.
 //!
-//! In: alarms as their frames carry them. Out: values for the signals of `PACKWATCH_Digest`. A receiver that has lost
-//! alarm frames, or started late, finds with the checksum whether its table of raised alarms is complete.
+//! In: alarms as their frames carry them. Out: values for the signals of `PACKWATCH_Digest`. With the checksum, a
+//! receiver that lost alarm frames or started late can check whether its table of raised alarms is complete.
 
 use super::layout::LayoutMessage;
 use super::message::{OutputMessage, RULES};
@@ -14,31 +14,31 @@ use crate::quantity::CellIndex;
 /// Number of alarm rules.
 const RULE_COUNT: usize = RULES.len();
 
-/// State of a rule; the number is the code of the wire.
+/// State of a rule; the number is the wire code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(u8)]
 pub enum RuleState {
-    /// Judged; no alarm of it is raised.
+    /// Every alarm of the rule is known and not raised.
     None = 0,
-    /// An alarm of severity info is raised, none is worse.
+    /// The worst raised alarm has severity info.
     Info = 1,
-    /// Of severity warning.
+    /// The worst raised alarm has severity warning.
     Warning = 2,
-    /// Of severity severe.
+    /// The worst raised alarm has severity severe.
     Severe = 3,
-    /// No alarm of it is raised, and not all of them can be judged.
+    /// No alarm of the rule is raised, but at least one is unknown.
     Unknown = 4,
     /// No threshold is configured.
     #[default]
     NotWatched = 5,
 }
 
-/// A threshold as configured.
+/// A configured threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThresholdFields {
     /// Number of the rule.
     pub rule: u8,
-    /// Code of the wire: 1 info, 2 warning, 3 severe.
+    /// Wire code: 1 info, 2 warning, 3 severe.
     pub severity: u8,
     /// In the rule's internal unit.
     pub threshold: f64,
@@ -47,66 +47,66 @@ pub struct ThresholdFields {
 /// Contents of all pages of the digest.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct DigestFields {
-    /// Raised alarms.
+    /// Number of raised alarms.
     pub raised: usize,
-    /// Code of the wire: 0 none, 1 info, 2 warning, 3 severe.
+    /// Wire code of the worst severity: 0 none, 1 info, 2 warning, 3 severe.
     pub worst: u8,
-    /// Over the raised alarms.
+    /// Checksum of the raised alarms.
     pub checksum: TableChecksum,
-    /// Longest time between two frames of one raised alarm, s.
+    /// Longest time between two frames of the same raised alarm, s.
     pub pass_time_s: f64,
     /// States of the rules, in the order of their numbers.
     pub rules: [RuleState; RULE_COUNT],
-    /// The threshold whose turn it is; `None` = none is configured.
+    /// The threshold to send in this digest; `None` = none configured.
     pub threshold: Option<ThresholdFields>,
 }
 
-/// Checksum over a table of raised alarms: the sum, modulo 65536, of the CRC-16 (polynomial 0x1021, start 0xFFFF) of each
-/// entry. A sum does not depend on the order, so a receiver adds and subtracts entries as they come.
+/// Checksum of a table of raised alarms: the sum, modulo 65536, of the CRC-16 (polynomial 0x1021, start 0xFFFF) of each
+/// entry. A sum does not depend on the order, so a receiver can add and subtract entries as they change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TableChecksum(u16);
 
 impl TableChecksum {
-    /// Adds a raised alarm, as its frame carries it: number of the rule, codes of severity and state, cell (`None` = the
-    /// pack), whether it is acknowledged.
+    /// Adds a raised alarm, as its frame carries it: number of the rule, codes of severity and state, cell (`None` =
+    /// the pack), and whether it is acknowledged.
     pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
-        // The code of "the pack as a whole" in a table entry, as in the alarm frame of the shipped DBC.
+        // 2047 is the code of "the whole pack", as in the alarm frame of the shipped DBC.
         let [low, high] = cell.map_or(2047, |cell| cell.0).to_le_bytes();
         let entry = [rule, severity, low, high, state | u8::from(is_acknowledged) << 3];
         self.0 = self.0.wrapping_add(crc16(0xFFFF, &entry));
     }
 
-    /// The value that is sent: 65535 means "not available", so a sum of 65535 is sent as 65534.
+    /// The value to send: 65535 means "not available", so a sum of 65535 is sent as 65534.
     pub fn value(self) -> u16 {
         self.0.min(u16::MAX - 1)
     }
 }
 
-/// The digest frame, ready for encoding.
+/// The digest frame, prepared for encoding.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct DigestPlan {
     pub(super) message: OutputMessage,
-    /// Selector codes of the pages, ascending.
+    /// Selector codes of the pages, in ascending order.
     pages: Vec<u64>,
-    /// Per rule: the factor from the rule's internal unit to that of its `Threshold_...`.
+    /// Factor from each rule's internal unit to the unit of its `Threshold_...` signal.
     factors: [f64; RULE_COUNT],
 }
 
 impl DigestPlan {
-    /// The plan; `None` = the database has no digest, or faults are noted.
+    /// Creates the plan; `None` = the database has no digest, or faults were added to `faults`.
     pub(super) fn new(database: &Database, alarm: &OutputMessage, faults: &mut Vec<String>) -> Option<Self> {
         let name = LayoutMessage::Digest.message();
         database.message(name)?;
         let rules = RULES.map(|rule| format!("Rule_{rule}"));
         let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
-        // Signals on page 0. The rules and the threshold are on pages of their own.
+        // Signals on page 0. The rules and the threshold are on separate pages.
         let required = [&["Page", "Raised", "Worst", "TableChecksum", "PassTime"][..], &rules].concat();
         let message = OutputMessage::new(database, name, &required, faults)?.with_places(&rules);
         let factors = RULES.map(|rule| alarm.per_inside_unit(&format!("Threshold_{rule}")));
         Some(Self { pages: message.page_codes(), message, factors })
     }
 
-    /// One page, counted from 0; `None` = there is no such page.
+    /// Encodes a page, counted from 0; `None` = no such page.
     pub(super) fn frame(&self, page: usize, fields: &DigestFields, counter: &mut u8) -> Option<Frame> {
         let code = *self.pages.get(page)?;
         Some(self.message.frame(code, counter, |name, rule| match rule {
@@ -115,7 +115,7 @@ impl DigestPlan {
         }))
     }
 
-    /// Pages of the digest.
+    /// Number of pages of the digest.
     pub(super) fn page_count(&self) -> usize {
         self.pages.len()
     }

@@ -1,14 +1,14 @@
-//! Input frames made from channel values, for CSV replay and the simulator.
+//! Encodes channel values as input frames, for CSV replay and the simulator.
 //!
-//! Each message and multiplexer page that has a value makes one frame. A signal of that frame without a value is
-//! written as its "not available" code, or else as a code that its receiver rejects (NaN, out of range); where there is no
-//! such code the whole frame is left out and its values are counted as not carried. A frame without any value is sent only
-//! if one of its signals has a "not available" code. Values beyond the bits saturate; values outside the DBC's range stay
-//! outside, so that their receiver detects the fault. A diagnostic answer is made with its request and flow control, as on a
-//! bus with a tester.
+//! Each message and multiplexer page with at least one value gives one frame. In that frame, a signal without a value
+//! is encoded as its "not available" code, or else as a code that the receiver rejects (NaN, out of range). If no such
+//! code exists, the whole frame is omitted and its values count as not carried. A frame without any value is sent only
+//! if one of its signals has a "not available" code. Values beyond the signal's bits saturate; values outside the DBC's
+//! range stay outside, so that the receiver detects the fault. A diagnostic response is encoded with its request and
+//! flow control, as on a bus with a tester.
 //!
-//! Rows of one log have the same channels in the same order: where the value of each signal is in a row is looked up once and
-//! kept until the channels change.
+//! Rows of one log have the same channels in the same order. Therefore the position of each signal's value in a row is
+//! looked up once and kept until the channels change.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -20,47 +20,47 @@ use crate::can::uds::{Answer, AnswerSignal, Controller, Question};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
 
-/// Makes input frames from values.
+/// Encodes values as input frames.
 #[derive(Debug, Clone)]
 pub struct InputEncoder {
     pages: Vec<InputPage>,
     answers: Vec<AnswerPage>,
-    /// Of the last row; kept, because the next one most often has the same channels.
+    /// Positions in the last row; kept because the next row usually has the same channels.
     places: RefCell<RowPlaces>,
 }
 
-/// Where the values of the fields are in a row of values.
+/// Positions of the fields' values in a row.
 #[derive(Debug, Clone, Default)]
 struct RowPlaces {
     channels: Vec<RowChannel>,
-    /// Place of each field's value, by the field's number; `None` = the row has no such channel.
+    /// Position of each field's value, by the field's number; `None` = the row does not have the channel.
     of_fields: Vec<Option<usize>>,
 }
 
-/// A row of values, and where they are.
+/// A row of values, with the positions of the fields' values.
 #[derive(Clone, Copy)]
 struct PlacedRow<'a> {
     values: &'a [(Channel, Option<f64>)],
     of_fields: &'a [Option<usize>],
 }
 
-/// A place in a row of values.
+/// A position in a row of values.
 #[derive(Debug, Clone, Copy)]
 struct RowChannel {
     channel: Channel,
-    /// A later place has the same channel, and its value counts.
+    /// A later position has the same channel, so its value counts instead.
     is_overridden: bool,
     /// Whether a frame carries the value of the current row.
     is_carried: bool,
 }
 
-/// One diagnostic answer.
+/// One diagnostic response.
 #[derive(Debug, Clone)]
 struct AnswerPage {
     question: Question,
-    /// The answer's message, with all signals 0.
+    /// The response message, with all signals 0.
     template: Vec<u8>,
-    /// Signals and the byte of the message with which each begins.
+    /// The byte of the message at which each signal's layout starts, and the signal.
     fields: Vec<(usize, InputField)>,
 }
 
@@ -70,7 +70,7 @@ struct InputPage {
     bus: BusIndex,
     id: CanId,
     len: usize,
-    /// Payload with the selectors, all else 0.
+    /// Payload with the selectors; all other bits are 0.
     template: [u8; MAX_DATA],
     fields: Vec<InputField>,
 }
@@ -78,14 +78,14 @@ struct InputPage {
 #[derive(Debug, Clone)]
 struct InputField {
     channel: Channel,
-    /// Number among all fields of the encoder, for [`RowPlaces`].
+    /// Index among all fields of the encoder, for [`RowPlaces`].
     number: usize,
     plan: SignalPlan,
     scale: f64,
     offset: f64,
-    /// Code for "no value".
+    /// Code for "no value"; `None` = no such code exists.
     missing: Option<u64>,
-    /// `missing` is a configured "not available", which makes a frame even without any value.
+    /// `missing` is a configured "not available" code, for which a frame is sent even without any value.
     has_not_available: bool,
 }
 
@@ -119,12 +119,12 @@ impl InputField {
         of_fields.get(self.number).copied().flatten()
     }
 
-    /// Its value in a row; NaN is no value.
+    /// The field's value in a row; NaN counts as missing.
     fn value(&self, row: PlacedRow<'_>) -> Option<f64> {
         row.values.get(self.place(row.of_fields)?)?.1.filter(|value| !value.is_nan())
     }
 
-    /// Whether a frame is needed for it.
+    /// Whether the field requires a frame.
     fn is_sent(&self, row: PlacedRow<'_>) -> bool {
         self.place(row.of_fields).is_some() && (self.has_not_available || self.value(row).is_some())
     }
@@ -136,11 +136,11 @@ impl InputField {
 }
 
 impl InputEncoder {
-    /// One page per message and combination of selector codes.
+    /// Creates an encoder with one page per message and combination of selector codes.
     pub fn new(map: &InputMap) -> Self {
         let same_message = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id);
         let pages = map.bindings().chunk_by(same_message).flat_map(|message| {
-            // Signals that are always present are on the pages of the others, if any.
+            // Signals that are always present are on the pages of the multiplexed signals, if there are any.
             let paged = message.iter().any(|binding| !binding.mux.is_empty());
             let of_a_page = message.iter().filter(|binding| !paged || !binding.mux.is_empty());
             let mut templates: Vec<_> = of_a_page.map(template).collect();
@@ -151,14 +151,14 @@ impl InputEncoder {
         Self { pages: pages.collect(), answers: Vec::new(), places: RefCell::default() }.numbered()
     }
 
-    /// The same with diagnostic answers, made after the frames.
+    /// Adds diagnostic responses, which are encoded after the frames.
     #[must_use]
     pub fn with_answers(self, answers: &[Answer]) -> Self {
         Self { answers: answers.iter().map(AnswerPage::new).collect(), ..self }.numbered()
     }
 
-    /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value now". Returns how many
-    /// values no frame could carry.
+    /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value". Returns the number of values
+    /// that no frame could carry.
     pub fn encode(&self, values: &[(Channel, Option<f64>)], out: &mut Vec<(BusIndex, Frame)>) -> usize {
         let mut places = self.places.borrow_mut();
         if !places.are_of(values) {
@@ -188,7 +188,7 @@ impl InputEncoder {
         channels.iter().zip(values).filter(|(of, (_, value))| is_open(of) && is_known(*value)).count()
     }
 
-    /// Numbers the fields.
+    /// Assigns a number to each field.
     fn numbered(mut self) -> Self {
         let of_pages = self.pages.iter_mut().flat_map(|page| &mut page.fields);
         let of_answers = self.answers.iter_mut().flat_map(|answer| &mut answer.fields).map(|(_, field)| field);
@@ -197,7 +197,7 @@ impl InputEncoder {
         self
     }
 
-    /// Finds where the values of the fields are in rows of these channels.
+    /// Finds the positions of the fields' values in rows with these channels.
     fn find_places(&self, values: &[(Channel, Option<f64>)]) -> RowPlaces {
         let last: BTreeMap<Channel, usize> = values.iter().enumerate().map(|(place, value)| (value.0, place)).collect();
         let of_pages = self.pages.iter().flat_map(|page| &page.fields);
@@ -215,9 +215,9 @@ impl InputEncoder {
 }
 
 impl RowPlaces {
-    /// Whether they are those of a row of the same channels.
+    /// Whether the positions were found for a row with the same channels.
     fn are_of(&self, values: &[(Channel, Option<f64>)]) -> bool {
-        // An encoder that has seen no row has no places yet.
+        // An encoder that has not encoded a row has no positions yet.
         let is_found = !self.of_fields.is_empty() && self.channels.len() == values.len();
         is_found && self.channels.iter().zip(values).all(|(of, (channel, _))| of.channel == *channel)
     }
@@ -233,7 +233,7 @@ impl AnswerPage {
         Self { question: answer.question, template, fields: answer.signals.iter().map(field).collect() }
     }
 
-    /// The answer with these values; `None` when none of them is in it, or one that is missing has no code.
+    /// The response with these values; `None` = it carries none of them, or a missing one has no code.
     fn message(&self, row: PlacedRow<'_>) -> Option<Vec<u8>> {
         if !self.fields.iter().any(|(_, field)| field.is_sent(row)) {
             return None;
@@ -246,7 +246,7 @@ impl AnswerPage {
         Some(message)
     }
 
-    /// Appends the request, the answer, and the flow control behind its first frame.
+    /// Appends the request, the response, and the flow control after its first frame.
     fn exchange(&self, message: &[u8], out: &mut Vec<(BusIndex, Frame)>) {
         let Controller { bus, request, request_extension, response, response_extension } = self.question.controller;
         let of_tester = |payload: &[u8]| Frame::classic(request, payload).map(|frame| (bus, frame));
@@ -255,15 +255,15 @@ impl AnswerPage {
         for (index, payload) in frames.iter().enumerate() {
             out.extend(Frame::classic(response, payload).map(|frame| (bus, frame)));
             if index == 0 && frames.len() > 1 {
-                let go_on: Vec<u8> = request_extension.into_iter().chain(FLOW_CONTROL).collect();
-                out.extend(of_tester(&go_on));
+                let flow_control: Vec<u8> = request_extension.into_iter().chain(FLOW_CONTROL).collect();
+                out.extend(of_tester(&flow_control));
             }
         }
     }
 }
 
 impl InputPage {
-    /// The page of `template` with every signal that is present with its selectors.
+    /// The page with the selectors of `template`, and every signal present with these selectors.
     fn new(message: &[Binding], template: [u8; MAX_DATA]) -> Self {
         let (bus, id) = (message[0].bus, message[0].id);
         let present: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
@@ -288,12 +288,12 @@ impl InputPage {
     }
 }
 
-/// A payload with the selectors of the binding's page written, each as the first code of its first range.
+/// A payload with the selectors of the binding's page, each with the first code of its first range.
 fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {
         let code = test.ranges.first().map_or(0, |range| range.0);
-        // A code beyond the selector's bits leaves 0: no frame of that page can exist.
+        // If the code does not fit the selector, the selector stays 0, because no frame of that page can exist.
         let _ = test.plan.encode_raw(&mut payload, code);
     }
     payload

@@ -1,13 +1,14 @@
-//! The layout of the sent frames, of the command frame and its reply: one [`Database`] for encoder and consumers.
+//! The layout of the sent frames, the command frame and its reply: one [`Database`] for the encoder and for consumers.
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
-//! messages with identifiers, frame formats, cycle times, end-to-end protection and authentication as set, the signals of
-//! header and trailer included. The encoder is made from it and `packwatch dbc` writes it, so that the two always agree.
+//! messages with identifiers, frame formats, cycle times, end-to-end protection and authentication as configured,
+//! including the signals of header and trailer. The encoder is built from this database and `packwatch dbc` writes it,
+//! so they always agree.
 //!
-//! The built-in base is fitted: steps of Ah signals grow with the cell, and profile 5, whose header is a byte longer
-//! than the free space, moves the signals up by that byte. An authenticated message grows by its trailer; a command gives up
-//! the bytes of the header instead. The user's own DBC is not moved: its signals must leave header and trailer free. All
-//! settings that do not fit are reported together.
+//! The built-in base is adapted. The steps of Ah signals grow with the cell. The header of profile 5 is one byte longer
+//! than the reserved space, so all signals move up by a byte. An authenticated message grows by its trailer; an
+//! authenticated command omits the header's bytes. The user's own DBC is not adapted: its signals must leave header and
+//! trailer free. All settings that do not fit are reported together.
 
 use std::sync::OnceLock;
 
@@ -18,40 +19,40 @@ use crate::can::secoc::{self, Authentication};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-/// Names of the signals that protection and authentication write; no value of the daemon has one of these.
+/// Names of the signals that protection and authentication write. No value of the daemon has one of these names.
 pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
-/// Length of a built-in message whose signals were moved for profile 5: the next FD length above 8.
+/// Length of a built-in message whose signals were moved for profile 5, bytes: the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
-/// Frames of a changed alarm after its first one: of four frames at least one arrives, but for one change in 10,000 where a
-/// tenth of all frames is lost.
+/// Number of repetitions of a changed alarm after its first frame. If a tenth of all frames is lost, all four frames of
+/// a change are lost only once in 10,000 changes.
 pub const CHANGE_REPETITIONS: u32 = 3;
-/// Time between them, ms: longer than most bursts of errors on a bus.
+/// Time between these repetitions, ms: longer than most error bursts on a bus.
 pub const CHANGE_REPETITION_MS: u32 = 100;
-/// Mean time between two alarm frames, at least, ms: 100 frames in a second are 2.7 % of a bus of 500 kbit/s.
+/// Smallest mean time between two alarm frames, ms: 100 frames a second use 2.7 % of a bus of 500 kbit/s.
 pub const ALARM_DELAY_MS: u32 = 10;
-/// Mean time between two replies, at least, ms.
+/// Smallest mean time between two replies, ms.
 pub const REPLY_DELAY_MS: u32 = 100;
 
-/// Period of the announcements of freshness, ms. With it a command is good for two seconds at most.
+/// Period of the freshness announcements, ms. With it, a command is valid for at most two seconds.
 pub const FRESHNESS_PERIOD_MS: u32 = 1000;
 
-/// Cycle time of a sent message without one in the settings or the base, ms.
+/// Cycle time of a sent message if neither the settings nor the base give one, ms.
 pub const DEFAULT_PERIOD_MS: u32 = 1000;
 
-/// The DBC that ships with the program.
+/// The DBC shipped with the program.
 ///
 /// # Errors
-/// Never for the file as shipped (a test reads it).
+/// Never for the shipped file, which a test parses.
 pub fn default_database() -> Result<Database, DbcError> {
     Database::parse(include_str!("../../../../config/packwatch.dbc"))
 }
 
-/// The same, parsed once: its grammar takes longer than all the rest of reading a configuration.
+/// The shipped DBC, parsed once: parsing takes longer than the rest of loading a configuration.
 fn shipped() -> &'static Database {
     static SHIPPED: OnceLock<Database> = OnceLock::new();
-    // Cannot fail: a test reads the shipped file.
+    // Cannot fail: a test parses the shipped file.
     SHIPPED.get_or_init(|| default_database().unwrap_or_default())
 }
 
@@ -75,7 +76,7 @@ pub enum LayoutMessage {
 }
 
 impl LayoutMessage {
-    /// All of them, in the order of the layout.
+    /// All messages, in the order of the layout.
     pub const ALL: [Self; 7] =
         [Self::Status, Self::Health, Self::Alarm, Self::Command, Self::Digest, Self::Reply, Self::Freshness];
 
@@ -92,7 +93,7 @@ impl LayoutMessage {
         }
     }
 
-    /// Name of its table in a configuration (`output.status`), and in texts.
+    /// Name of its table in the configuration (`output.status`) and in messages.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Status => "status",
@@ -105,7 +106,7 @@ impl LayoutMessage {
         }
     }
 
-    /// How it is repeated after an event.
+    /// Repetition after an event.
     const fn repetition(self) -> Repetition {
         match self {
             Self::Alarm => Repetition {
@@ -120,7 +121,7 @@ impl LayoutMessage {
         }
     }
 
-    /// Whether it is sent periodically.
+    /// Whether the message is sent periodically.
     const fn is_cyclic(self) -> bool {
         matches!(self, Self::Status | Self::Health | Self::Alarm | Self::Digest | Self::Freshness)
     }
@@ -129,16 +130,16 @@ impl LayoutMessage {
 /// End-to-end protection of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum E2eSetting {
-    /// As in the base; the built-in one has none.
+    /// As in the base; the built-in base has no protection.
     #[default]
     AsBase,
-    /// None.
+    /// No protection.
     Off,
-    /// This one.
+    /// This protection.
     On(Protection),
 }
 
-/// Settings of a message; `None` = as in the base.
+/// Settings of one message; `None` = as in the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MessageSettings {
     /// Identifier.
@@ -151,16 +152,16 @@ pub struct MessageSettings {
     pub period_ms: Option<u32>,
     /// Protection.
     pub e2e: E2eSetting,
-    /// Authentication; `None` = none.
+    /// Authentication; `None` = not authenticated.
     pub secoc: Option<Authentication>,
 }
 
 /// Base of a layout.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LayoutBase<'d> {
-    /// The shipped DBC, fitted to a cell of this rated capacity, Ah.
+    /// The shipped DBC, adapted to a cell of this rated capacity, Ah.
     BuiltIn {
-        /// Ah.
+        /// Rated capacity, Ah.
         rated_capacity_ah: f64,
     },
     /// Another DBC, unchanged.
@@ -180,9 +181,9 @@ pub struct LayoutSettings {
     pub command: Option<MessageSettings>,
     /// Digest of all alarms.
     pub digest: MessageSettings,
-    /// Reply to a command frame; sent only where commands are accepted.
+    /// Reply to a command frame; sent only if commands are accepted.
     pub reply: MessageSettings,
-    /// Announcement of freshness; sent only where commands are authenticated.
+    /// Announcement of freshness; sent only if commands are authenticated.
     pub freshness: MessageSettings,
 }
 
@@ -200,7 +201,7 @@ impl LayoutSettings {
     }
 }
 
-/// A setting that does not fit the message.
+/// A setting that does not fit its message.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {what}", .message.message())]
 pub struct SettingFault {
@@ -208,11 +209,11 @@ pub struct SettingFault {
     pub message: LayoutMessage,
     /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`, `secoc`.
     pub key: &'static str,
-    /// The fault: found and allowed.
+    /// The fault: what was found and what is allowed.
     pub what: String,
 }
 
-/// Makes the layout. A message that the base does not have is left out: the plans report what is missing.
+/// Creates the layout. Omits messages that the base does not have; the plans report what is missing.
 ///
 /// # Errors
 /// All settings that do not fit.
@@ -247,7 +248,7 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
     Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages })
 }
 
-/// Applies the settings to a message; `movable` = its signals may be moved.
+/// Applies the settings to a message. If `movable`, its signals may be moved.
 fn apply(
     message: &mut Message,
     settings: &MessageSettings,
@@ -303,7 +304,7 @@ fn apply(
 
 fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
     let (was_fd, was_brs) = match message.format {
-        // A DBC without a format attribute implies FD by a length that classic frames do not have.
+        // A DBC without a format attribute implies FD if the message is longer than a classic frame.
         FrameFormat::Classic => (message.len_bytes > 8, false),
         FrameFormat::Fd { brs } => (true, brs),
     };
@@ -313,7 +314,7 @@ fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
     }
 }
 
-/// Makes room for the third byte of profile 5's header: all signals one byte up.
+/// Makes room for the third byte of profile 5's header by moving all signals up by one byte.
 fn move_up(message: &mut Message) {
     for signal in &mut message.signals {
         signal.layout.start_bit += 8;
@@ -321,15 +322,15 @@ fn move_up(message: &mut Message) {
     message.len_bytes = MOVED_LEN_BYTES;
 }
 
-/// Moves the signals of a command to its beginning: an authenticated command has no header.
+/// Moves the signals of a command to the start of the message, because an authenticated command has no header.
 fn move_down(message: &mut Message) {
     for signal in &mut message.signals {
         // The header of end-to-end protection has two bytes.
         signal.layout.start_bit = signal.layout.start_bit.saturating_sub(16);
     }
-    // Without that header and the bytes that only it covers.
+    // Length without that header and without the padding up to 8 bytes.
     message.len_bytes = 4;
-    message.comment = Some("What packwatch takes from another ECU, authenticated: see PACKWATCH_Freshness.".to_owned());
+    message.comment = Some("Authenticated command from another ECU: see PACKWATCH_Freshness.".to_owned());
 }
 
 /// Replaces the signals of header and trailer.
@@ -337,7 +338,7 @@ fn set_header(message: &mut Message) {
     let mut header = message.e2e.map(header_signals).unwrap_or_default();
     header.extend(message.secoc.into_iter().flat_map(|secoc| trailer_signals(message.len_bytes, secoc)));
     let is_kept = |signal: &Signal| !HEADER_SIGNALS.contains(&signal.name.as_str());
-    // Conditions name multiplexors by their index, which changes.
+    // Conditions refer to multiplexors by index, and the indices change.
     let mut next = header.len();
     let places = message.signals.iter().map(|signal| {
         let place = is_kept(signal).then_some(next);
@@ -354,11 +355,11 @@ fn set_header(message: &mut Message) {
     }));
 }
 
-/// The header as signals, so that a consumer can check it with the DBC alone.
+/// Signals of the header, so that a consumer can check it with the DBC alone.
 fn header_signals(protection: Protection) -> Vec<Signal> {
     let Protection { profile, data_id } = protection;
     let crc = format!("CRC of end-to-end profile {}, data id {data_id}.", profile.name());
-    let counter = format!("Rises by one with every frame, 0 to {}, then again from 0.", profile.max_counter());
+    let counter = format!("Increases by one with every frame, from 0 to {}, then from 0 again.", profile.max_counter());
     match profile {
         Profile::P01A => vec![header_signal("E2eCrc", 0, 8, &crc), header_signal("E2eCounter", 8, 4, &counter)],
         Profile::P01C => vec![
@@ -370,13 +371,14 @@ fn header_signals(protection: Protection) -> Vec<Signal> {
     }
 }
 
-/// Freshness and authenticator at the end of a message of this length.
+/// Signals of freshness and authenticator at the end of a message of this length.
 fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal> {
     let Authentication { profile, data_id } = authentication;
     let length = |bits: u32| u16::try_from(bits).unwrap_or(0);
     let (freshness, mac) = (length(profile.freshness_bits()), length(profile.mac_bits()));
     let first = 8 * len_bytes.saturating_sub(length(u32::from(freshness + mac) / 8));
-    // The DBC's place of a big-endian signal is that of its most significant bit; bits of a byte count from the least.
+    // In a DBC, the start bit of a big-endian signal is its most significant bit; bits of a byte count from the least
+    // significant.
     let place = |bit: u16| bit / 8 * 8 + 7 - bit % 8;
     let signal = |name, bit, length_bits, comment: &str| {
         let mut signal = header_signal(name, place(bit), length_bits, comment);
@@ -403,7 +405,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
             factor: 1.0,
             offset: 0.0,
             minimum: 0.0,
-            // A number that a float holds exactly; 0 = not stated.
+            // Only stated if a float represents it exactly; 0 = not stated.
             maximum: if length_bits < 53 { ((1_u64 << length_bits) - 1) as f64 } else { 0.0 },
         },
         unit: String::new(),
@@ -415,7 +417,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
     }
 }
 
-/// The header must fit into the message, and no other signal may lie in it.
+/// Checks that the header fits into the message and that no other signal overlaps it.
 fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMut(&'static str, String)) {
     let Protection { profile, data_id } = protection;
     let (name, len, word) = (&message.name, usize::from(message.len_bytes), profile.name());
@@ -428,7 +430,7 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
     } else if !is_frame_length(len) {
         fault(
             "e2e",
-            format!("message {name} has {len} bytes, must have a length that frames have: padding is not protected"),
+            format!("message {name} has {len} bytes, must have a valid CAN FD length: padding is not protected"),
         );
     }
     let in_header = |signal: &&Signal| {
@@ -445,13 +447,13 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
     }
 }
 
-/// The trailer must fit into the message, and no other signal may lie in it.
+/// Checks that the trailer fits into the message and that no other signal overlaps it.
 fn check_trailer(message: &Message, authentication: Authentication, fault: &mut impl FnMut(&'static str, String)) {
     let (name, len, trailer) = (&message.name, usize::from(message.len_bytes), authentication.profile.trailer_bytes());
     let word = authentication.profile.name();
     if len < trailer || !is_frame_length(len) {
         let what = format!(
-            "message {name} has {len} bytes, must have a frame's length of {trailer} or more for profile {word}"
+            "message {name} has {len} bytes, must have a valid frame length of at least {trailer} for profile {word}"
         );
         return fault("secoc", what);
     }
@@ -465,8 +467,8 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
     }
 }
 
-/// Steps of signals in Ah: the smallest of 1, 2, 5, 10, ... times the built-in one with which the largest value the
-/// cell may have fits: twice the rated capacity, half of it for a standard deviation.
+/// Adapts the steps of Ah signals: multiplies the built-in step by the smallest of 1, 2, 5, 10, ... for which the
+/// largest possible value fits. That value is twice the rated capacity, or half of it for a standard deviation.
 fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
     for is_std in [false, true] {
@@ -480,22 +482,22 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     }
 }
 
-/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; the largest where none is.
+/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; at most the largest step.
 fn times(needed: f64) -> f64 {
-    /// No cell needs more: a million times 40 Ah.
+    /// Larger than any cell needs: a million times 40 Ah.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);
     ladder.find(|step| *step >= needed).unwrap_or(LARGEST)
 }
 
-/// Without the digits that arithmetic adds to a decimal number.
+/// Rounds away the digits that floating-point arithmetic adds to a decimal number.
 fn decimal(value: f64) -> f64 {
     format!("{value:.6}").parse().unwrap_or(value)
 }
 
 impl FrameFormat {
-    /// Kind of the sent frame.
+    /// Kind of the frame to send.
     pub const fn kind(self) -> FrameKind {
         match self {
             Self::Classic => FrameKind::Classic,

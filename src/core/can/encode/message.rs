@@ -1,4 +1,4 @@
-//! A message of a layout, ready for encoding: signals, codes for "not available", pages, protection.
+//! A message of a layout, prepared for encoding: signals, "not available" codes, pages, protection.
 //!
 //! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
 
@@ -10,13 +10,13 @@ use crate::can::secoc::Authentication;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
-/// All faults of a DBC for a plan, one line each.
+/// All faults of a DBC, one per line.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", .0.join("\n"))]
 pub struct PlanFaults(pub Vec<String>);
 
-/// The alarm rules in the order of their numbers, which start at 1: each has its `Value_...` and `Threshold_...`, for
-/// their units differ.
+/// The alarm rules in the order of their numbers, which start at 1. Each has its own `Value_...` and `Threshold_...`
+/// signal, because their units differ.
 pub(super) const RULES: [&str; 17] = [
     "CapacityLow",
     "UsableCapacityLow",
@@ -52,19 +52,19 @@ pub(super) struct OutputMessage {
 #[derive(Debug, Clone, PartialEq)]
 struct OutputField {
     name: String,
-    /// Place of the name in the list of [`OutputMessage::with_places`].
+    /// Index of the name in the list passed to [`OutputMessage::with_places`].
     place: Option<usize>,
     plan: SignalPlan,
     not_available: u64,
-    /// 100 where the DBC's unit is % or %/d.
+    /// Factor from the internal unit: 100 if the DBC's unit is % or %/d, else 1.
     per_inside_unit: f64,
-    /// Codes of the message's multiplexor with which the signal is present; empty = always.
+    /// Selector codes for which the signal is present; empty = always.
     pages: Vec<(u64, u64)>,
     is_multiplexor: bool,
 }
 
 impl OutputMessage {
-    /// The message of that name, with all `required` signals.
+    /// Prepares the message with the given name, which must have all `required` signals.
     pub(super) fn new(database: &Database, name: &str, required: &[&str], faults: &mut Vec<String>) -> Option<Self> {
         let Some(message) = database.message(name) else {
             faults.push(format!("message {name} is missing"));
@@ -93,7 +93,7 @@ impl OutputMessage {
         })
     }
 
-    /// Every rule must have its value and its threshold, on its own page and on no other rule's.
+    /// Checks that every rule has its value and its threshold, on its own page only.
     pub(super) fn check_rules(&self, rules: &[&str], faults: &mut Vec<String>) {
         if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
             faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
@@ -107,19 +107,19 @@ impl OutputMessage {
                 let found: Vec<_> = (1..).take(rules.len()).filter(|page| field.is_on(*page)).collect();
                 if found != [number] {
                     faults.push(format!(
-                        "signal PACKWATCH_Alarm.{name} is there for the rules {found:?}, must be for {number} alone"
+                        "signal PACKWATCH_Alarm.{name} is present for rules {found:?}, must be present for rule {number} only"
                     ));
                 }
             }
         }
     }
 
-    /// Factor from the program's unit to that of a signal; 1 for one that is not there.
+    /// Factor from the program's unit to the unit of a signal; 1 if the signal is missing.
     pub(super) fn per_inside_unit(&self, name: &str) -> f64 {
         self.fields.iter().find(|field| field.name == name).map_or(1.0, |field| field.per_inside_unit)
     }
 
-    /// First selector code of every page; a message without pages has the one page 0.
+    /// First selector code of every page; a message without pages has only page 0.
     pub(super) fn page_codes(&self) -> Vec<u64> {
         let mut codes: Vec<_> = self.fields.iter().filter_map(|field| Some(field.pages.first()?.0)).collect();
         codes.sort_unstable();
@@ -127,12 +127,12 @@ impl OutputMessage {
         if codes.is_empty() { vec![0] } else { codes }
     }
 
-    /// Bytes before the trailer of an authenticated message.
+    /// Number of bytes before the trailer of an authenticated message.
     fn data_len(&self) -> usize {
         self.len.saturating_sub(self.secoc.map_or(0, |secoc| secoc.profile.trailer_bytes()))
     }
 
-    /// Notes the place of each signal's name in a list, so that no frame has to look for it.
+    /// Stores the index of each signal's name in a list, so that encoding does not search for it.
     pub(super) fn with_places(mut self, names: &[&str]) -> Self {
         for field in &mut self.fields {
             field.place = names.iter().position(|name| *name == field.name);
@@ -140,8 +140,9 @@ impl OutputMessage {
         self
     }
 
-    /// A frame of the page with `value` of each signal, of which the name and its [place](Self::with_places) are given. `counter` is
-    /// the protection's next; it is advanced. The trailer of an authenticated message is 0: it is written when the freshness is known.
+    /// Encodes a page. `value` returns the value of a signal, given its name and its [index](Self::with_places).
+    /// `counter` is the protection's next counter and is advanced. The trailer of an authenticated message stays 0; it
+    /// is written once the freshness is known.
     pub(super) fn frame(
         &self,
         page: u64,
@@ -155,13 +156,13 @@ impl OutputMessage {
             } else {
                 field.code(value(&field.name, field.place))
             };
-            // Cannot fail: the message was checked against the message's length, and the code fits the signal.
+            // Cannot fail: the signal was checked against the message's length, and the code fits the signal.
             let _ = field.plan.encode_raw(&mut payload, code);
         }
         if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.data_len())) {
-            // A counter restored from another profile may be beyond this one's last.
+            // A counter restored from another profile may exceed this profile's largest.
             let now = (*counter).min(protection.profile.max_counter());
-            // Cannot fail: length and data id were checked when the plan was made.
+            // Cannot fail: length and data id were checked when the plan was created.
             let _ = protection.protect(payload, now);
             *counter = protection.profile.next_counter(now);
         }
@@ -169,12 +170,12 @@ impl OutputMessage {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
             FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, false, self.len, &payload),
         };
-        // Always a frame: lengths were checked when the plan was made.
+        // Always a frame: lengths were checked when the plan was created.
         frame.unwrap_or(Frame::empty(self.id))
     }
 }
 
-/// The message must fit into its frames, and its protection into the message.
+/// Checks that the message fits into its frames, and its protection into the message.
 fn check_length(message: &Message, faults: &mut Vec<String>) {
     let (name, len) = (&message.name, usize::from(message.len_bytes));
     if len > MAX_DATA {
@@ -187,13 +188,14 @@ fn check_length(message: &Message, faults: &mut Vec<String>) {
     if !(least..=most).contains(&len) || !is_frame_length(len) || data_id > profile.max_data_id() {
         let (word, largest) = (profile.name(), profile.max_data_id());
         faults.push(format!(
-            "message {name}: {len} bytes and data id {data_id}, must be a frame's length of {least} to {most} and at most \
-             {largest} with protection {word}"
+            "message {name}: {len} bytes and data id {data_id}, must be a valid frame length of {least} to {most} and at \
+             most {largest} with protection {word}"
         ));
     }
 }
 
-/// The multiplexor must have a code for every page, or a page would be sent with another one's number.
+/// Checks that the multiplexor has a code for every page. Otherwise, a page would be sent with the number of another
+/// one.
 fn check_pages(message: &str, fields: &[OutputField], faults: &mut Vec<String>) {
     for selector in fields.iter().filter(|field| field.is_multiplexor) {
         let highest = selector.plan.all_ones();
@@ -209,12 +211,12 @@ impl OutputField {
     fn new(message: &Message, signal: &Signal) -> Result<Self, String> {
         let plan = signal.layout.plan().map_err(|fault| fault.to_string())?;
         if plan.bytes_needed() > usize::from(message.len_bytes) {
-            return Err(format!("reaches past the message's {} bytes", message.len_bytes));
+            return Err(format!("extends beyond the message's {} bytes", message.len_bytes));
         }
         let pages = match signal.conditions.as_slice() {
             [] => Vec::new(),
             [condition] => condition.ranges.clone(),
-            _ => return Err("nested multiplexing, must be one multiplexor".to_owned()),
+            _ => return Err("nested multiplexing, must have a single multiplexor".to_owned()),
         };
         let customary = match plan.value_type() {
             ValueType::Unsigned => plan.all_ones(),
@@ -241,13 +243,13 @@ impl OutputField {
         let code = value.and_then(|value| self.plan.code(value * self.per_inside_unit));
         match code {
             None => self.not_available,
-            // One bit has no code to spare.
+            // A signal of one bit has no spare code.
             Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.neighbour(code),
             Some(code) => code,
         }
     }
 
-    /// The code next to one that is taken: below, or above where there is none below.
+    /// The code next to the "not available" code: below it, or above it if there is none below.
     fn neighbour(&self, taken: u64) -> u64 {
         let lowest = match self.plan.value_type() {
             ValueType::Signed => 1 << (self.plan.length_bits() - 1),

@@ -1,12 +1,12 @@
-//! The frames the daemon sends, as a layout gives them.
+//! The frames that the daemon sends, encoded with a layout.
 //!
-//! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is sent
-//! as the code the DBC's value table calls "not available", else as all ones (unsigned), the lowest code (signed) or
-//! NaN (float). A known value never has that code: it saturates before it. End-to-end headers are written with the counters
-//! that the caller keeps ([`SendCounters`]).
+//! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is
+//! sent as the code that the DBC's value table calls "not available", else as all ones (unsigned), the lowest code
+//! (signed) or NaN (float). A known value never has that code: it saturates before it. End-to-end headers use the
+//! counters that the caller keeps ([`SendCounters`]).
 //!
-//! A DBC with missing signals, or in which a value could be read as another rule's or page's, is rejected with all its
-//! faults.
+//! A DBC is rejected with all its faults if signals are missing, or if a value could be mistaken for that of another
+//! rule or page.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,7 +20,7 @@ use crate::can::secoc::{Authentication, Profile};
 use crate::can::{CanId, Frame};
 use crate::quantity::{CellIndex, Mode};
 
-/// Signals of a message with their values.
+/// Signals of a message with the functions that return their values.
 type SignalTable<T, const N: usize> = [(&'static str, fn(&T) -> Option<f64>); N];
 
 /// Signals of the status frame.
@@ -35,7 +35,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
     ("UnknownRules", |f| f.unknown_rules.map(f64::from)),
 ];
 
-/// Signals of the health frame, whatever its pages; the first [`HEALTH_REQUIRED`] are required.
+/// Signals of the health frame, on any page; the first [`HEALTH_REQUIRED`] are required.
 const HEALTH: SignalTable<HealthFields, 18> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
@@ -70,15 +70,15 @@ pub struct StatusFields {
     pub soc_std: Option<f64>,
     /// Operating mode of the pack.
     pub mode: Option<Mode>,
-    /// Code of the wire: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
+    /// Wire code: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
     pub validity: u8,
-    /// Code of the wire: 0 none, 1 info, 2 warning, 3 severe.
+    /// Wire code: 0 none, 1 info, 2 warning, 3 severe.
     pub highest_severity: Option<u8>,
     /// Number of active alarms.
     pub active_alarms: Option<u16>,
     /// The cell that limits discharge.
     pub limiting_cell: Option<CellIndex>,
-    /// Code of the wire: rules that cannot be judged: 0 none, 1 some, 2 all.
+    /// Wire code of the rules that are unknown: 0 none, 1 some, 2 all.
     pub unknown_rules: Option<u8>,
 }
 
@@ -99,21 +99,23 @@ pub struct HealthFields {
     pub usable_capacity_ah: Option<f64>,
     /// Ah.
     pub usable_capacity_std_ah: Option<f64>,
-    /// Relative to new, 1 = as new.
+    /// Resistance relative to new (1 = as new).
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. As all that follows, sent only if the DBC has its signal.
+    /// Equivalent full cycles until the end of life, median. This and all following values are sent only if the DBC has
+    /// their signal.
     pub remaining_cycles: Option<f64>,
     /// Its 5 % quantile.
     pub remaining_cycles_low: Option<f64>,
     /// Days, median.
     pub remaining_days: Option<f64>,
-    /// Loss of lithium inventory of the cell with the least capacity and its standard deviation, fractions of new.
+    /// Loss of lithium inventory of the cell with the least capacity, and its standard deviation, fractions of a new
+    /// cell's.
     pub lli: [Option<f64>; 2],
-    /// Loss of active material of its negative electrode, likewise.
+    /// Loss of active material of the same cell's negative electrode, and its standard deviation.
     pub lam_ne: [Option<f64>; 2],
-    /// Of its positive electrode.
+    /// Loss of active material of the same cell's positive electrode, and its standard deviation.
     pub lam_pe: [Option<f64>; 2],
-    /// How well the cells' model is known, by its code of the wire.
+    /// Wire code of how well the cells' model is known.
     pub model_state: Option<u8>,
 }
 
@@ -122,16 +124,16 @@ pub struct HealthFields {
 pub struct AlarmFields {
     /// Number of the rule.
     pub rule: u8,
-    /// Code of the wire: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, its input is not
-    /// valid now), 6 unknown (cannot be judged); `None` = not available.
+    /// Wire code: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, but its input is
+    /// invalid), 6 unknown; `None` = not available.
     pub state: Option<u8>,
-    /// Code of the wire: 1 info, 2 warning, 3 severe; `None` = unknown.
+    /// Wire code: 1 info, 2 warning, 3 severe; `None` = unknown.
     pub severity: Option<u8>,
     /// Whether it is a test, not a real alarm.
     pub test: bool,
     /// Whether it is acknowledged.
     pub acknowledged: bool,
-    /// `None` = the pack as a whole.
+    /// The cell; `None` = the whole pack.
     pub cell: Option<CellIndex>,
     /// In the rule's internal unit.
     pub value: Option<f64>,
@@ -139,8 +141,8 @@ pub struct AlarmFields {
     pub threshold: Option<f64>,
 }
 
-/// The next counter of each message's end-to-end protection, to be kept over a restart: for a receiver, a counter that
-/// jumps back marks an old frame.
+/// The next counter of each message's end-to-end protection. They must survive a restart: to a receiver, a counter that
+/// jumps back indicates an old frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {
@@ -151,25 +153,25 @@ pub struct SendCounters {
     reply: u8,
 }
 
-/// The daemon's frames, ready for encoding.
+/// The daemon's frames, prepared for encoding.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputPlan {
     status: OutputMessage,
     health: OutputMessage,
     alarm: OutputMessage,
-    /// Selector codes of the health frame, ascending.
+    /// Selector codes of the health frame, in ascending order.
     pages: Vec<u64>,
-    /// `None` = the layout has none.
+    /// `None` = the layout has no digest.
     digest: Option<DigestPlan>,
     reply: Option<OutputMessage>,
     /// The announcement of the freshness of commands.
     freshness: Option<OutputMessage>,
 }
 
-/// What a layout says of one sent message.
+/// Properties of one sent message in a layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SentMessage {
-    /// Which message.
+    /// The message.
     pub message: LayoutMessage,
     /// Identifier.
     pub id: CanId,
@@ -179,22 +181,22 @@ pub struct SentMessage {
     pub protection: Option<Protection>,
     /// Authentication.
     pub secoc: Option<Authentication>,
-    /// Cycle time, ms; `None` = it is sent on an event only.
+    /// Cycle time, ms; `None` = sent only on an event.
     pub cycle_time_ms: Option<u32>,
 }
 
 impl SentMessage {
-    /// Data id of protection and authentication; `None` = it has neither.
+    /// Data id of protection or authentication; `None` = it has neither.
     pub fn data_id(&self) -> Option<u16> {
         self.protection.map(|protection| protection.data_id).or(self.secoc.map(|secoc| secoc.data_id))
     }
 }
 
 impl OutputPlan {
-    /// Finds every message and signal the daemon sends.
+    /// Finds every message and signal that the daemon sends.
     ///
     /// # Errors
-    /// All that is missing or cannot be written, by name.
+    /// Every message or signal that is missing or cannot be encoded, by name.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
         let mut faults = Vec::new();
         let mut message = |which: LayoutMessage, required: &[&str]| {
@@ -220,7 +222,7 @@ impl OutputPlan {
         }
     }
 
-    /// The sent messages: status, health, alarm, then digest, reply and freshness where the layout has them.
+    /// The sent messages: status, health, alarm, then digest, reply and freshness if the layout has them.
     pub fn messages(&self) -> impl Iterator<Item = SentMessage> + '_ {
         let always = [
             (LayoutMessage::Status, &self.status),
@@ -245,7 +247,7 @@ impl OutputPlan {
         self.messages().map(|message| message.id).collect()
     }
 
-    /// Advances the counter of a message as if so many of its frames were sent.
+    /// Advances the counter of a message as if `frames` of its frames had been sent.
     pub fn skip(&self, message: LayoutMessage, frames: u64, counters: &mut SendCounters) {
         let Some(protection) = self.messages().find(|sent| sent.message == message).and_then(|sent| sent.protection)
         else {
@@ -277,33 +279,33 @@ impl OutputPlan {
         }
     }
 
-    /// Whether replies are sent.
+    /// Whether the layout has replies.
     pub fn has_reply(&self) -> bool {
         self.reply.is_some()
     }
 
-    /// Pages of the digest; 0 = the layout has none.
+    /// Number of pages of the digest; 0 = the layout has no digest.
     pub fn digest_pages(&self) -> usize {
         self.digest.as_ref().map_or(0, DigestPlan::page_count)
     }
 
-    /// Pages the health frame has, at least 1.
+    /// Number of pages of the health frame, at least 1.
     pub fn health_pages(&self) -> usize {
         self.pages.len()
     }
 
-    /// The status frame.
+    /// Encodes the status frame.
     pub fn status(&self, fields: &StatusFields, counters: &mut SendCounters) -> Frame {
         self.status.frame(0, &mut counters.status, |_, place| value_of(&STATUS, fields, place))
     }
 
-    /// One page of the health frame, counted from 0; beyond the last it starts again.
+    /// Encodes a page of the health frame, counted from 0, modulo the number of pages.
     pub fn health(&self, page: usize, fields: &HealthFields, counters: &mut SendCounters) -> Frame {
         let code = self.pages.get(page % self.pages.len().max(1)).copied().unwrap_or(0);
         self.health.frame(code, &mut counters.health, |_, place| value_of(&HEALTH, fields, place))
     }
 
-    /// One alarm. Value and threshold go into the rule's own `Value_...` and `Threshold_...`.
+    /// Encodes one alarm. Value and threshold use the rule's own `Value_...` and `Threshold_...` signals.
     pub fn alarm(&self, fields: &AlarmFields, counters: &mut SendCounters) -> Frame {
         let bit = |set: bool| Some(if set { 1.0 } else { 0.0 });
         self.alarm.frame(u64::from(fields.rule), &mut counters.alarm, |name, _| match name {
@@ -320,17 +322,17 @@ impl OutputPlan {
 }
 
 impl OutputPlan {
-    /// One page of the digest, counted from 0; `None` = the layout has no such page.
+    /// Encodes a page of the digest, counted from 0; `None` = the layout has no such page.
     pub fn digest(&self, page: usize, fields: &DigestFields, counters: &mut SendCounters) -> Option<Frame> {
         self.digest.as_ref()?.frame(page, fields, &mut counters.digest)
     }
 
-    /// The announcement of a freshness, still without it; `None` = the layout has none.
+    /// The announcement frame, to which the caller adds the freshness; `None` = the layout has none.
     pub fn freshness(&self) -> Option<Frame> {
         self.freshness.as_ref().map(|message| message.frame(0, &mut 0, |_, _| None))
     }
 
-    /// The reply to a command; `None` = the layout has none.
+    /// Encodes the reply to a command; `None` = the layout has no reply.
     pub fn reply(&self, fields: &ReplyFields, counters: &mut SendCounters) -> Option<Frame> {
         self.reply.as_ref().map(|message| reply_frame(message, fields, &mut counters.reply))
     }
@@ -343,15 +345,15 @@ fn freshness_message(database: &Database, faults: &mut Vec<String>) -> Option<Ou
     OutputMessage::new(database, name, &[], faults)
 }
 
-/// Name of a signal and how its value is taken from the fields of a message.
+/// Name of a signal and the function that returns its value.
 type SignalValue<T> = (&'static str, fn(&T) -> Option<f64>);
 
-/// Value of the signal at a place of the table.
+/// Value of the signal at an index of the table.
 fn value_of<T>(signals: &[SignalValue<T>], fields: &T, place: Option<usize>) -> Option<f64> {
     signals.get(place?).and_then(|(_, value)| value(fields))
 }
 
-/// Code of the wire.
+/// Wire code of the mode.
 fn mode_code(mode: Mode) -> f64 {
     match mode {
         Mode::Unknown => 0.0,

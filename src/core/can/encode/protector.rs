@@ -1,14 +1,14 @@
-//! Protection of generated input frames (CSV replay, simulator): the sender's half of the end-to-end check.
+//! Protects generated input frames (CSV replay, simulator): the sender's side of the end-to-end check.
 //!
 //! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC.
-//! Every other frame is unchanged, also one too short for the header (its receiver detects the fault).
+//! Other frames are unchanged, and so are frames too short for the header; the receiver detects that fault.
 
 use crate::can::e2e::Protection;
 use crate::can::guard::GuardConfig;
 use crate::can::{CanId, Frame};
 use crate::quantity::BusIndex;
 
-/// The sending half of every protected input message.
+/// The sender's side of every protected input message.
 #[derive(Debug, Clone, Default)]
 pub struct InputProtector {
     senders: Vec<MessageSender>,
@@ -23,7 +23,7 @@ struct MessageSender {
 }
 
 impl InputProtector {
-    /// For the messages that `guards` check; every counter begins at 0.
+    /// Creates the protector for the messages that `guards` check. Every counter starts at 0.
     pub fn new(guards: &[GuardConfig]) -> Self {
         let sender = |guard: &GuardConfig| MessageSender {
             bus: guard.bus,
@@ -60,7 +60,7 @@ mod tests {
     use crate::quantity::Timestamp;
 
     #[test]
-    fn protected_frames_pass_their_own_guard_and_others_stay_as_they_are() {
+    fn protected_frames_pass_guard_and_others_are_unchanged() {
         let protection = Protection { profile: Profile::P01C, data_id: 0x0456 };
         let (bus, id) = (BusIndex(0), CanId::Standard(0x123));
         let guard = GuardConfig { bus, id, check: CheckConfig::new(protection), cycle_time_s: None };

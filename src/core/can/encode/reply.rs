@@ -1,7 +1,8 @@
 //! The reply to a command frame.
 //!
-//! In: the outcome of a command, or why it was not executed, and the counter that the next command must have. Out: values
-//! for the signals of `PACKWATCH_Reply`. The content of a frame with a wrong checksum is not repeated.
+//! In: the outcome of a command, or the reason why it was not executed, and the counter that the next command must
+//! have. Out: values for the signals of `PACKWATCH_Reply`. If the checksum of a frame is wrong, the reply does not
+//! repeat its content.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,31 +17,32 @@ use crate::can::e2e::Status;
 const REQUIRED: [&str; 9] =
     ["Result", "Reason", "Command", "Rule", "Severity", "Cell", "CounterExpected", "Changed", "Refused"];
 
-/// Why a command frame was not executed; the number is the code of `Reason` on the wire.
+/// Reason why a command frame was not executed; the number is the wire code of `Reason`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CommandRefusal {
-    /// The first frame after a start of the receiver: it only shows the counter.
+    /// The first frame after a start of the receiver, which only sets the counter.
     FirstFrame = 1,
-    /// Damaged, too short, or of another message.
+    /// Damaged, too short, or from another message.
     WrongChecksum = 2,
-    /// The counter is that of the last accepted frame.
+    /// The counter equals that of the last accepted frame.
     RepeatedCounter = 3,
-    /// The counter skipped further than allowed.
+    /// The counter jumped further than allowed.
     WrongCounter = 4,
-    /// A code without a meaning.
+    /// An undefined code.
     NoMeaning = 5,
-    /// The authenticator is wrong: forged, or made with another key.
+    /// The authenticator is wrong: forged, or created with another key.
     NotAuthentic = 8,
-    /// The freshness was used before, is older than the announcement before the last, or was not announced yet.
+    /// The freshness was used before, is older than the previous announcement, or was not announced yet.
     OldFreshness = 9,
-    /// Authentic, but many forged frames came: the command is executed when it comes again with another freshness.
+    /// Authentic, but many forged frames were received. The command is executed if it is repeated with another
+    /// freshness.
     RepeatNeeded = 10,
 }
 
 impl CommandRefusal {
-    /// Why a frame with this result of its end-to-end check is not executed; `None` = it may be.
+    /// The reason for which a frame with this end-to-end status is not executed; `None` = it may be executed.
     pub const fn of(status: Status) -> Option<Self> {
         match status {
             Status::Ok | Status::OkSomeLost | Status::Sync => None,
@@ -51,12 +53,12 @@ impl CommandRefusal {
         }
     }
 
-    /// Whether the frame's checksum or authenticator was right.
+    /// Whether the frame's checksum or authenticator was correct.
     pub const fn is_intact(self) -> bool {
         !matches!(self, Self::WrongChecksum | Self::NotAuthentic | Self::OldFreshness)
     }
 
-    /// Words for a log.
+    /// Description for logs.
     pub const fn words(self) -> &'static str {
         match self {
             Self::FirstFrame => "first frame after a start",
@@ -66,7 +68,7 @@ impl CommandRefusal {
             Self::NoMeaning => "no meaning",
             Self::NotAuthentic => "not authentic",
             Self::OldFreshness => "old freshness",
-            Self::RepeatNeeded => "many forged frames came: to be repeated",
+            Self::RepeatNeeded => "repeat needed: many forged frames received",
         }
     }
 }
@@ -74,17 +76,17 @@ impl CommandRefusal {
 /// Contents of the reply.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplyFields {
-    /// Alarms changed and alarms refused by the command, or why it was not executed.
+    /// Numbers of alarms changed and refused by the command, or the reason why it was not executed.
     pub outcome: Result<(u32, u32), CommandRefusal>,
-    /// The command; `None` = it could not be read.
+    /// The command; `None` = it could not be decoded.
     pub command: Option<CommandFields>,
     /// Counter that the next command must have; `None` = any.
     pub counter_expected: Option<u8>,
 }
 
 impl ReplyFields {
-    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (beyond those of [`CommandRefusal`]: 0 none, 6 not healthy, 7 nothing
-    /// to do).
+    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (besides those of [`CommandRefusal`]: 0 none, 6 not
+    /// healthy, 7 nothing to do).
     fn result(&self) -> (u8, u8) {
         let replaces_pack = self.command.is_some_and(|fields| fields.command == Command::PackReplaced);
         match self.outcome {
@@ -118,14 +120,14 @@ impl ReplyFields {
     }
 }
 
-/// The reply's message; `None` = the database has none, or faults are noted.
+/// Prepares the reply message; `None` = the database has none, or faults were added to `faults`.
 pub(super) fn reply_message(database: &Database, faults: &mut Vec<String>) -> Option<OutputMessage> {
     let name = LayoutMessage::Reply.message();
     database.message(name)?;
     OutputMessage::new(database, name, &REQUIRED, faults)
 }
 
-/// The reply.
+/// Encodes the reply.
 pub(super) fn reply_frame(message: &OutputMessage, fields: &ReplyFields, counter: &mut u8) -> Frame {
     message.frame(0, counter, |name, _| fields.value(name))
 }
@@ -154,17 +156,21 @@ mod tests {
     }
 
     #[test]
-    fn an_outcome_has_a_result_a_reason_and_counts() {
+    fn outcome_encodes_result_reason_and_counts() {
         assert_eq!(codes(&fields(Ok((2, 0)), Command::Clear)), [1, 0, 2, 9, 0, 5, 255, 2, 0]);
         assert_eq!(codes(&fields(Ok((2, 3)), Command::Clear)), [1, 6, 2, 9, 0, 5, 255, 2, 3]);
         assert_eq!(codes(&fields(Ok((0, 3)), Command::Clear)), [2, 6, 2, 9, 0, 5, 255, 0, 3]);
         assert_eq!(codes(&fields(Ok((0, 0)), Command::Acknowledge)), [1, 7, 1, 9, 0, 5, 255, 0, 0]);
         assert_eq!(codes(&fields(Ok((0, 0)), Command::PackReplaced))[..2], [1, 0]);
-        assert_eq!(codes(&fields(Ok((4000, 4000)), Command::Clear))[7..], [62, 14], "counts end before not available");
+        assert_eq!(
+            codes(&fields(Ok((4000, 4000)), Command::Clear))[7..],
+            [62, 14],
+            "counts saturate below the code for not available"
+        );
     }
 
     #[test]
-    fn a_frame_that_was_not_executed_has_its_reason_and_no_counts() {
+    fn refused_frame_encodes_reason_without_counts() {
         for (status, reason) in
             [(Status::Initial, 1), (Status::WrongCrc, 2), (Status::Repeated, 3), (Status::WrongSequence, 4)]
         {
@@ -176,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn every_usable_status_is_executed() {
+    fn usable_statuses_are_executed() {
         for status in Status::ALL {
             assert_eq!(CommandRefusal::of(status).is_none(), status.is_usable(), "{status:?}");
         }

@@ -1,4 +1,4 @@
-//! Digest frames read back with the shipped DBC.
+//! Digest frames, decoded with the shipped DBC.
 
 use super::*;
 use crate::can::encode::{OutputPlan, SendCounters, default_database};
@@ -19,7 +19,7 @@ fn frames(fields: &DigestFields) -> Vec<Frame> {
 }
 
 #[test]
-fn every_page_reads_back() {
+fn every_page_decodes_to_its_values() {
     let mut checksum = TableChecksum::default();
     checksum.add(9, 2, None, 1, true);
     let mut rules = [RuleState::NotWatched; RULE_COUNT];
@@ -49,7 +49,7 @@ fn every_page_reads_back() {
 }
 
 #[test]
-fn a_threshold_has_the_unit_of_the_rule_s_own_signal() {
+fn threshold_uses_unit_of_rule_signal() {
     let of = |rule, threshold| {
         let threshold = Some(ThresholdFields { rule, severity: 1, threshold });
         read(&frames(&DigestFields { threshold, ..DigestFields::default() }), "Threshold")
@@ -60,7 +60,7 @@ fn a_threshold_has_the_unit_of_the_rule_s_own_signal() {
 }
 
 #[test]
-fn the_checksum_does_not_depend_on_the_order_and_differs_with_every_part_of_an_entry() {
+fn checksum_ignores_order_and_covers_every_field() {
     let sum = |entries: &[(u8, u8, Option<u16>, u8, bool)]| {
         let mut checksum = TableChecksum::default();
         for &(rule, severity, cell, state, is_acknowledged) in entries {
@@ -81,7 +81,7 @@ fn the_checksum_does_not_depend_on_the_order_and_differs_with_every_part_of_an_e
     ] {
         assert_ne!(sum(&[one]), sum(&[changed]), "{changed:?}");
     }
-    // The example of the manual.
+    // The example in the manual.
     assert_eq!(sum(&[(9, 2, None, 1, false)]), 0x12CD);
     assert_eq!(TableChecksum(u16::MAX).value(), 65534);
 }

@@ -1,4 +1,4 @@
-//! Frames made from values decode to those values.
+//! Frames encoded from values decode to those values.
 
 use super::*;
 use crate::can::FrameKind;
@@ -8,14 +8,14 @@ use proptest::prelude::*;
 
 type Values = Vec<(Channel, Option<f64>)>;
 
-/// The frames, and how many values they leave out.
+/// The frames, and the number of values that they do not carry.
 fn encode(map: &InputMap, values: &[(Channel, Option<f64>)]) -> (Vec<Frame>, usize) {
     let mut frames = Vec::new();
     let lost = InputEncoder::new(map).encode(values, &mut frames);
     (frames.into_iter().map(|(_, frame)| frame).collect(), lost)
 }
 
-/// What the frames made of `values` say.
+/// Decodes the frames that carry `values`.
 fn round_trip(map: &InputMap, values: &[(Channel, Option<f64>)]) -> Vec<(Channel, Result<f64, Fault>)> {
     encode(map, values).0.iter().flat_map(|frame| readings(map, 0, frame)).collect()
 }
@@ -25,7 +25,7 @@ fn near(found: Result<f64, Fault>, wanted: f64, within: f64) -> bool {
 }
 
 #[test]
-fn every_message_and_page_decodes_to_the_values_it_was_made_from() {
+fn messages_and_pages_decode_to_encoded_values() {
     let values: Values = vec![
         (Channel::PackVoltage, Some(355.1)),
         (Channel::Current, Some(-12.3)),
@@ -41,14 +41,14 @@ fn every_message_and_page_decodes_to_the_values_it_was_made_from() {
     let found = round_trip(&map(), &values);
     for (channel, wanted) in &values {
         let readings: Vec<_> = found.iter().filter(|(name, _)| name == channel).collect();
-        // The temperature next to the cells is on both pages.
+        // The temperature beside the cells is on both pages.
         assert_eq!(readings.len(), if *channel == sensor(1) { 2 } else { 1 }, "{channel:?}");
         assert!(readings.iter().all(|(_, value)| near(*value, wanted.unwrap(), 1e-9)), "{channel:?}: {readings:?}");
     }
 }
 
 #[test]
-fn pages_below_pages_of_a_long_frame_come_back_and_no_page_says_zero_for_another_pages_signal() {
+fn nested_pages_decode_without_foreign_signals() {
     let values: Values =
         vec![(sensor(0), Some(20.0)), (sensor(1), Some(21.0)), (cell(0), Some(3.7)), (cell(1), Some(3.75))];
     let (frames, lost) = encode(&nested(), &values);
@@ -66,20 +66,20 @@ fn pages_below_pages_of_a_long_frame_come_back_and_no_page_says_zero_for_another
 }
 
 #[test]
-fn a_missing_value_goes_out_as_not_available() {
+fn missing_value_is_encoded_as_not_available() {
     let values = [(Channel::Current, Some(5.0)), (sensor(0), None), (Channel::PackVoltage, Some(350.0))];
     let found = round_trip(&map(), &values);
     let wanted =
         [(Channel::Current, Ok(5.0)), (sensor(0), Err(Fault::NotAvailable)), (Channel::PackVoltage, Ok(350.0))];
     assert_eq!(found, wanted);
     let unnamed = round_trip(&map(), &[(Channel::Current, Some(5.0)), (Channel::PackVoltage, Some(350.0))]);
-    assert_eq!(unnamed, wanted, "not named is not known either");
+    assert_eq!(unnamed, wanted, "a channel that is absent is unknown, too");
     let nan = round_trip(&map(), &[values[0], (sensor(0), Some(f64::NAN)), values[2]]);
     assert_eq!(nan, wanted);
 }
 
 #[test]
-fn a_missing_value_without_such_a_code_goes_out_as_one_the_reader_refuses() {
+fn missing_value_without_code_is_encoded_as_invalid() {
     let found = round_trip(&map(), &[(sensor(0), Some(25.0))]);
     let refused = Err(Fault::OutOfRange);
     assert_eq!(found, [(Channel::Current, refused), (sensor(0), Ok(25.0)), (Channel::PackVoltage, refused)]);
@@ -91,18 +91,18 @@ fn a_missing_value_without_such_a_code_goes_out_as_one_the_reader_refuses() {
 }
 
 #[test]
-fn a_frame_that_would_have_to_lie_is_left_out_and_its_values_are_counted() {
-    // Every code of the third cell is a voltage: its page cannot be sent without it, the other page can.
+fn frame_without_code_for_missing_is_omitted_and_counted() {
+    // Every code of the third cell is a valid voltage: its page cannot be sent without a value, but the other page can.
     let (frames, lost) = encode(&map(), &[(sensor(1), Some(1.0))]);
     assert_eq!((frames.len(), lost), (1, 0));
     let two = InputMap::new(vec![bind("Cells.Cell3", cell(2)), bind("Cells.Air", sensor(1))]);
     assert_eq!(encode(&two, &[(sensor(1), Some(1.0))]), (vec![], 1));
     assert_eq!(encode(&two, &[(sensor(1), Some(1.0)), (cell(2), Some(3.3))]).1, 0);
-    assert_eq!(encode(&two, &[(Channel::PackVoltage, Some(350.0))]), (vec![], 1), "nothing carries this one");
+    assert_eq!(encode(&two, &[(Channel::PackVoltage, Some(350.0))]), (vec![], 1), "no frame carries this value");
 }
 
 #[test]
-fn nothing_to_say_makes_no_frame_except_for_a_code_that_says_so() {
+fn no_values_give_no_frame_unless_not_available_code() {
     assert_eq!(encode(&map(), &[]), (vec![], 0));
     assert_eq!(encode(&map(), &[(cell(0), None), (Channel::Current, None)]), (vec![], 0));
     let found = round_trip(&map(), &[(sensor(0), None)]);
@@ -110,7 +110,7 @@ fn nothing_to_say_makes_no_frame_except_for_a_code_that_says_so() {
 }
 
 #[test]
-fn a_value_outside_the_range_is_seen_as_such() {
+fn value_outside_range_decodes_as_fault() {
     let all = [(Channel::Current, Some(1.0)), (sensor(0), Some(1.0)), (Channel::PackVoltage, Some(512.0))];
     assert_eq!(round_trip(&map(), &all)[2], (Channel::PackVoltage, Err(Fault::OutOfRange)));
     let far = [(Channel::PackVoltage, Some(f64::INFINITY))];
@@ -119,7 +119,7 @@ fn a_value_outside_the_range_is_seen_as_such() {
 
 proptest! {
     #[test]
-    fn whatever_is_encoded_is_decoded_within_half_a_code_and_nothing_else_is(
+    fn encoded_values_decode_within_half_a_code(
         current in -3000.0..3000.0, air in -300.0..300.0, pack in 0.0..500.0, cells in prop::array::uniform3(0.0..5.0),
         known in prop::array::uniform6(any::<bool>()),
     ) {
@@ -132,7 +132,7 @@ proptest! {
             if known[n] {
                 prop_assert!(near(value, numbers[n], half[n] + 1e-9), "{channel:?} {value:?} for {}", numbers[n]);
             } else {
-                prop_assert!(value.is_err(), "{channel:?} was not known but reads {value:?}");
+                prop_assert!(value.is_err(), "{channel:?} was unknown but decodes to {value:?}");
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Settings land in the layout, or are refused with their key; a layout made again from its own text stays the same.
+//! Settings change the layout, or are rejected with their key; a layout built from its own text does not change.
 
 use super::*;
 use crate::can::encode::{CommandPlan, OutputPlan};
@@ -17,7 +17,7 @@ fn with_status(status: MessageSettings) -> LayoutSettings {
     LayoutSettings { status, ..Default::default() }
 }
 
-/// Key and text of the one fault of an own DBC, which is the shipped one with one text replaced.
+/// Key and text of the only fault of an own DBC, which is the shipped DBC with one text replaced.
 fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, String) {
     assert!(TEXT.contains(from), "{from}");
     let own = Database::parse(&TEXT.replace(from, to)).unwrap();
@@ -27,7 +27,7 @@ fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, St
 }
 
 #[test]
-fn without_settings_the_layout_is_the_shipped_file_but_for_the_command() {
+fn default_layout_is_shipped_file_without_command() {
     let shipped = default_database().unwrap();
     let made = built_in(&LayoutSettings::default()).unwrap();
     let sent = |name: &str| !matches!(name, "PACKWATCH_Command" | "PACKWATCH_Reply" | "PACKWATCH_Freshness");
@@ -38,7 +38,7 @@ fn without_settings_the_layout_is_the_shipped_file_but_for_the_command() {
 }
 
 #[test]
-fn identifiers_formats_and_periods_are_as_set() {
+fn identifiers_formats_and_periods_follow_settings() {
     let fd = MessageSettings { fd: Some(true), brs: Some(true), ..Default::default() };
     let settings = LayoutSettings {
         status: MessageSettings { id: CanId::extended(5), period_ms: Some(20), ..Default::default() },
@@ -56,7 +56,7 @@ fn identifiers_formats_and_periods_are_as_set() {
 }
 
 #[test]
-fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
+fn profile_5_moves_built_in_signals_by_one_byte() {
     let shipped = default_database().unwrap();
     let settings = |data_id| MessageSettings { fd: Some(true), ..on(Profile::P05, data_id) };
     let all = LayoutSettings {
@@ -86,7 +86,7 @@ fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
 }
 
 #[test]
-fn profile_5_in_classic_frames_is_refused_with_what_would_do() {
+fn profile_5_in_classic_frames_is_rejected_with_advice() {
     let faults = built_in(&with_status(on(Profile::P05, 1))).unwrap_err();
     assert_eq!(
         faults[0].to_string(),
@@ -100,7 +100,7 @@ fn profile_5_in_classic_frames_is_refused_with_what_would_do() {
 }
 
 #[test]
-fn the_header_names_its_signals() {
+fn header_signals_are_named() {
     let names = |profile| {
         let made = built_in(&with_status(on(profile, 0x123))).unwrap();
         let status = &made.messages[0];
@@ -115,7 +115,7 @@ fn the_header_names_its_signals() {
 }
 
 #[test]
-fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
+fn layout_rebuilt_from_its_text_is_unchanged() {
     let fd = |settings| MessageSettings { fd: Some(true), ..settings };
     let settings = LayoutSettings {
         status: fd(on(Profile::P05, 1)),
@@ -131,14 +131,14 @@ fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
     assert_eq!(read, made);
     let as_it_is = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
     assert_eq!(layout(LayoutBase::Own(&read), &as_it_is).unwrap(), made);
-    assert_eq!(layout(LayoutBase::Own(&read), &settings).unwrap(), made, "set again");
+    assert_eq!(layout(LayoutBase::Own(&read), &settings).unwrap(), made, "with the same settings again");
     let off = MessageSettings { e2e: E2eSetting::Off, ..Default::default() };
     let plain = layout(LayoutBase::Own(&read), &with_status(off)).unwrap();
     assert_eq!((plain.messages[0].e2e, &*plain.messages[0].signals[0].name), (None, "Soc"));
 }
 
 #[test]
-fn an_own_dbc_is_not_moved_and_must_leave_the_header_free() {
+fn own_dbc_must_leave_header_free() {
     let status = MessageSettings { fd: Some(true), ..on(Profile::P05, 1) };
     let (key, what) = own_fault("VERSION", "VERSION", status);
     let wanted = "signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 bits of the header of profile 5 free";
@@ -150,23 +150,23 @@ fn an_own_dbc_is_not_moved_and_must_leave_the_header_free() {
 }
 
 #[test]
-fn profile_1a_leaves_the_upper_half_of_the_second_byte_to_a_signal() {
+fn profile_1a_leaves_upper_nibble_to_a_signal() {
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 12|4@1+")).unwrap();
     assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok());
     assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01C, 1))).is_err());
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|4@0+")).unwrap();
     assert!(
         layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok(),
-        "the same bits, the other order"
+        "the same bits in the other byte order"
     );
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|5@0+")).unwrap();
     assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_err());
 }
 
 #[test]
-fn lengths_that_a_frame_or_a_profile_does_not_have_are_refused() {
+fn invalid_frame_and_profile_lengths_are_rejected() {
     let length = |len: u32, status| own_fault("PACKWATCH_Status: 8", &format!("PACKWATCH_Status: {len}"), status);
-    let what = "message PACKWATCH_Status has 10 bytes, must have a length that frames have: padding is not protected";
+    let what = "message PACKWATCH_Status has 10 bytes, must have a valid CAN FD length: padding is not protected";
     assert_eq!(length(10, on(Profile::P01A, 1)), ("e2e", what.to_owned()));
     let what = "message PACKWATCH_Status has 32 bytes, must have 2 to 30 for profile 1A";
     assert_eq!(length(32, on(Profile::P01A, 1)), ("e2e", what.to_owned()));
@@ -175,7 +175,7 @@ fn lengths_that_a_frame_or_a_profile_does_not_have_are_refused() {
 }
 
 #[test]
-fn a_long_message_of_an_own_dbc_is_sent_in_fd_frames() {
+fn long_message_of_own_dbc_uses_fd_frames() {
     let own = Database::parse(&TEXT.replace("PACKWATCH_Status: 8", "PACKWATCH_Status: 12")).unwrap();
     let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].format, FrameFormat::Fd { brs: false });
@@ -183,14 +183,14 @@ fn a_long_message_of_an_own_dbc_is_sent_in_fd_frames() {
 }
 
 #[test]
-fn a_frame_without_a_cycle_time_gets_the_default_one_in_the_dbc() {
+fn missing_cycle_time_becomes_default_in_dbc() {
     let text = TEXT.replace("BA_ \"GenMsgCycleTime\" BO_ 1712 100;\n", "");
     let made = layout(LayoutBase::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].cycle_time_ms, Some(1000));
 }
 
 #[test]
-fn settings_that_do_not_fit_are_all_reported_with_their_keys() {
+fn all_invalid_settings_are_reported_with_keys() {
     let wrong = LayoutSettings {
         status: MessageSettings { brs: Some(true), ..Default::default() },
         health: on(Profile::P01C, 0x1000),
@@ -204,7 +204,7 @@ fn settings_that_do_not_fit_are_all_reported_with_their_keys() {
 }
 
 #[test]
-fn steps_in_ah_fit_the_cell() {
+fn ah_steps_fit_rated_capacity() {
     let steps = |rated_capacity_ah| {
         let made = layout(LayoutBase::BuiltIn { rated_capacity_ah }, &LayoutSettings::default()).unwrap();
         let step = |name: &str| {
@@ -212,7 +212,11 @@ fn steps_in_ah_fit_the_cell() {
             let share = if name.ends_with("Std") { 0.5 } else { 2.0 };
             assert!(layout.maximum >= share * rated_capacity_ah, "{name} for {rated_capacity_ah} Ah");
             let codes = layout.plan().unwrap().code(layout.maximum).unwrap();
-            assert_eq!(codes, layout.plan().unwrap().all_ones() - 1, "{name}: all but the code for not available");
+            assert_eq!(
+                codes,
+                layout.plan().unwrap().all_ones() - 1,
+                "{name}: all codes except the one for not available"
+            );
             layout.factor
         };
         let [value, threshold] =
@@ -229,7 +233,7 @@ fn steps_in_ah_fit_the_cell() {
 }
 
 #[test]
-fn an_own_dbc_keeps_its_steps_and_loses_messages_that_are_not_the_daemons() {
+fn own_dbc_keeps_steps_but_not_foreign_messages() {
     let text = format!("{TEXT}\nBO_ 5 Other: 8 PACKWATCH\n SG_ X : 0|8@1+ (1,0) [0|0] \"Ah\" PACKWATCH\n");
     let own = Database::parse(&text).unwrap();
     let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
@@ -240,7 +244,7 @@ fn an_own_dbc_keeps_its_steps_and_loses_messages_that_are_not_the_daemons() {
 }
 
 #[test]
-fn an_own_dbc_without_digest_and_reply_sends_what_it_has() {
+fn own_dbc_without_digest_and_reply_is_accepted() {
     let mut own = default_database().unwrap();
     own.messages.retain(|message| !matches!(message.name.as_str(), "PACKWATCH_Digest" | "PACKWATCH_Reply"));
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
@@ -254,7 +258,7 @@ fn secoc(profile: secoc::Profile, data_id: u16) -> MessageSettings {
 }
 
 #[test]
-fn an_authenticated_message_has_its_trailer_as_signals_and_reads_back_equal() {
+fn authenticated_message_has_trailer_signals() {
     let fd = |settings| MessageSettings { fd: Some(true), ..settings };
     for (profile, len_bytes) in [(secoc::Profile::P1, 8), (secoc::Profile::P3, 8), (secoc::Profile::Fd, 16)] {
         let command = secoc(profile, 4);
@@ -272,7 +276,7 @@ fn an_authenticated_message_has_its_trailer_as_signals_and_reads_back_equal() {
         assert_eq!(lens, [24, 20, len_bytes, 8], "{profile:?}");
         let plan = CommandPlan::new(&made).unwrap();
         assert_eq!((plan.authentication(), plan.protection()), (command.secoc, None));
-        // The signals of the trailer are where it is written.
+        // The trailer signals are where the trailer is written.
         let command = made.message("PACKWATCH_Command").unwrap();
         let mut payload = vec![0; usize::from(len_bytes)];
         let authentication = Authentication { profile, data_id: 4 };
@@ -286,7 +290,7 @@ fn an_authenticated_message_has_its_trailer_as_signals_and_reads_back_equal() {
 }
 
 #[test]
-fn a_trailer_that_does_not_fit_is_refused() {
+fn trailer_that_does_not_fit_is_rejected() {
     let fault = |settings: &LayoutSettings| {
         let faults = built_in(settings).unwrap_err();
         assert_eq!(faults.len(), 1, "{faults:?}");
@@ -304,6 +308,6 @@ fn a_trailer_that_does_not_fit_is_refused() {
     assert_eq!(
         texts,
         [("secoc", "signal PACKWATCH_Command.Cell must leave the last 4 bytes free for profile 1")],
-        "an own DBC is not moved"
+        "the signals of an own DBC are not moved"
     );
 }

@@ -1,4 +1,4 @@
-//! Sent frames read back with the same DBC, and unknown never reads as a number.
+//! Sent frames decode with the same DBC, and unknown values never decode to a number.
 
 use super::*;
 use crate::can::e2e::Profile;
@@ -7,7 +7,7 @@ use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
 
-/// The plan, with counters that no test reads.
+/// The plan, with counters that no test uses.
 struct Unprotected(OutputPlan);
 
 impl Unprotected {
@@ -36,7 +36,7 @@ fn read(name: &str, frame: &Frame) -> (u64, Result<f64, Fault>) {
     (plan.raw(frame.data()).unwrap(), plan.decode(frame.data()))
 }
 
-/// Asserts a value within half a bit, in the DBC's unit.
+/// Asserts that a signal decodes to a value within half a bit, in the DBC's unit.
 fn says(name: &str, frame: &Frame, wanted: f64) {
     let dbc = default_database().unwrap();
     let half = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout.factor / 2.0 + 1e-9;
@@ -44,17 +44,17 @@ fn says(name: &str, frame: &Frame, wanted: f64) {
     assert!(found.is_ok_and(|found| (found - wanted).abs() <= half), "{name}: {found:?} for {wanted}");
 }
 
-/// Asserts the code for not available, which must lie outside the range.
+/// Asserts that a signal is "not available" and that this code is outside its range.
 fn says_nothing(name: &str, frame: &Frame) {
     let dbc = default_database().unwrap();
     let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();
     let (code, value) = read(name, frame);
     assert_eq!(vec![code], codes, "{name}");
-    // Severity 0 is the one code for "not available" inside a range.
+    // Severity 0 is the only "not available" code inside a range.
     assert!(value == Err(Fault::OutOfRange) || name == "Alarm.Severity", "{name} reads {value:?}");
 }
 
-/// The DBC with one text replaced.
+/// Faults of the DBC with one text replaced.
 fn faults(from: &str, to: &str) -> Vec<String> {
     assert!(TEXT.contains(from), "{from}");
     let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();
@@ -62,7 +62,7 @@ fn faults(from: &str, to: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
+fn shipped_dbc_has_all_signals_and_cycle_times() {
     let plan = plan().0;
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5].map(CanId::Standard));
     let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
@@ -72,7 +72,7 @@ fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
 }
 
 #[test]
-fn status_reads_back_within_half_a_bit() {
+fn status_decodes_within_half_a_bit() {
     let fields = StatusFields {
         soc: Some(0.7312),
         soc_std: Some(0.0123),
@@ -96,13 +96,13 @@ fn status_reads_back_within_half_a_bit() {
     ] {
         says(&format!("Status.{name}"), &frame, wanted);
     }
-    assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]), "kept free for end-to-end protection");
+    assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]), "reserved for end-to-end protection");
     for (mode, code) in [(Mode::Unknown, 0.0), (Mode::Charge, 1.0), (Mode::Rest, 2.0)] {
         says("Status.Mode", &plan().status(&StatusFields { mode: Some(mode), ..fields }), code);
     }
 }
 
-/// Fields of the health frame with the page each is on, a value inside, and what it reads.
+/// Fields of the health frame with the page of each, a value in internal units, and the value that it decodes to.
 const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
@@ -145,19 +145,19 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
 }
 
 #[test]
-fn every_page_of_the_health_frame_reads_back_within_half_a_bit() {
+fn health_pages_decode_within_half_a_bit() {
     let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
     for (page, name, _, wanted) in HEALTH_VALUES {
         let frame = plan().health(page, &fields);
         says(&format!("Health.{name}"), &frame, wanted);
         assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
-        assert_eq!(plan().health(page + 5, &fields), frame, "after the last page comes the first");
+        assert_eq!(plan().health(page + 5, &fields), frame, "the first page follows the last");
     }
 }
 
 #[test]
-fn each_health_value_alone_leaves_the_others_not_available() {
+fn single_health_value_leaves_others_not_available() {
     for known in 0..HEALTH_VALUES.len() {
         let fields = health_fields(|n| (n == known).then_some(HEALTH_VALUES[n].2));
         for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
@@ -172,7 +172,7 @@ fn each_health_value_alone_leaves_the_others_not_available() {
 }
 
 #[test]
-fn what_is_not_known_is_not_available_on_every_frame() {
+fn unknown_values_are_not_available_in_every_frame() {
     let status = plan().status(&StatusFields::default());
     for name in STATUS.map(|(name, _)| name).into_iter().filter(|name| *name != "Validity") {
         says_nothing(&format!("Status.{name}"), &status);
@@ -190,11 +190,11 @@ fn what_is_not_known_is_not_available_on_every_frame() {
         says_nothing(&format!("Alarm.Threshold_{rule}"), &frame);
     }
     let nan = StatusFields { soc: Some(f64::NAN), soc_std: Some(f64::NAN), ..Default::default() };
-    assert_eq!(plan().status(&nan), status, "NaN is not known");
+    assert_eq!(plan().status(&nan), status, "NaN is unknown");
 }
 
 #[test]
-fn extremes_saturate_at_the_range_and_never_say_not_available() {
+fn extremes_saturate_and_never_become_not_available() {
     let dbc = default_database().unwrap();
     for extreme in [f64::MAX, f64::INFINITY, f64::MIN, f64::NEG_INFINITY] {
         let end = |name: &str| {
@@ -241,7 +241,7 @@ fn extremes_saturate_at_the_range_and_never_say_not_available() {
 
 #[test]
 fn every_rule_has_its_own_value_and_threshold() {
-    // In the rule's inside unit and as read: the share of bad readings is a fraction inside and % on the wire.
+    // In internal units and as decoded: the share of bad readings is a fraction internally and % on the wire.
     let values: [(f64, f64); RULES.len()] = [
         (1.4, 1.4),
         (1.38, 1.38),
@@ -292,7 +292,7 @@ fn every_rule_has_its_own_value_and_threshold() {
 }
 
 #[test]
-fn the_rules_numbers_and_names_are_those_of_the_value_table() {
+fn rule_numbers_and_names_match_value_table() {
     let dbc = default_database().unwrap();
     let table = &dbc.signal("PACKWATCH_Alarm.Rule").unwrap().1.values;
     let named = (1..).zip(RULES).map(|(number, name)| (number, name.to_owned()));
@@ -311,7 +311,7 @@ fn all_missing_signals_are_reported_together() {
 }
 
 #[test]
-fn every_signal_the_daemon_fills_is_required() {
+fn every_filled_signal_is_required() {
     let rules = RULES.iter().flat_map(|rule| [format!("Value_{rule}"), format!("Threshold_{rule}")]);
     let all = STATUS.map(|(name, _)| format!("Status.{name}")).into_iter();
     let all = all.chain(HEALTH[..HEALTH_REQUIRED].iter().map(|(name, _)| format!("Health.{name}")));
@@ -322,7 +322,7 @@ fn every_signal_the_daemon_fills_is_required() {
         let (message, signal) = name.split_once('.').unwrap();
         let message = dbc.messages.iter_mut().find(|m| m.name.ends_with(message)).unwrap();
         let position = message.signals.iter().position(|s| s.name == signal).unwrap();
-        // Renamed and not removed: the others' conditions count positions.
+        // Renamed, not removed, because conditions refer to signals by index.
         message.signals[position].name = "Other".to_owned();
         let found = OutputPlan::new(&dbc).unwrap_err();
         assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);
@@ -332,29 +332,29 @@ fn every_signal_the_daemon_fills_is_required() {
 }
 
 #[test]
-fn a_value_that_could_be_read_as_another_s_is_refused() {
+fn ambiguous_value_signals_are_rejected() {
     assert_eq!(
         faults("Value_InputMissing m4", "Value_InputMissing m5"),
-        ["signal PACKWATCH_Alarm.Value_InputMissing is there for the rules [5], must be for 4 alone"]
+        ["signal PACKWATCH_Alarm.Value_InputMissing is present for rules [5], must be present for rule 4 only"]
     );
     assert_eq!(
         faults("Threshold_CapacityLow m1", "Threshold_CapacityLow "),
         [
-            "signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17], must be for 1 alone"
+            "signal PACKWATCH_Alarm.Threshold_CapacityLow is present for rules [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17], must be present for rule 1 only"
         ]
     );
     let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
     assert_eq!(
         unreachable, 18,
-        "of health three signals are on page 2, three on page 3, six on page 4; of the digest three each on pages 2 and 3"
+        "health: three signals on page 2, three on page 3, six on page 4; digest: three each on pages 2 and 3"
     );
 }
 
 #[test]
-fn a_signal_past_its_message_or_without_layout_is_refused() {
+fn signal_beyond_message_or_invalid_layout_is_rejected() {
     assert_eq!(
         faults("LimitingCell : 51|11@1+", "LimitingCell : 54|11@1+"),
-        ["signal PACKWATCH_Status.LimitingCell: reaches past the message's 8 bytes"]
+        ["signal PACKWATCH_Status.LimitingCell: extends beyond the message's 8 bytes"]
     );
     assert_eq!(faults("Soc : 16|12@1+ (0.025,0)", "Soc : 16|12@1+ (0,0)").len(), 1);
     assert_eq!(
@@ -368,7 +368,7 @@ fn a_signal_past_its_message_or_without_layout_is_refused() {
 }
 
 #[test]
-fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() {
+fn known_values_avoid_not_available_code() {
     let text = TEXT
         .replace("Soc : 16|12@1+ (0.025,0) [0|102.35]", "Soc : 16|12@1- (1,0) [0|0]")
         .replace("SocStd : 28|8@1+ (0.1,0) [0|25.4]", "SocStd : 28|8@1+ (1,0) [0|0]")
@@ -380,11 +380,11 @@ fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() 
     };
     assert_eq!(codes(None), (0x800, 255));
     assert_eq!(codes(Some(1e9)), (0x7FF, 254));
-    assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is taken: the next one up");
+    assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is reserved: the next higher one is used");
 }
 
 #[test]
-fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
+fn messages_are_protected_with_separate_counters() {
     for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
         let settings = |data_id| MessageSettings {
             fd: Some(true),
@@ -402,7 +402,7 @@ fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
             let fields = StatusFields { active_alarms: Some(round % 60), ..Default::default() };
             let frame = plan.status(&fields, &mut counters);
             assert_eq!(status.verified_counter(frame.data()), Some(expected), "{profile:?} {round}");
-            assert_eq!(health.verified_counter(frame.data()), None, "another frame's data id");
+            assert_eq!(health.verified_counter(frame.data()), None, "data id of another message");
             expected = profile.next_counter(expected);
         }
         let frame = plan.health(1, &HealthFields::default(), &mut counters);
@@ -417,7 +417,7 @@ fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
 }
 
 #[test]
-fn counters_survive_a_restart_and_a_change_of_the_profile() {
+fn counters_survive_restart_and_profile_change() {
     let protection = Protection { profile: Profile::P01A, data_id: 9 };
     let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
     let settings = LayoutSettings { status, ..Default::default() };
@@ -428,10 +428,10 @@ fn counters_survive_a_restart_and_a_change_of_the_profile() {
     assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
     let stored = serde_json::to_string(&counters).unwrap();
     let wanted = r#"{"status":1,"health":0,"alarm":3,"digest":0,"reply":0}"#;
-    assert_eq!(stored, wanted, "unprotected frames count nothing");
+    assert_eq!(stored, wanted, "unprotected frames do not count");
     plan.skip(LayoutMessage::Status, 16, &mut counters);
     plan.skip(LayoutMessage::Alarm, 16, &mut counters);
     let frame = plan.status(&StatusFields::default(), &mut counters);
-    assert_eq!(protection.verified_counter(frame.data()), Some(2), "a turn of 15 and one more");
+    assert_eq!(protection.verified_counter(frame.data()), Some(2), "one round of 15 and one more");
     assert_eq!(serde_json::to_value(counters).unwrap()["alarm"], 3, "not protected");
 }
