@@ -1,17 +1,16 @@
-//! Signal layouts: position of a number in a payload, reading and writing it.
+//! Signal layouts: the position of a number in a payload, its decoding and encoding.
 //!
-//! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended)
-//! and physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout compiled once;
-//! reading is then load, shift, shift, multiply-add. Signals have 1 to 64 bits at any position of payloads of up to
-//! 64 bytes.
+//! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended) and
+//! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout prepared once; decoding is
+//! then load, shift, shift, multiply-add. Signals have 1 to 64 bits at any position of payloads of up to 64 bytes.
 //!
-//! Bad input is data: a payload too short gives [`Fault::ShortFrame`], NaN or infinity [`Fault::NotFinite`], a value
-//! outside the DBC's range [`Fault::OutOfRange`]. Writing rounds to the nearest code and saturates.
+//! Bad input is data: a payload that is too short gives [`Fault::ShortFrame`], NaN or infinity [`Fault::NotFinite`], a
+//! value outside the DBC's range [`Fault::OutOfRange`]. Encoding rounds to the nearest code and saturates.
 
 use crate::can::MAX_DATA;
 use crate::quantity::Fault;
 
-/// Bits a payload can have at most.
+/// Most bits of a payload.
 const MAX_BITS: u16 = 512;
 const _: () = assert!(MAX_DATA * 8 == MAX_BITS as usize);
 
@@ -37,53 +36,53 @@ pub enum ValueType {
     Float64,
 }
 
-/// Position and meaning of a signal, as in a DBC.
+/// Position and conversion of a signal, as in a DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalLayout {
     /// DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 its most significant, bit 8 starts byte 1.
     pub start_bit: u16,
-    /// 1 to 64.
+    /// Length, 1 to 64 bits.
     pub length_bits: u16,
     /// Order of bytes.
     pub byte_order: ByteOrder,
-    /// Kind of number.
+    /// Number format.
     pub value_type: ValueType,
     /// Physical units per code; not 0.
     pub factor: f64,
     /// Physical value of code 0.
     pub offset: f64,
-    /// Smallest physical value; with `maximum` both 0 means "not stated".
+    /// Smallest physical value. If `minimum` and `maximum` are both 0, the range is not stated.
     pub minimum: f64,
     /// Largest physical value.
     pub maximum: f64,
 }
 
-/// Why a layout is invalid.
+/// Reason why a layout is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct LayoutFault(String);
 
-/// A layout compiled for reading and writing.
+/// A layout prepared for decoding and encoding.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalPlan {
     /// First byte of the eight-byte window that is loaded.
     pub(crate) window: u8,
-    /// Bytes the payload must have.
+    /// Bytes that the payload must have.
     bytes_needed: u8,
-    /// The signal touches nine bytes: the window is widened to sixteen.
+    /// The signal spans nine bytes, so the window is widened to sixteen.
     wide: bool,
     pub(crate) byte_order: ByteOrder,
     value_type: ValueType,
-    /// Shift that brings the signal's top bit to the word's top.
+    /// Left shift that moves the signal's highest bit to the top of the word.
     pub(crate) up: u8,
-    /// Shift that then brings its lowest bit to the word's bottom; 64 - length.
+    /// Right shift that then moves its lowest bit to the bottom of the word: 64 - length.
     pub(crate) down: u8,
     pub(crate) factor: f64,
     pub(crate) offset: f64,
-    /// Physical limits widened by half a code, so that rounding in factor and offset never rejects a code on the limit.
+    /// Physical limits, widened by half a code so that rounding never rejects a code on the limit.
     pub(crate) low: f64,
     pub(crate) high: f64,
-    /// Codes (sign-extended) within both the DBC's range and the bits.
+    /// Smallest and largest code (sign-extended) within both the DBC's range and the bits.
     low_code: i128,
     high_code: i128,
 }
@@ -98,13 +97,13 @@ pub(crate) fn float_of_signed(code: i64) -> f64 {
     code as f64
 }
 
-/// A whole float as an integer; saturates at the ends of `i128`, NaN gives 0.
+/// Converts a float without fraction to an integer. Saturates at the ends of `i128`; NaN gives 0.
 fn integer_of(whole: f64) -> i128 {
     whole as i128
 }
 
-/// The nearest integer, of two the one farther from 0: as `number.round()`, without a call. Saturates at the ends of `i64`,
-/// NaN gives 0.
+/// Rounds to the nearest integer, half away from 0: like `number.round()`, but without a function call. Saturates at
+/// the ends of `i64`; NaN gives 0.
 fn nearest(number: f64) -> i64 {
     let towards_zero = number as i64;
     // Exact: numbers above 2^52 have no fraction.
@@ -112,7 +111,7 @@ fn nearest(number: f64) -> i64 {
     towards_zero.saturating_add(i64::from(rest >= 0.5) - i64::from(rest <= -0.5))
 }
 
-/// The nearest code to a number where codes are unsigned and have 64 bits.
+/// The code nearest to a number, for unsigned codes of 64 bits.
 #[cold]
 fn wide_code(number: f64, low: i128, high: i128) -> u64 {
     low_64(integer_of(number.round()).clamp(low, high))
@@ -125,8 +124,8 @@ fn low_64(code: i128) -> u64 {
 }
 
 impl SignalLayout {
-    /// Positions of the first and last bit in the order of the bytes on the wire: within a byte from bit 0 up for
-    /// little-endian signals, from bit 7 down for big-endian ones.
+    /// Positions of the first and last bit in wire order: within a byte from bit 0 up for little-endian signals, from
+    /// bit 7 down for big-endian signals.
     pub(crate) fn span(&self) -> (u32, u32) {
         let start = u32::from(self.start_bit);
         let first = match self.byte_order {
@@ -136,12 +135,13 @@ impl SignalLayout {
         (first, first + u32::from(self.length_bits.max(1)) - 1)
     }
 
-    /// Payload bytes up to the signal's end.
+    /// Number of payload bytes up to the signal's end.
     pub fn end_byte(&self) -> u32 {
         self.span().1 / 8 + 1
     }
 
-    /// Smallest and largest physical value its bits can hold, whatever range is stated; infinite for floats.
+    /// Smallest and largest physical value that the bits can represent, regardless of the stated range; infinite for
+    /// floats.
     pub fn extent(&self) -> (f64, f64) {
         if matches!(self.value_type, ValueType::Float32 | ValueType::Float64) || !(1..=64).contains(&self.length_bits) {
             return (f64::NEG_INFINITY, f64::INFINITY);
@@ -151,25 +151,25 @@ impl SignalLayout {
         (a.min(b), a.max(b))
     }
 
-    /// Whether both have a bit of the payload.
+    /// Whether the two signals share a bit of the payload.
     pub fn overlaps(&self, other: &Self) -> bool {
         let theirs: Vec<u32> = other.bits().collect();
         self.bits().any(|bit| theirs.contains(&bit))
     }
 
-    /// Its bits in the DBC's numbering.
+    /// Its bits, in the DBC's numbering.
     fn bits(&self) -> impl Iterator<Item = u32> + use<> {
         let (first, last) = self.span();
         let is_little = self.byte_order == ByteOrder::LittleEndian;
         (first..=last).map(move |bit| if is_little { bit } else { bit - bit % 8 + (7 - bit % 8) })
     }
 
-    /// Whether minimum and maximum are stated (`[0|0]` is no range).
+    /// Whether minimum and maximum are stated; `[0|0]` means that they are not.
     pub fn has_range(&self) -> bool {
         self.minimum != 0.0 || self.maximum != 0.0
     }
 
-    /// Whether one of its bits is in the mask, which is of the payload's first bytes.
+    /// Whether one of its bits is in `mask`, which covers the first bytes of the payload.
     pub fn touches(&self, mask: [u8; 3]) -> bool {
         let mut payload = [0; MAX_DATA];
         payload[..mask.len()].copy_from_slice(&mask);
@@ -200,7 +200,7 @@ impl SignalLayout {
         }))
     }
 
-    /// Smallest and largest code the bits can hold.
+    /// Smallest and largest code that the bits can represent.
     fn representable(&self) -> (i128, i128) {
         match self.value_type {
             ValueType::Signed => (-(1_i128 << (self.length_bits - 1)), (1_i128 << (self.length_bits - 1)) - 1),
@@ -208,9 +208,10 @@ impl SignalLayout {
         }
     }
 
-    /// Smallest and largest code within the bits and the stated range; only the bits when no code lies in the range.
+    /// Smallest and largest code within the bits and the stated range; within the bits only if no code lies in the
+    /// range.
     fn code_limits(&self) -> (i128, i128) {
-        /// Tolerance of the DBC's decimal numbers, in codes.
+        /// Tolerance for the decimal numbers of the DBC, in codes.
         const ROUNDING: f64 = 1e-6;
         let (lowest, highest) = self.representable();
         if !self.has_range() {
@@ -223,7 +224,7 @@ impl SignalLayout {
         if low <= high { (low, high) } else { (lowest, highest) }
     }
 
-    /// Physical limits widened by half a code (floats: by 1e-6 of the range's ends).
+    /// Physical limits, widened by half a code (for floats, by 1e-6 of the larger limit).
     fn physical_limits(&self) -> (f64, f64) {
         if !self.has_range() {
             // Still rejects values that factor and offset make infinite.
@@ -236,10 +237,10 @@ impl SignalLayout {
         (self.minimum - room, self.maximum + room)
     }
 
-    /// Compiles the layout.
+    /// Prepares the layout for decoding and encoding.
     ///
     /// # Errors
-    /// When no payload can carry it, or factor, offset or range are invalid.
+    /// No payload can carry the signal, or factor, offset or range are invalid.
     pub fn plan(&self) -> Result<SignalPlan, LayoutFault> {
         self.check()?;
         let (first, last) = self.span();
@@ -255,7 +256,7 @@ impl SignalLayout {
         };
         let (low, high) = self.physical_limits();
         let (low_code, high_code) = self.code_limits();
-        // Each number was checked above to be below 128.
+        // Each number is below 128, as checked above.
         let small = |n: u32| u8::try_from(n).unwrap_or(u8::MAX);
         Ok(SignalPlan {
             window: small(window),
@@ -276,18 +277,18 @@ impl SignalLayout {
 }
 
 impl SignalPlan {
-    /// Bytes a payload must have to carry the signal.
+    /// Bytes that a payload must have to carry the signal.
     pub fn bytes_needed(&self) -> usize {
         usize::from(self.bytes_needed)
     }
 
-    /// Whether it is an integer of at most 63 bits within eight bytes.
+    /// Whether the signal is an integer of at most 63 bits within eight bytes.
     pub(crate) fn is_simple(&self) -> bool {
         let is_integer = matches!(self.value_type, ValueType::Unsigned | ValueType::Signed);
         is_integer && !self.wide && self.down > 0
     }
 
-    /// Smallest and largest code the bits of a simple signal can hold.
+    /// Smallest and largest code that the bits of a simple signal can represent.
     pub(crate) fn codes(&self) -> (i64, i64) {
         let highest = (u64::MAX >> self.down).cast_signed();
         if self.value_type == ValueType::Signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
@@ -298,12 +299,12 @@ impl SignalPlan {
         64 - u32::from(self.down)
     }
 
-    /// Kind of number.
+    /// Number format.
     pub fn value_type(&self) -> ValueType {
         self.value_type
     }
 
-    /// The code with every bit set: the customary "not available" of an unsigned signal.
+    /// The code with all bits set: the usual "not available" code of an unsigned signal.
     pub fn all_ones(&self) -> u64 {
         u64::MAX >> self.down
     }
@@ -311,13 +312,13 @@ impl SignalPlan {
     /// The signal's bits, lowest bit first, without sign extension.
     ///
     /// # Errors
-    /// [`Fault::ShortFrame`] when the payload ends before the signal does.
+    /// [`Fault::ShortFrame`] if the payload ends before the signal does.
     #[inline]
     pub fn raw(&self, payload: &[u8]) -> Result<u64, Fault> {
         Ok(self.lifted(payload)? >> self.down)
     }
 
-    /// The signal's bits at the top of a word, zeros below.
+    /// The signal's bits at the top of a word, with zeros or other payload bits below.
     #[inline]
     fn lifted(&self, payload: &[u8]) -> Result<u64, Fault> {
         if payload.len() < self.bytes_needed() {
@@ -338,7 +339,7 @@ impl SignalPlan {
         Ok(word << self.up)
     }
 
-    /// As `lifted`, for a signal of 58 to 64 bits that touches nine bytes.
+    /// Like `lifted`, for a signal of 58 to 64 bits that spans nine bytes.
     #[cold]
     fn lifted_wide(&self, payload: &[u8]) -> u64 {
         let bytes: [u8; 16] = padded(payload, usize::from(self.window));
@@ -347,11 +348,11 @@ impl SignalPlan {
             ByteOrder::BigEndian => u128::from_be_bytes(bytes),
         };
         let top = (word << self.up) >> 64;
-        // Lossless: 64 bits are left after the shift; bits below the signal go with the shift by `down`.
+        // Lossless: 64 bits remain after the shift. The later shift by `down` drops the bits below the signal.
         u64::try_from(top).unwrap_or(u64::MAX)
     }
 
-    /// The physical value, in the DBC's unit, without the DBC's range.
+    /// The physical value, in the DBC's unit, not checked against the DBC's range.
     ///
     /// # Errors
     /// [`Fault::ShortFrame`], [`Fault::NotFinite`].
@@ -374,8 +375,8 @@ impl SignalPlan {
         if number.is_finite() { Ok(number) } else { Err(Fault::NotFinite) }
     }
 
-    /// The physical value, in the DBC's unit, checked against the DBC's range (`[0|0]` is no range). A code on the
-    /// limit is inside it, however factor and offset round.
+    /// The physical value, in the DBC's unit, checked against the DBC's range (`[0|0]` means no range). A code on the
+    /// limit is in the range, regardless of rounding in factor and offset.
     ///
     /// # Errors
     /// [`Fault::ShortFrame`], [`Fault::NotFinite`], [`Fault::OutOfRange`].
@@ -385,8 +386,8 @@ impl SignalPlan {
         if value >= self.low && value <= self.high { Ok(value) } else { Err(Fault::OutOfRange) }
     }
 
-    /// The code nearest to a physical value, saturated at the ends of what the bits and the DBC's range allow.
-    /// `None` for NaN.
+    /// The code nearest to a physical value, saturated at the limits of the bits and of the DBC's range; `None` for
+    /// NaN.
     pub fn code(&self, value: f64) -> Option<u64> {
         match self.value_type {
             ValueType::Unsigned | ValueType::Signed => self.integer_code(value, self.low_code, self.high_code),
@@ -394,8 +395,8 @@ impl SignalPlan {
         }
     }
 
-    /// As [`Self::code`], but saturated only at what the bits can hold: a value outside the DBC's range stays
-    /// outside it, so that its receiver detects the fault.
+    /// Like [`Self::code`], but saturated only at the limits of the bits: a value outside the DBC's range stays
+    /// outside, so that the receiver detects the fault.
     pub fn code_beyond_range(&self, value: f64) -> Option<u64> {
         let bits = self.length_bits();
         match self.value_type {
@@ -432,12 +433,12 @@ impl SignalPlan {
         }
     }
 
-    /// Writes a physical value: rounds to the nearest code, saturates at the ends of what the bits and the DBC's
-    /// range allow (infinities too). Other bits of the payload stay as they are.
+    /// Encodes a physical value: rounds to the nearest code, and saturates (also infinities) at the limits of the bits
+    /// and of the DBC's range. Other bits of the payload do not change.
     ///
     /// # Errors
-    /// [`Fault::ShortFrame`] when the payload ends before the signal does, [`Fault::NotFinite`] for NaN; the payload
-    /// is then unchanged.
+    /// [`Fault::ShortFrame`] if the payload ends before the signal does, [`Fault::NotFinite`] for NaN. The payload is
+    /// then unchanged.
     pub fn encode(&self, payload: &mut [u8], value: f64) -> Result<(), Fault> {
         let code = self.code(value).ok_or(Fault::NotFinite)?;
         self.encode_raw(payload, code)
@@ -446,8 +447,8 @@ impl SignalPlan {
     /// Writes the signal's bits.
     ///
     /// # Errors
-    /// [`Fault::ShortFrame`] when the payload ends before the signal does, [`Fault::OutOfRange`] when `code` has more
-    /// bits than the signal; the payload is then unchanged.
+    /// [`Fault::ShortFrame`] if the payload ends before the signal does, [`Fault::OutOfRange`] if `code` has more bits
+    /// than the signal. The payload is then unchanged.
     pub fn encode_raw(&self, payload: &mut [u8], code: u64) -> Result<(), Fault> {
         if payload.len() < self.bytes_needed() {
             return Err(Fault::ShortFrame);
@@ -476,7 +477,7 @@ impl SignalPlan {
         Ok(())
     }
 
-    /// As `encode_raw`, for a signal of 58 to 64 bits that touches nine bytes; the payload has them.
+    /// Like `encode_raw`, for a signal of 58 to 64 bits that spans nine bytes. The payload must be long enough.
     #[cold]
     fn place_wide(&self, payload: &mut [u8], code: u64) {
         let from = usize::from(self.window);
@@ -492,7 +493,7 @@ impl SignalPlan {
     }
 }
 
-/// `N` bytes of the payload from `from` on, zeros where it ends earlier.
+/// `N` bytes of the payload from `from` on, padded with zeros.
 fn padded<const N: usize>(payload: &[u8], from: usize) -> [u8; N] {
     let mut bytes = [0; N];
     for (to, byte) in bytes.iter_mut().zip(payload.iter().skip(from)) {

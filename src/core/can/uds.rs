@@ -1,8 +1,9 @@
-//! Diagnostic answers (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) over ISO-TP: which are read, and where their signals are.
+//! Diagnostic responses (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) over ISO-TP: which responses are decoded, and
+//! where their signals are.
 //!
-//! In: frames of the configured identifiers, from any tester. Out: whole answers, and their readings
-//! ([`Answer::readings`]). Of every controller it is counted what came: answers, refusals, answers without a request
-//! before, lost messages by their fault. Nothing is sent here. Memory: one message per configured controller.
+//! In: frames of the configured identifiers, from any tester. Out: complete responses, and their readings
+//! ([`Answer::readings`]). Counts per controller: decoded responses, negative responses, responses without a preceding
+//! request, and lost messages by fault. This module sends nothing. Memory: one message per configured controller.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,30 +13,30 @@ use super::isotp::{IsoTpFault, Progress, Receiver};
 use super::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Channel, Fault, Reading, Timestamp};
 
-/// Added to the service in an answer.
+/// Added to the service code in a positive response.
 const POSITIVE: u8 = 0x40;
-/// Code of a refusal that only says "wait" (requestCorrectlyReceived-ResponsePending).
+/// Negative response code requestCorrectlyReceived-ResponsePending: the response follows later.
 pub const PENDING: u8 = 0x78;
 
-/// A service that only reads.
+/// A read-only service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Service {
-    /// Current data of OBD, identifier of one byte.
+    /// Current data of OBD, with an identifier of one byte.
     CurrentData = 0x01,
-    /// `ReadDataByLocalIdentifier` of KWP 2000, identifier of one byte.
+    /// `ReadDataByLocalIdentifier` of KWP 2000, with an identifier of one byte.
     ByLocalIdentifier = 0x21,
-    /// `ReadDataByIdentifier` of UDS, identifier of two bytes.
+    /// `ReadDataByIdentifier` of UDS, with an identifier of two bytes.
     ByIdentifier = 0x22,
 }
 
 impl Service {
-    /// The service of this number; `None` = any other, which this program neither reads nor asks.
+    /// The service with this code; `None` = any other service, which packwatch neither decodes nor requests.
     pub fn from_code(code: u8) -> Option<Self> {
         [Self::CurrentData, Self::ByLocalIdentifier, Self::ByIdentifier].into_iter().find(|s| *s as u8 == code)
     }
 
-    /// Bytes of an identifier.
+    /// Length of an identifier, bytes.
     pub fn identifier_bytes(self) -> usize {
         match self {
             Self::CurrentData | Self::ByLocalIdentifier => 1,
@@ -44,39 +45,39 @@ impl Service {
     }
 }
 
-/// A controller on a bus: where it is asked and where it answers.
+/// A controller on a bus, with the identifiers of its requests and responses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Controller {
     /// Interface.
     pub bus: BusIndex,
-    /// Identifier of its answers.
+    /// Identifier of its responses.
     pub response: CanId,
-    /// First data byte of its answers, with extended addressing.
+    /// First data byte of its responses, for extended addressing.
     pub response_extension: Option<u8>,
-    /// Identifier of requests to it.
+    /// Identifier of its requests.
     pub request: CanId,
-    /// First data byte of requests, with extended addressing.
+    /// First data byte of its requests, for extended addressing.
     pub request_extension: Option<u8>,
 }
 
-/// What an answer is an answer to.
+/// A diagnostic request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Question {
-    /// The controller asked.
+    /// The controller.
     pub controller: Controller,
     /// Service.
     pub service: Service,
-    /// Identifier of the values.
+    /// Identifier of the requested value.
     pub identifier: u16,
 }
 
 impl Question {
-    /// The request's message.
+    /// The request message.
     pub fn request(&self) -> Vec<u8> {
         self.message(self.service as u8)
     }
 
-    /// What the answer begins with.
+    /// The first bytes of the response: service and identifier.
     pub fn answer_head(&self) -> Vec<u8> {
         self.message(self.service as u8 + POSITIVE)
     }
@@ -87,32 +88,32 @@ impl Question {
     }
 }
 
-/// A signal of an answer.
+/// A signal of a response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSignal {
-    /// Byte behind the echoed service and identifier with which the layout begins.
+    /// Byte at which the layout starts, counted after the echoed service and identifier.
     pub first_byte: usize,
-    /// The signal from there on; its interface and identifier are those of the answer's frames.
+    /// The signal, relative to this byte. Interface and identifier are those of the response frames.
     pub binding: Binding,
 }
 
-/// An answer that is read.
+/// A response to be decoded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
-    /// What it answers.
+    /// The request that it answers.
     pub question: Question,
     /// Its signals.
     pub signals: Vec<AnswerSignal>,
 }
 
 impl Answer {
-    /// Whether it has a reading of this kind.
+    /// Whether it has a signal for a channel that satisfies the predicate.
     pub fn has(&self, is_wanted: impl Fn(Channel) -> bool) -> bool {
         self.signals.iter().any(|signal| is_wanted(signal.binding.channel))
     }
 
-    /// The readings of an answer's data, which begin behind the echoed service and identifier. A signal behind the end of a
-    /// cut answer is a short frame.
+    /// Decodes the data of a response, which starts after the echoed service and identifier. A signal beyond the end of
+    /// a truncated response gives a short-frame fault.
     pub fn readings<'a>(&'a self, data: &'a [u8]) -> impl Iterator<Item = Reading> + 'a {
         self.signals.iter().map(move |signal| {
             let bytes = data.get(signal.first_byte..).ok_or(Fault::ShortFrame);
@@ -121,27 +122,27 @@ impl Answer {
     }
 }
 
-/// What came from a controller.
+/// Counts of what a controller sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ControllerCounts {
-    /// Whole answers that are read.
+    /// Complete responses that are decoded.
     pub read: u64,
-    /// Whole messages that are not: other identifiers, other services.
+    /// Complete messages that are not decoded: other identifiers, other services.
     pub other: u64,
-    /// Refusals, "wait" excepted.
+    /// Negative responses, except "response pending".
     pub refused: u64,
-    /// Refusals that say "wait".
+    /// "Response pending" messages.
     pub pending: u64,
-    /// Code of the latest refusal, "wait" excepted.
+    /// Code of the latest negative response, except "response pending".
     pub latest_refusal: Option<u8>,
-    /// Answers that are read, although no request was heard within five seconds before.
+    /// Decoded responses for which no request was received in the preceding five seconds.
     pub unasked: u64,
-    /// Lost messages, by [`IsoTpFault::ALL`].
+    /// Lost messages, indexed like [`IsoTpFault::ALL`].
     pub lost: [u64; IsoTpFault::ALL.len()],
 }
 
 impl ControllerCounts {
-    /// What came since an earlier count.
+    /// Difference from the earlier counts `before`.
     #[must_use]
     pub fn since(&self, before: &Self) -> Self {
         Self {
@@ -155,70 +156,70 @@ impl ControllerCounts {
         }
     }
 
-    /// Lost messages by their fault, those that happened.
+    /// Faults that caused lost messages, with their numbers.
     pub fn losses(&self) -> impl Iterator<Item = (IsoTpFault, u64)> + '_ {
         IsoTpFault::ALL.into_iter().zip(self.lost).filter(|(_, count)| *count > 0)
     }
 
-    /// All lost messages.
+    /// Total number of lost messages.
     pub fn lost_in_all(&self) -> u64 {
         self.lost.iter().fold(0, |sum, count| sum.saturating_add(*count))
     }
 }
 
-/// Messages of a controller were lost.
+/// Reports that messages of a controller were lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MessageLoss {
     /// Interface.
     pub bus: BusIndex,
-    /// Identifier of the controller's answers.
+    /// Identifier of the controller's responses.
     pub id: CanId,
-    /// What happened to the latest of them.
+    /// The fault of the latest lost message.
     pub fault: IsoTpFault,
-    /// Messages lost so far.
+    /// Number of messages lost so far.
     pub lost: u64,
 }
 
-/// A refusal.
+/// A negative response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Refusal {
-    /// The service that was asked for.
+    /// The requested service.
     pub service: u8,
-    /// Why (ISO 14229-1, table A.1); [`PENDING`] only says "wait".
+    /// Negative response code (ISO 14229-1, table A.1); [`PENDING`] means that the response follows later.
     pub code: u8,
 }
 
-/// What a frame brought.
+/// Result of a received frame.
 #[derive(Debug, PartialEq)]
 pub enum Heard<'a> {
-    /// Nothing to read.
+    /// Nothing to decode.
     Nothing,
-    /// An answer of the controller of this index begins: its values are of now.
+    /// The first frame of a response. Its values were measured now.
     Begun {
         /// Index in [`Listener::counts`].
         controller: usize,
     },
-    /// A further part of an answer.
+    /// A further frame of a response.
     Continued {
         /// Index in [`Listener::counts`].
         controller: usize,
     },
-    /// A refusal.
+    /// A negative response.
     Refused {
         /// Index in [`Listener::counts`].
         controller: usize,
         /// The refusal.
         refusal: Refusal,
     },
-    /// A whole answer.
+    /// A complete response.
     Whole {
         /// Index in [`Listener::counts`].
         controller: usize,
-        /// Its plan.
+        /// Its configuration.
         answer: &'a Answer,
-        /// Its data behind the echoed service and identifier.
+        /// Its data, after the echoed service and identifier.
         data: &'a [u8],
-        /// Whether it came in one frame, without [`Heard::Begun`] before.
+        /// Whether it arrived in a single frame, without a preceding [`Heard::Begun`].
         is_single: bool,
     },
 }
@@ -229,12 +230,13 @@ struct Link {
     controller: Controller,
     receiver: Receiver,
     counts: ControllerCounts,
-    /// Head of the answer to the latest request, and when it was heard or postponed.
+    /// First bytes of the response to the latest request, and the time of that request or of the latest "response
+    /// pending".
     asked: Option<([u8; 3], Timestamp)>,
     reported_at: Option<Timestamp>,
 }
 
-/// An answer under way of one controller: what a snapshot keeps for a continuation without a break.
+/// Partial response of one controller, for a snapshot from which the monitor resumes without a gap.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkProgress {
     controller: Controller,
@@ -243,7 +245,7 @@ pub struct LinkProgress {
     reported_at: Option<Timestamp>,
 }
 
-/// Listens to all configured controllers.
+/// Receives the responses of all configured controllers.
 #[derive(Debug, Clone, Default)]
 pub struct Listener {
     /// Sorted by question.
@@ -252,12 +254,12 @@ pub struct Listener {
     links: Vec<Link>,
     ids: IdTable,
     id_count: usize,
-    /// Losses that wait to be reported.
+    /// Losses to be reported.
     pub(crate) losses: Vec<MessageLoss>,
 }
 
 impl Listener {
-    /// A listener for these answers; signals of equal questions are read together.
+    /// Creates a listener for these responses. Responses to equal requests are merged.
     pub fn new(answers: &[Answer]) -> Self {
         let mut sorted: Vec<Answer> = Vec::new();
         for answer in answers {
@@ -268,7 +270,7 @@ impl Listener {
         }
         sorted.sort_by_key(|answer| answer.question);
         for answer in &mut sorted {
-            // The current before the voltages that its sample is made with.
+            // Decode the current before the voltages, whose samples use it.
             answer.signals.sort_by_key(|signal| signal.binding.channel);
         }
         let mut controllers: Vec<Controller> = sorted.iter().map(|answer| answer.question.controller).collect();
@@ -290,17 +292,17 @@ impl Listener {
         }
     }
 
-    /// Whether nothing is configured.
+    /// Whether no response is configured.
     pub fn is_empty(&self) -> bool {
         self.links.is_empty()
     }
 
-    /// The controllers and what came from them.
+    /// The controllers and their counts.
     pub fn counts(&self) -> impl Iterator<Item = (Controller, ControllerCounts)> + '_ {
         self.links.iter().map(|link| (link.controller, link.counts))
     }
 
-    /// Continues stored counts, in the order of [`counts`](Self::counts); those of other controllers are left out.
+    /// Restores stored counts; ignores those of other controllers.
     pub fn restore(&mut self, counts: impl Iterator<Item = (Controller, ControllerCounts)>) {
         for (controller, counts) in counts {
             if let Some(link) = self.links.iter_mut().find(|link| link.controller == controller) {
@@ -309,7 +311,7 @@ impl Listener {
         }
     }
 
-    /// Answers under way.
+    /// Partial responses, to store.
     pub fn progress(&self) -> Vec<LinkProgress> {
         let of = |link: &Link| LinkProgress {
             controller: link.controller,
@@ -320,7 +322,7 @@ impl Listener {
         self.links.iter().map(of).collect()
     }
 
-    /// Continues stored answers under way.
+    /// Restores stored partial responses.
     pub fn resume(&mut self, stored: &[LinkProgress]) {
         for link in &mut self.links {
             if let Some(of) = stored.iter().find(|of| of.controller == link.controller) {
@@ -330,7 +332,7 @@ impl Listener {
         }
     }
 
-    /// After time without listening: messages under way are forgotten.
+    /// Handles time without listening: forgets partial messages.
     pub fn restart(&mut self) {
         for link in &mut self.links {
             link.receiver.restart();
@@ -338,7 +340,7 @@ impl Listener {
         }
     }
 
-    /// Gives up messages whose next frame is overdue.
+    /// Drops messages whose next frame is overdue.
     pub fn poll(&mut self, now: Timestamp) {
         for link in &mut self.links {
             let fault = link.receiver.poll(now);
@@ -346,7 +348,7 @@ impl Listener {
         }
     }
 
-    /// Takes a frame.
+    /// Handles a received frame.
     #[inline]
     pub fn handle(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Heard<'_> {
         if self.links.is_empty() || self.ids.number(bus, frame.id()) >= self.id_count {
@@ -387,12 +389,12 @@ impl Listener {
         }
     }
 
-    /// Takes a whole message.
+    /// Handles a complete message.
     fn whole(&mut self, now: Timestamp, controller: usize, is_single: bool) -> Heard<'_> {
         let Self { answers, links, .. } = self;
         let Some(link) = links.get_mut(controller) else { return Heard::Nothing };
         let message = link.receiver.message();
-        // First byte of a refusal (ISO 14229-1, table A.1).
+        // 0x7F is the first byte of a negative response (ISO 14229-1, table A.1).
         if let &[0x7F, service, code, ..] = message {
             if code == PENDING {
                 link.counts.pending = link.counts.pending.saturating_add(1);
@@ -413,7 +415,7 @@ impl Listener {
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
-            // An answer later than this after its request belongs to no request: the longest P2* of ISO 14229-2, ns.
+            // Longest time from request to response, ns: the longest P2* of ISO 14229-2.
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
@@ -422,7 +424,7 @@ impl Listener {
 }
 
 impl Link {
-    /// Takes a frame to the controller: a request, or flow control.
+    /// Handles a frame to the controller: a request or flow control.
     fn handle_request(&mut self, now: Timestamp, payload: &[u8]) -> Option<IsoTpFault> {
         let extension = self.controller.request_extension;
         let mut request = Receiver::new(extension);
@@ -435,14 +437,14 @@ impl Link {
         self.receiver.handle_flow_control(extension, payload)
     }
 
-    /// Counts a loss, and reports the first one in a while.
+    /// Counts a loss; reports it unless a loss was reported recently.
     fn note(&mut self, now: Timestamp, fault: Option<IsoTpFault>, losses: &mut Vec<MessageLoss>) {
         let Some(fault) = fault else { return };
         let place = IsoTpFault::ALL.iter().position(|other| *other == fault);
         if let Some(count) = place.and_then(|place| self.counts.lost.get_mut(place)) {
             *count = count.saturating_add(1);
         }
-        // Lost messages of a controller are reported at most this often, ns.
+        // Shortest time between two reports for a controller, ns.
         if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= 60_000_000_000) {
             self.reported_at = Some(now);
             let Controller { bus, response: id, .. } = self.controller;
@@ -451,7 +453,8 @@ impl Link {
     }
 }
 
-/// Identifiers to be received for these answers, of requests too: an answer that was asked for differs from another by them.
+/// Identifiers to be received for these responses. Includes those of the requests, to tell whether a response was
+/// requested.
 pub fn wanted(answers: &[Answer]) -> Vec<(BusIndex, CanId)> {
     let both = |answer: &Answer| {
         let Controller { bus, request, response, .. } = answer.question.controller;

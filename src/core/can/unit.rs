@@ -1,9 +1,9 @@
-//! Units as the author of a DBC writes them.
+//! Units as written in a DBC.
 //!
-//! In: the text between the quotation marks. Out: the quantity and its conversion to the program's unit (A, V, degrees C).
-//! A DBC has no list of units, so an unknown text says nothing: it is neither right nor wrong.
+//! In: the text between the quotation marks. Out: the quantity and its conversion to the program's unit (A, V, degrees
+//! C). DBC files do not define a list of units, so an unknown unit gives no information.
 
-/// Quantity that a unit belongs to.
+/// Quantity of a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Quantity {
     /// A.
@@ -12,7 +12,7 @@ pub enum Quantity {
     Voltage,
     /// Degrees C.
     Temperature,
-    /// No input of a pack; its name with its article, `an angle`.
+    /// Not an input of a pack; the name with its article, such as `an angle`.
     Other(&'static str),
 }
 
@@ -21,19 +21,19 @@ impl Quantity {
     pub const PERCENTAGE: Self = Self::Other("a percentage");
 }
 
-/// A unit that is known.
+/// A known unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalUnit {
     /// Its quantity.
     pub quantity: Quantity,
-    /// Value x factor + offset is in the program's unit; 1 for a quantity without one.
+    /// Factor to the program's unit: value x factor + offset; 1 for a quantity without such a unit.
     pub factor: f64,
     /// See `factor`.
     pub offset: f64,
 }
 
 impl SignalUnit {
-    /// Reads a unit, whatever the case of its letters; `None` = unknown, or none.
+    /// Parses a unit, ignoring case; `None` = unknown or empty.
     pub fn parse(text: &str) -> Option<Self> {
         let plain: String = text.chars().filter(|c| c.is_ascii_alphanumeric() || "%/".contains(*c)).collect();
         let is_degree_sign = plain.is_empty() && text.contains('\u{b0}');
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn units_are_read_as_authors_write_them() {
+    fn common_unit_spellings_are_recognised() {
         for celsius in ["C", "degC", "deg C", "\u{b0}C", "Celsius"] {
             assert_eq!(known(celsius), Some((Quantity::Temperature, 1.0, 0.0)), "{celsius}");
         }

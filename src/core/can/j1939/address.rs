@@ -1,15 +1,15 @@
-//! Claiming the address, defending it, falling silent (J1939-81), as a machine of four states.
+//! Claims the address, defends it, and falls silent after losing it (J1939-81): a state machine with four states.
 //!
-//! | state | started | lower or same NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
+//! | state | started | lower or equal NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
 //! | idle | claim | - | - | - | - |
 //! | claiming | claim | lost | claim, wait again | claim | claimed |
 //! | claimed | claim | lost | claim | claim | - |
 //! | lost | claim | - | - | cannot claim | - |
 //!
-//! An equal NAME is a second node with this node's configuration. Arbitration cannot separate the two, and broadcasts of two
-//! nodes under one address would destroy each other: a node that receives its own NAME falls silent. (A socket does not
-//! receive its own frames.)
+//! An equal NAME belongs to a second node with the same configuration. Arbitration cannot separate the two nodes, and
+//! their broadcasts from one address would corrupt each other. Therefore a node that receives its own NAME falls
+//! silent. (A socket does not receive its own frames.)
 
 use serde::{Deserialize, Serialize};
 
@@ -19,8 +19,8 @@ use super::name::Name;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, and 50 ms because a frame is on
-/// the wire a little later than its time here (interfaces start, queues empty; 12 ms were measured).
+/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, plus 50 ms because a frame
+/// reaches the wire later than its time here (interface start, queues; 12 ms were measured).
 const CONTENTION_NS: i64 = 300_000_000;
 
 /// State of the claim.
@@ -28,7 +28,7 @@ const CONTENTION_NS: i64 = 300_000_000;
 pub(super) enum ClaimState {
     /// Not started.
     Idle,
-    /// Has claimed, waits for objections.
+    /// Waiting for objections to the claim.
     Claiming,
     /// The node has the address.
     Claimed,
@@ -39,7 +39,7 @@ pub(super) enum ClaimState {
 /// Input of the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
-    /// The program starts, or continues after time without listening.
+    /// The program starts, or resumes after time without listening.
     Started,
     /// A lower or equal NAME claims the address.
     ClaimedByStronger,
@@ -47,11 +47,11 @@ pub(super) enum ClaimEvent {
     ClaimedByWeaker,
     /// A node requests address claims.
     Requested,
-    /// No objection for the time of contention.
+    /// No objection during the contention time.
     Unopposed,
 }
 
-/// Frame to send.
+/// Response of the state machine: a frame to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ClaimAnswer {
     Nothing,
@@ -59,7 +59,7 @@ enum ClaimAnswer {
     CannotClaim,
 }
 
-/// The table above.
+/// The table in the module's documentation.
 fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
     match (state, event) {
         (ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost, ClaimEvent::Started)
@@ -89,12 +89,12 @@ pub(super) struct AddressClaim {
     name: Name,
     address: u8,
     pub(super) state: ClaimState,
-    /// When contention ends, while claiming.
+    /// End of the contention time, in state `Claiming`.
     unopposed_at: Timestamp,
-    /// Time to send a claim (in state lost: "cannot claim").
+    /// When to send a claim (in state `Lost`: "cannot claim").
     send_at: Option<Timestamp>,
     last_sent: Option<Timestamp>,
-    /// The claim that begins the contention is not yet sent.
+    /// Whether the first claim, which starts the contention time, still has to be sent.
     is_first: bool,
 }
 
@@ -111,12 +111,12 @@ impl AddressClaim {
         }
     }
 
-    /// Whether both claim the same address for the same node.
+    /// Whether both claim the same address for the same NAME.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         (self.name, self.address) == (other.name, other.address)
     }
 
-    /// Starts, or starts again after time without listening.
+    /// Starts, or restarts after time without listening.
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;
@@ -124,13 +124,13 @@ impl AddressClaim {
         self.handle(now, ClaimEvent::Started);
     }
 
-    /// Takes a claim of the address by another node.
+    /// Handles another node's claim of the address.
     pub(super) fn contend(&mut self, now: Timestamp, by: Name) -> Option<NodeEvent> {
         let (before, was_answered) = (self.state, self.send_at.is_none());
         self.handle(now, if by <= self.name { ClaimEvent::ClaimedByStronger } else { ClaimEvent::ClaimedByWeaker });
         match (before, self.state) {
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Lost) => Some(NodeEvent::AddressLost { to: by }),
-            // One event per answer: a flood of claims is answered at a limited rate.
+            // One event per response, because a flood of claims is answered at a limited rate.
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Claiming | ClaimState::Claimed) => {
                 was_answered.then_some(NodeEvent::AddressDefended { against: by })
             }
@@ -138,7 +138,7 @@ impl AddressClaim {
         }
     }
 
-    /// Takes a request for claims.
+    /// Handles a request for claims.
     pub(super) fn handle_request(&mut self, now: Timestamp) {
         self.handle(now, ClaimEvent::Requested);
     }
@@ -147,26 +147,28 @@ impl AddressClaim {
         let before = self.state;
         let (state, answer) = next(before, event);
         self.state = state;
-        // Shortest time between two claims, ns: five in the time the other node waits; a flood of claims causes no flood of answers.
+        // Shortest time between two claims, ns: five claims within the time that the other node waits, and no flood of
+        // responses to a flood of claims.
         let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(50_000_000)));
         match answer {
             ClaimAnswer::Nothing => {}
             ClaimAnswer::Claim => self.send_at = Some(self.send_at.map_or(spaced, |due| due.min(spaced))),
-            // A frame that was due before the loss was a claim.
+            // A frame that is already due in state `Lost` is a "cannot claim": keep its time.
             ClaimAnswer::CannotClaim if before == ClaimState::Lost && self.send_at.is_some() => {}
             ClaimAnswer::CannotClaim => self.send_at = Some(spaced.plus_nanos(self.loser_delay_ns())),
         }
-        // Only the start counts: requests and weaker claims must not keep the node silent.
+        // Only the start restarts the contention time: requests and weaker claims must not keep the node silent.
         if event == ClaimEvent::Started {
             self.unopposed_at = now.plus_nanos(CONTENTION_NS);
         }
     }
 
-    /// From the NAME, so that every run waits equally long and two nodes most likely do not.
+    /// Delay before "cannot claim", derived from the NAME: the same in every run, and most likely different for two
+    /// nodes.
     fn loser_delay_ns(&self) -> i64 {
-        // Fibonacci hashing: neighbouring serial numbers come out far apart.
+        // Fibonacci hashing: consecutive serial numbers give very different delays.
         let mixed = self.name.raw().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
-        // "Cannot claim" waits 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
+        // 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
         1_000_000 * i64::try_from(mixed % 154).unwrap_or(0)
     }
 
@@ -236,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn every_state_answers_every_event_as_the_table_says() {
+    fn transitions_match_table_for_all_events() {
         use ClaimAnswer::{CannotClaim, Claim, Nothing};
         use ClaimState::{Claimed, Claiming, Idle, Lost};
         let wanted = [
@@ -253,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claim_is_the_name_from_the_address_to_all() {
+    fn claim_frame_carries_name_to_all() {
         let mut claim = AddressClaim::new(name(0x8877_6655_4433_2211), 0xF9);
         claim.start(at(0));
         let frame = claim.poll(at(0)).0.unwrap();
@@ -262,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_higher_name_is_answered_by_a_claim_and_lengthens_no_wait() {
+    fn higher_name_gets_claim_without_longer_wait() {
         let mut claim = AddressClaim::new(name(10), 0xF9);
         claim.start(at(0));
         assert!(claim.poll(at(0)).0.is_some());
@@ -276,26 +278,26 @@ mod tests {
     }
 
     #[test]
-    fn a_lower_name_takes_the_address_and_cannot_claim_follows_within_153_ms() {
+    fn lower_name_wins_and_loser_reports_within_153_ms() {
         let mut claim = claimed(10);
         assert_eq!(claim.contend(at(1000), name(9)), Some(NodeEvent::AddressLost { to: name(9) }));
         let due = claim.next_due().unwrap();
         assert!(at(1000) <= due && due <= at(1153), "{due:?}");
         let frame = claim.poll(due).0.unwrap();
         assert_eq!((frame.id().raw(), frame.data()[0]), (0x18EE_FFFE, 10));
-        assert_eq!(claim.contend(at(2000), name(8)), None, "lost is lost");
+        assert_eq!(claim.contend(at(2000), name(8)), None, "the address is already lost");
         assert_eq!((claim.poll(at(9000)), claim.next_due()), ((None, None), None));
     }
 
     #[test]
-    fn an_equal_name_from_another_node_silences_this_one() {
+    fn equal_name_silences_this_node() {
         let mut claim = claimed(10);
         assert_eq!(claim.contend(at(1000), name(10)), Some(NodeEvent::AddressLost { to: name(10) }));
         assert_eq!(claim.state, ClaimState::Lost);
     }
 
     #[test]
-    fn a_flood_of_claims_is_answered_every_50_ms() {
+    fn flood_of_claims_is_answered_every_50_ms() {
         let mut claim = claimed(10);
         let (mut sent, mut events) = (0, 0);
         for ms in 1000..2000 {
@@ -303,11 +305,11 @@ mod tests {
             sent += usize::from(claim.poll(at(ms)).0.is_some());
         }
         assert_eq!(sent, 20);
-        assert!(events <= 21, "one event per answer, not {events}");
+        assert!(events <= 21, "one event per response, not {events}");
     }
 
     #[test]
-    fn a_loser_answers_a_request_with_cannot_claim() {
+    fn loser_answers_request_with_cannot_claim() {
         let mut claim = claimed(10);
         claim.contend(at(1000), name(9));
         assert!(claim.poll(at(1153)).0.is_some());
@@ -316,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn a_start_after_a_loss_claims_again() {
+    fn restart_after_loss_claims_again() {
         let mut claim = claimed(10);
         claim.contend(at(1000), name(9));
         claim.start(at(1001));

@@ -1,17 +1,19 @@
-//! The codes as sent, which follow the active codes: at most one change a second each (J1939-73).
+//! Trouble codes as sent, which follow the active codes with at most one change a second each (J1939-73).
 //!
-//! A code is sent as soon as it becomes active, and removed as soon as it is no longer active, unless its last change on the
-//! bus is less than a second ago: then the change waits. A code that was active only while it waited is still sent, for at
-//! least a second. One that was inactive only while it waited stays, with a higher count.
+//! A code is sent as soon as it becomes active, and removed as soon as it becomes inactive, unless its last change on
+//! the bus is less than a second ago. In that case, the change waits. A code that was active only while a change waited
+//! is still sent, for at least a second. A code that was inactive only while a change waited stays, with a higher
+//! count.
 //!
-//! The state "everything is known" follows the same rule, but only towards known: unknown is sent at once.
+//! The state "all known" follows the same rule when it becomes true; when it becomes false, it is sent at once.
 
 use serde::{Deserialize, Serialize};
 
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// Most codes followed at a time: more than a configuration has (17 rules of three severities are 51), few enough to search.
+/// Most codes followed at a time: more than a configuration can have (17 rules with three severities are 51), but few
+/// enough for a linear search.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.
@@ -23,28 +25,28 @@ pub struct ActiveCode {
     pub lamp: Lamp,
 }
 
-/// One code, active and as sent.
+/// One code: its active state, and its state as sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
-    /// Active now.
+    /// Whether the code is active now.
     is_active: bool,
-    /// Became active since its last change on the bus.
+    /// Whether the code became active since its last change on the bus.
     is_unseen: bool,
-    /// Most severe lamp since its last change on the bus.
+    /// Most severe lamp since the last change on the bus.
     lamp: Lamp,
     /// Lamp now.
     lamp_now: Lamp,
-    /// Lamp as sent; `None` = not active.
+    /// Lamp as sent; `None` = the code is not sent.
     shown: Option<Lamp>,
-    /// Time of its last change on the bus.
+    /// Time of the last change on the bus.
     changed_at: Option<Timestamp>,
-    /// Its change is in the message that is being transferred.
+    /// Whether the change is part of the message that is being transferred.
     is_in_flight: bool,
 }
 
 impl FollowedCode {
-    /// A code that has just become active.
+    /// Creates the state of a code that has just become active.
     fn new(active: &ActiveCode) -> Self {
         Self {
             code: active.code,
@@ -67,13 +69,13 @@ impl FollowedCode {
         (self.wanted() != self.shown).then_some(spaced(self.changed_at))
     }
 
-    /// The lamp in a message at this time.
+    /// The lamp in a message that is sent at `now`; `None` = the code is not in it.
     fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
         if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
     }
 
     fn activate(&mut self, active: &ActiveCode) {
-        // Twice in one list: the more severe lamp and the higher count hold.
+        // If the list contains the code twice, use the more severe lamp and the higher count.
         let (lamp_before, count_before) = match self.is_active {
             true => (self.lamp_now, self.code.occurrence_count()),
             false => (Lamp::None, 0),
@@ -84,7 +86,7 @@ impl FollowedCode {
         self.code = active.code.with_occurrences(active.code.occurrence_count().max(count_before).into());
     }
 
-    /// After a new list: keeps the most severe lamp that was not yet sent.
+    /// Handles the end of a new list: keeps the most severe lamp that was not sent yet.
     fn settle_lamp(&mut self) {
         if self.is_active {
             let is_unseen = self.shown.is_none_or(|shown| self.lamp > shown);
@@ -99,7 +101,7 @@ fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
     changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(1_000_000_000))
 }
 
-/// All codes.
+/// All followed codes.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(super) struct Codes {
     followed: Vec<FollowedCode>,
@@ -109,7 +111,7 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Takes the active codes; at most [`MAX_FOLLOWED`] are followed.
+    /// Handles a list of active codes, of which at most [`MAX_FOLLOWED`] are followed.
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
         self.all_known = all_known;
@@ -136,7 +138,7 @@ impl Codes {
         });
     }
 
-    /// Begins again after time without the bus: active codes count as new.
+    /// Restarts after time without the bus: active codes count as new.
     pub(super) fn restart(&mut self) {
         self.followed.retain(|followed| followed.is_active);
         for followed in &mut self.followed {
@@ -156,17 +158,17 @@ impl Codes {
         self.changes().chain(known).min()
     }
 
-    /// When each code that waits changes in the message.
+    /// Time of each waiting change.
     pub(super) fn changes(&self) -> impl Iterator<Item = Timestamp> {
         self.followed.iter().filter_map(FollowedCode::due)
     }
 
-    /// Number of codes of a message at this time.
+    /// Number of codes in a message that is sent at `now`.
     pub(super) fn count_at(&self, now: Timestamp) -> usize {
         self.followed.iter().filter(|followed| followed.shown_at(now).is_some()).count()
     }
 
-    /// A message is made at this time: every change that is due is in it.
+    /// Applies every change that is due to the message that is built at `now`.
     pub(super) fn show(&mut self, now: Timestamp) {
         for followed in &mut self.followed {
             if followed.due().is_some_and(|due| due <= now) {
@@ -183,7 +185,7 @@ impl Codes {
         }
     }
 
-    /// The last byte of the message was sent at this time: its changes count from now.
+    /// Handles the end of a message at `now`: the second without changes starts now.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);
@@ -191,7 +193,7 @@ impl Codes {
         }
     }
 
-    /// The lamps as sent: those of all codes, also of codes beyond one message.
+    /// The lamps as sent: those of all codes, including codes that do not fit into the message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }
@@ -218,7 +220,7 @@ mod tests {
         ActiveCode { code: TroubleCode::new(spn, 31, count).unwrap(), lamp }
     }
 
-    /// Sets, and shows what may be shown.
+    /// Sets the active codes and sends a message; returns its codes.
     fn step(codes: &mut Codes, ms: i64, now_active: &[ActiveCode]) -> Vec<u32> {
         codes.set(at(ms), now_active, true);
         codes.show(at(ms));
@@ -227,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_code_is_shown_at_once_and_a_second_change_waits_a_second() {
+    fn new_code_is_sent_at_once_and_next_change_waits() {
         let mut codes = Codes::default();
         assert_eq!(step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]), [1]);
         assert_eq!(step(&mut codes, 10, &[]), [1]);
@@ -238,20 +240,20 @@ mod tests {
     }
 
     #[test]
-    fn a_code_active_only_while_it_waits_is_still_shown_for_a_second() {
+    fn briefly_active_code_is_sent_for_a_second() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
         assert_eq!(step(&mut codes, 1000, &[]), [] as [u32; 0]);
         assert_eq!(step(&mut codes, 1100, &[active(1, Lamp::Amber, 2)]), [] as [u32; 0]);
         assert_eq!(step(&mut codes, 1200, &[]), [] as [u32; 0]);
-        assert_eq!(step(&mut codes, 2000, &[]), [1], "shown although it is over");
+        assert_eq!(step(&mut codes, 2000, &[]), [1], "sent although no longer active");
         assert_eq!(codes.shown()[0].occurrence_count(), 2);
         assert_eq!(step(&mut codes, 2999, &[]), [1]);
         assert_eq!(step(&mut codes, 3000, &[]), [] as [u32; 0]);
     }
 
     #[test]
-    fn a_code_inactive_only_while_it_waits_stays_shown_with_its_new_count() {
+    fn briefly_inactive_code_stays_with_new_count() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
         assert_eq!(step(&mut codes, 100, &[]), [1]);
@@ -268,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worse_lamp_is_a_change_and_a_short_worst_is_not_lost() {
+    fn briefly_worse_lamp_is_still_sent() {
         let mut codes = Codes::default();
         let red = |codes: &Codes| codes.lamps().red;
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
@@ -276,7 +278,7 @@ mod tests {
         step(&mut codes, 200, &[active(1, Lamp::Amber, 1)]);
         assert_eq!((red(&codes), codes.change_due()), (LampState::Off, Some(at(1000))));
         step(&mut codes, 1000, &[active(1, Lamp::Amber, 1)]);
-        assert_eq!(red(&codes), LampState::On, "it was red in between");
+        assert_eq!(red(&codes), LampState::On, "the lamp was red in between");
         step(&mut codes, 1500, &[active(1, Lamp::Amber, 1)]);
         assert_eq!(red(&codes), LampState::On);
         step(&mut codes, 2000, &[active(1, Lamp::Amber, 1)]);
@@ -284,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_milder_lamp_is_shown_too() {
+    fn milder_lamp_is_sent() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Red, 1)]);
         step(&mut codes, 5000, &[active(1, Lamp::Protect, 1)]);
@@ -292,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn a_code_that_comes_back_milder_does_not_light_its_old_lamp() {
+    fn code_returning_milder_does_not_light_old_lamp() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Red, 1)]);
         step(&mut codes, 1000, &[]);
@@ -302,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_named_twice_is_one_code_with_the_worse_lamp_and_the_higher_count() {
+    fn duplicate_failure_keeps_worse_lamp_and_higher_count() {
         let mut codes = Codes::default();
         assert_eq!(step(&mut codes, 0, &[active(1, Lamp::Red, 1), active(1, Lamp::Amber, 5)]), [1]);
         assert_eq!(codes.lamps(), Lamps::of([Lamp::Red], true));
@@ -310,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_is_sent_at_once_and_known_again_after_a_second() {
+    fn unknown_is_sent_at_once_but_known_waits() {
         let mut codes = Codes::default();
         let show = |codes: &mut Codes, ms, all_known| {
             codes.set(at(ms), &[], all_known);
@@ -322,18 +324,18 @@ mod tests {
         assert!(!show(&mut codes, 10, false));
         assert!(!show(&mut codes, 1009, true));
         assert!(show(&mut codes, 1010, true));
-        assert!(!show(&mut codes, 1011, false), "unknown does not wait");
+        assert!(!show(&mut codes, 1011, false), "unknown is sent without a wait");
     }
 
     #[test]
-    fn the_most_severe_come_first_then_the_lowest_number() {
+    fn codes_are_sorted_by_lamp_then_number() {
         let mut codes = Codes::default();
         let lamps = [(4, Lamp::None), (3, Lamp::Red), (2, Lamp::Amber), (1, Lamp::Red), (5, Lamp::Protect)];
         assert_eq!(step(&mut codes, 0, &lamps.map(|(spn, lamp)| active(spn, lamp, 1))), [1, 3, 2, 5, 4]);
     }
 
     #[test]
-    fn memory_is_bounded_and_given_back() {
+    fn followed_codes_are_bounded_and_forgotten() {
         let mut codes = Codes::default();
         let many: Vec<_> = (1..=70).map(|spn| active(spn, Lamp::Amber, 1)).collect();
         codes.set(at(0), &many, true);
@@ -346,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_restart_inactive_codes_are_forgotten_and_active_ones_are_new() {
+    fn restart_forgets_inactive_and_renews_active_codes() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1), active(2, Lamp::Red, 1)]);
         codes.set(at(10), &[active(2, Lamp::Amber, 1)], true);

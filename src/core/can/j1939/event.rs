@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::name::Name;
 
-/// A change worth a line in a log.
+/// An event of the node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "node_event")]
 pub enum NodeEvent {
@@ -15,17 +15,17 @@ pub enum NodeEvent {
     },
     /// Another node took the address; no codes are sent any more.
     AddressLost {
-        /// Its NAME; this node's own when two nodes have the same configuration.
+        /// Its NAME; this node's own NAME if two nodes have the same configuration.
         to: Name,
     },
-    /// Another node claimed the address and must give way.
+    /// Another node claimed the address, but has the lower priority.
     AddressDefended {
         /// Its NAME.
         against: Name,
     },
-    /// The number of active codes beyond the capacity of one message changed.
+    /// The number of active codes that do not fit into one message changed.
     CodesLeftOut {
-        /// Their number; 0 = all codes are sent again.
+        /// The number of codes; 0 = all codes are sent again.
         codes: usize,
     },
 }

@@ -4,7 +4,7 @@ use crate::can::CanId;
 
 /// Requests a parameter group, to one address or to all.
 pub const PGN_REQUEST: u32 = 59_904;
-/// Acknowledges, or here only refuses, a request.
+/// Acknowledges a request; this node sends only negative acknowledgements.
 pub const PGN_ACKNOWLEDGEMENT: u32 = 59_392;
 /// Claims an address ("cannot claim" from [`NULL_ADDRESS`]).
 pub const PGN_ADDRESS_CLAIMED: u32 = 60_928;
@@ -19,22 +19,22 @@ pub const PGN_DM2: u32 = 65_227;
 
 /// Destination of frames to all nodes.
 pub const GLOBAL_ADDRESS: u8 = 255;
-/// Source of a node that has no address.
+/// Source address of a node without an address.
 pub const NULL_ADDRESS: u8 = 254;
 /// Largest address a node may claim.
 pub const MAX_ADDRESS: u8 = 253;
 
 /// Default priority of claims, requests, acknowledgements and diagnostic messages.
 pub(super) const PRIORITY: u8 = 6;
-/// Default priority of the transport protocol: below everything, because a transfer takes many frames.
+/// Default priority of the transport protocol: the lowest, because a transfer takes many frames.
 pub(super) const TRANSPORT_PRIORITY: u8 = 7;
 
-/// Bits of an identifier that are not its priority.
+/// Mask of the identifier without the priority.
 pub(super) const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
-/// PDU formats from here on (240) carry no destination: their last byte belongs to the PGN.
+/// First PDU format without a destination; its PDU-specific byte belongs to the PGN.
 const FIRST_BROADCAST_FORMAT: u8 = 240;
 
-/// Parts of an identifier.
+/// Parts of an identifier, without the priority.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Header {
     /// Parameter group number, 18 bits.
@@ -56,26 +56,27 @@ impl Header {
     }
 }
 
-/// The identifier of a frame; `destination` counts only for groups that carry one.
+/// The identifier of a frame. `destination` is used only for groups that have one.
 pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> CanId {
     let [_, page, format, low] = pgn.to_be_bytes();
     let specific = if format < FIRST_BROADCAST_FORMAT { destination } else { low };
-    // Masked to 3 and 2 bits: callers pass the constants above, which fit.
+    // Masked to 3 and 2 bits; callers pass the constants above, which fit.
     CanId::Extended(u32::from_be_bytes([((priority & 7) << 2) | (page & 3), format, specific, source]))
 }
 
-/// Identifier and mask of one group from any source at any priority; a destination where the group carries one.
+/// Identifier and mask of one group from any source with any priority. `destination` is used only for groups that have
+/// one.
 pub(super) fn filter(pgn: u32, destination: u8) -> (u32, u32) {
     (can_id(0, pgn, destination, 0).raw(), WITHOUT_PRIORITY & !0xFF)
 }
 
-/// A PGN as payloads carry it: three bytes, lowest first.
+/// A PGN in a payload: three bytes, lowest first.
 pub(super) fn pgn_bytes(pgn: u32) -> [u8; 3] {
     let [low, middle, high, _] = pgn.to_le_bytes();
     [low, middle, high]
 }
 
-/// The PGN of three payload bytes.
+/// The PGN from three payload bytes.
 pub(super) fn pgn_of(bytes: [u8; 3]) -> u32 {
     u32::from_le_bytes([bytes[0], bytes[1], bytes[2], 0])
 }
@@ -85,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn identifiers_are_those_of_the_standard() {
+    fn identifiers_match_the_standard() {
         let id = |priority, pgn| can_id(priority, pgn, GLOBAL_ADDRESS, 0xF9).raw();
         assert_eq!(id(PRIORITY, PGN_DM1), 0x18FE_CAF9);
         assert_eq!(id(PRIORITY, PGN_DM2), 0x18FE_CBF9);
@@ -97,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn every_identifier_splits_into_the_parts_it_was_made_of() {
+    fn identifiers_split_into_their_parts() {
         for (pgn, destination, read) in
             [(PGN_REQUEST, 0x21, 0x21), (PGN_DM1, 0x21, GLOBAL_ADDRESS), (0x3_EF00, 0x21, 0x21), (0x1_FECA, 7, 255)]
         {
@@ -108,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn a_filter_leaves_priority_and_source_open() {
+    fn filter_ignores_priority_and_source() {
         let (id, mask) = filter(PGN_REQUEST, 0x21);
         for priority in 0..8 {
             assert_eq!(can_id(priority, PGN_REQUEST, 0x21, 0xF3).raw() & mask, id);

@@ -1,29 +1,30 @@
-//! J1939: this program as one node that claims an address and sends its trouble codes.
+//! J1939: packwatch as one node that claims an address and sends its trouble codes.
 //!
-//! In: times, received frames, the codes that are active now. Out: frames to send and events to log. Pure as the rest of
-//! [`can`](crate::can): the output depends on the input alone, so replay gives the same frames.
+//! In: times, received frames, the active codes. Out: frames to send and events to log. Pure like the rest of
+//! [`can`](crate::can): the output depends only on the input, so a replay gives the same frames.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | `name` | the 64-bit NAME of J1939-81 |
 //! | `id` | priorities, parameter group numbers and addresses in an extended identifier |
 //! | `trouble_code` | a code, the lamps, and the payload of DM1 and DM2 |
-//! | `codes` | the codes as sent: at most one change a second each, no short activity lost |
+//! | `codes` | the codes as sent: at most one change a second each, without losing short activity |
 //! | `transport` | payloads of more than 8 bytes, broadcast in packets (BAM) |
 //! | `address` | claiming the address, defending it, falling silent |
 //! | `event` | events of the node |
 //! | `node` | the node that consists of these parts |
 //!
-//! Promise: without its address the node sends only address claims. Unknown frames are ignored, short frames are counted,
-//! requests are answered at a limited rate; no input causes a panic.
+//! Promise: without its address, the node sends only address claims. Unknown and short frames are ignored, and requests
+//! are answered at a limited rate; no input causes a panic.
 //!
 //! Deviations from the standard:
-//! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of taking another.
-//!    A consumer that knows battery monitors by address cannot distinguish them when addresses change.
-//! 2. Every payload of more than 8 bytes is sent by BAM, also when a single node requested it (the standard has a connection
-//!    with flow control for that). That node receives the broadcast as well; the effect is bus load, limited by
-//!    [`MAX_CODES`].
-//! 3. The delay before "cannot claim" is drawn from the NAME, not at random, so that replay equals live.
+//! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of claiming
+//!    another. A consumer that identifies battery monitors by address could not tell them apart if addresses changed.
+//! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (the standard uses a
+//!    connection with flow control for that). That node receives the broadcast as well; the effect is bus load, limited
+//!    by [`MAX_CODES`].
+//! 3. The delay before "cannot claim" is derived from the NAME instead of random, so that a replay gives the same
+//!    frames.
 
 mod address;
 mod codes;

@@ -1,4 +1,4 @@
-//! The NAME of J1939-81: 64 bits that identify a node; the smaller NAME wins an address.
+//! The NAME of J1939-81: 64 bits that identify a node; the node with the smaller NAME wins an address.
 
 use std::fmt;
 
@@ -12,27 +12,27 @@ pub struct Name(u64);
 /// Fields of a NAME.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct NameFields {
-    /// Whether the node takes another address when it loses its own. This program never does.
+    /// Whether the node claims another address after losing its own. packwatch never does.
     pub arbitrary_address_capable: bool,
     /// 0 global, 1 on-highway, 2 agriculture, 3 construction, 4 marine, 5 industrial; 3 bits.
     pub industry_group: u8,
-    /// Number among equal vehicle systems; 4 bits.
+    /// Instance among equal vehicle systems; 4 bits.
     pub vehicle_system_instance: u8,
     /// Vehicle system within the industry group; 7 bits, 127 = not available.
     pub vehicle_system: u8,
     /// Function; 8 bits, 255 = not available.
     pub function: u8,
-    /// Number among nodes of this function; 5 bits.
+    /// Instance among nodes with this function; 5 bits.
     pub function_instance: u8,
-    /// Number among computers that share a function; 3 bits.
+    /// Instance among ECUs that share a function; 3 bits.
     pub ecu_instance: u8,
     /// Manufacturer, assigned by SAE; 11 bits.
     pub manufacturer_code: u16,
-    /// Serial number, unique within the maker; 21 bits.
+    /// Serial number, unique for the manufacturer; 21 bits.
     pub identity_number: u32,
 }
 
-/// A number that does not fit the bits it has on the wire.
+/// A number that does not fit its bits on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{field} = {found}, must be {lowest} to {highest}")]
 pub struct OutOfRange {
@@ -47,7 +47,7 @@ pub struct OutOfRange {
 }
 
 impl Name {
-    /// Makes a NAME of its fields.
+    /// Builds a NAME from its fields.
     ///
     /// # Errors
     /// The first field that does not fit its bits.
@@ -77,7 +77,7 @@ impl Name {
         Ok(Self(name))
     }
 
-    /// The NAME of received bytes.
+    /// The NAME from received bytes.
     pub const fn from_bytes(bytes: [u8; 8]) -> Self {
         Self(u64::from_le_bytes(bytes))
     }
@@ -87,14 +87,14 @@ impl Name {
         self.0.to_le_bytes()
     }
 
-    /// The number; the smaller wins.
+    /// The NAME as a number; the smaller number wins.
     pub const fn raw(self) -> u64 {
         self.0
     }
 }
 
 impl fmt::Display for Name {
-    /// 16 hex digits, as in the kernel's tools.
+    /// 16 hexadecimal digits, as in the kernel's tools.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:016X}", self.0)
     }
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_does_not_fit_is_an_error() {
+    fn field_that_does_not_fit_is_an_error() {
         let none = NameFields::default();
         for (fields, text) in [
             (NameFields { identity_number: 1 << 21, ..none }, "identity_number = 2097152, must be 0 to 2097151"),

@@ -1,11 +1,12 @@
 //! The node: claims its address, sends DM1 once a second and on every change, answers requests.
 //!
-//! * DM1 is sent once a second, also without any code, and at once on a change (`codes` limits the changes of one code).
+//! * DM1 is sent once a second, even without codes, and at once on a change (`codes` limits the changes of one code).
 //! * DM2 is sent only on request.
-//! * Messages of more than 8 bytes are transferred one after the other: a changed DM1 waits for the end of a transfer. When
-//!   both wait, DM1 and DM2 take turns, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2. A DM1 of
-//!   one frame passes a DM2 that is being transferred.
-//! * A request to this node alone for a group it does not have is refused; such a request to all is ignored.
+//! * Messages of more than 8 bytes are transferred one after the other: a changed DM1 waits for the end of a transfer.
+//!   If both wait, DM1 and DM2 alternate, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2. A
+//!   single-frame DM1 is sent even while a DM2 is being transferred.
+//! * If the node does not support the requested group, it rejects a request to its own address and ignores a request to
+//!   all.
 
 use std::collections::VecDeque;
 
@@ -24,9 +25,10 @@ use super::trouble_code::{DmPayload, TroubleCode, dm_payload};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::Timestamp;
 
-/// Time between two cyclic DM1, ns (J1939-73).
+/// Period of DM1, ns (J1939-73).
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
-/// Most waiting answers: a fifth would come more than 200 ms after its request, when the requester has given up (J1939-21).
+/// Most pending responses: a fifth would be sent more than 200 ms after its request, when the requester has given up
+/// (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
 
 /// Identity of a node.
@@ -39,7 +41,7 @@ pub struct NodeConfig {
 }
 
 impl NodeConfig {
-    /// Identifiers of all frames the node sends.
+    /// Identifiers of all frames that the node sends.
     pub fn sent_ids(&self) -> [CanId; 7] {
         let id = |priority, pgn, source| can_id(priority, pgn, GLOBAL_ADDRESS, source);
         [
@@ -63,7 +65,7 @@ pub struct NodeOutputs {
     pub events: Vec<NodeEvent>,
 }
 
-/// An answer to a request.
+/// A response to a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum PendingAnswer {
     Dm1,
@@ -89,7 +91,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// A node that is silent until it is started.
+    /// Creates a node that is silent until it is started.
     pub fn new(config: &NodeConfig) -> Self {
         Self {
             address: config.address,
@@ -107,14 +109,14 @@ impl Node {
         }
     }
 
-    /// Continues as `stored`, if that is the same node.
+    /// Resumes from `stored`, if it belongs to the same node.
     pub fn resume(&mut self, stored: &Self) {
         if self.address == stored.address && self.claim.is_same(&stored.claim) {
             self.clone_from(stored);
         }
     }
 
-    /// Claims the address. Codes are sent after 300 ms without objection (reason: see `address`).
+    /// Claims the address. Codes are sent after 300 ms without objection (see `address` for the reason).
     pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.fall_silent();
         self.codes.restart();
@@ -124,8 +126,8 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Sets the codes to send: active ones and previously active ones, most severe or latest first, and whether every value
-    /// that could raise one is known. The next [`poll`](Self::poll) sends them.
+    /// Sets the codes to send: active codes and previously active codes, most severe or latest first, and whether every
+    /// value that could activate a code is known. The next [`poll`](Self::poll) sends them.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -138,7 +140,7 @@ impl Node {
         self.previously_active.extend_from_slice(previously_active);
     }
 
-    /// Takes a received frame; frames that do not concern the node are ignored.
+    /// Handles a received frame; ignores frames that do not concern the node.
     pub fn handle_frame(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
         let Some(header) = Header::of(frame.id()).filter(|_| frame.kind() == FrameKind::Classic) else { return };
         match header.pgn {
@@ -163,7 +165,7 @@ impl Node {
         let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
         let answer = match (pgn_of([low, middle, high]), self.claim.state) {
-            // After a loss the address belongs to another node: only requests to all are for this one.
+            // After a loss, the address belongs to another node: only requests to all concern this node.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
                 return self.claim.handle_request(now);
@@ -174,7 +176,7 @@ impl Node {
             (_, ClaimState::Claimed) if is_for_all => return,
             (pgn, ClaimState::Claimed) => PendingAnswer::Refusal { pgn, to: header.source },
         };
-        // The answer is a broadcast: one serves all requesters.
+        // The response is a broadcast, so one response serves all requesters.
         if !self.answers.contains(&answer) && self.answers.len() < MAX_WAITING_ANSWERS {
             self.answers.push_back(answer);
         }
@@ -206,7 +208,7 @@ impl Node {
         let Some(transfer) = &mut self.transfer else { return };
         out.frames.extend(transfer.poll(now, self.address));
         if transfer.is_complete() {
-            // The next announcement keeps the packet spacing too.
+            // The next announcement also keeps the packet spacing.
             self.transport_free_at = transfer.due;
             self.last_transferred = transfer.pgn;
             if transfer.pgn == PGN_DM1 {
@@ -220,7 +222,7 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // On time, the next one keeps the cycle; after a change a new cycle begins now.
+            // If it was on time, the next DM1 keeps the cycle; after a change, a new cycle starts now.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);
@@ -237,7 +239,7 @@ impl Node {
             PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
-        // Shortest time between two answers to requests, ns: a flood of requests brings at most 20 frames a second.
+        // Shortest time between two responses to requests, ns: a flood of requests causes at most 20 frames a second.
         self.next_answer_at = now.plus_nanos(50_000_000);
         match answer {
             PendingAnswer::Dm1 => self.send_dm1(now, out),
@@ -276,17 +278,18 @@ impl Node {
         }
     }
 
-    /// After a DM1 in packets a DM2 that waits goes first.
+    /// Whether a pending DM2 goes first, because a DM1 was transferred last.
     fn is_turn_of_dm2(&self) -> bool {
         self.last_transferred == PGN_DM1 && self.answers.contains(&PendingAnswer::Dm2)
     }
 
-    /// Whether a message of this group may go out now.
+    /// Whether a message of this group can be sent now.
     fn can_start(&self, now: Timestamp, pgn: u32) -> bool {
         self.start_at(now, pgn).is_some_and(|start| start <= now)
     }
 
-    /// From when a message of this group may go out, as things stand at `now`; `None` = after another that goes first.
+    /// Earliest time at which a message of this group can be sent, given the state at `now`; `None` = another message
+    /// goes first.
     fn start_at(&self, now: Timestamp, pgn: u32) -> Option<Timestamp> {
         let codes = if pgn == PGN_DM1 { self.codes.count_at(now) } else { self.previously_active.len() };
         match &self.transfer {
@@ -298,8 +301,8 @@ impl Node {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to do, in the past = now; `None` = only a frame or [`start`](Self::start)
-    /// can change that. A poll before this time does nothing.
+    /// When [`poll`](Self::poll) has something to do; a time in the past means now; `None` = only a frame or
+    /// [`start`](Self::start) can change that. A poll before this time does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();
         if self.is_silent() {
@@ -323,12 +326,13 @@ impl Node {
         if pgn != PGN_DM1 || start.is_some_and(|start| start <= from) {
             return start;
         }
-        // Codes that leave the message may make it short enough to go out beside a transfer or before its spacing ends.
+        // When codes leave the message, it may become short enough to be sent during a transfer or before its spacing
+        // ends.
         let shorter = self.codes.changes().filter(|&change| change > from);
         shorter.filter_map(|change| self.start_at(change, pgn).map(|start| start.max(change))).chain(start).min()
     }
 
-    /// Whether only address claims may be sent: the node does not have its address.
+    /// Whether the node may send only address claims, because it does not have its address.
     pub fn is_silent(&self) -> bool {
         match self.claim.state {
             ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost => true,
@@ -336,8 +340,8 @@ impl Node {
         }
     }
 
-    /// Extended identifiers the node must receive, as identifier and mask at any priority: claims of its address, requests
-    /// to it and to all.
+    /// Extended identifiers that the node must receive, as identifier and mask for any priority: claims of its address,
+    /// requests to it and to all.
     pub fn wanted(&self) -> [(u32, u32); 3] {
         let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
         [
@@ -347,7 +351,7 @@ impl Node {
         ]
     }
 
-    /// Drops the transfer and the waiting answers.
+    /// Drops the transfer and the pending responses.
     fn fall_silent(&mut self) {
         self.transfer = None;
         self.answers.clear();

@@ -1,7 +1,7 @@
-//! A payload of more than 8 bytes, broadcast in packets (BAM of J1939-21): an announcement, then 7 bytes a packet.
+//! Broadcasts a payload of more than 8 bytes in packets (BAM of J1939-21): an announcement, then 7 bytes per packet.
 //!
-//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last one was sent, so packets
-//! keep their distance after a late poll.
+//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last one was sent, so
+//! packets keep their spacing after a late poll.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,10 +21,10 @@ pub(super) const PACKET_BYTES: usize = 7;
 // Sequence numbers are one byte and start at 1.
 const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);
 
-/// A transfer under way.
+/// A transfer in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Transfer {
-    /// Transferred parameter group.
+    /// The transferred parameter group.
     pub(super) pgn: u32,
     /// When the next packet is due.
     pub(super) due: Timestamp,
@@ -33,7 +33,7 @@ pub(super) struct Transfer {
 }
 
 impl Transfer {
-    /// Starts a transfer. Returns it with its announcement.
+    /// Starts a transfer; returns it with its announcement.
     pub(super) fn start(now: Timestamp, pgn: u32, payload: DmPayload, source: u8) -> (Self, Option<Frame>) {
         let transfer = Self { pgn, due: now.plus_nanos(PACKET_SPACING_NS), payload, sent_packets: 0 };
         let bytes = payload.as_slice().len();
@@ -45,7 +45,7 @@ impl Transfer {
         (transfer, Frame::classic(id, &announcement))
     }
 
-    /// The next packet, when it is due.
+    /// The next packet, if it is due.
     pub(super) fn poll(&mut self, now: Timestamp, source: u8) -> Option<Frame> {
         if now < self.due || self.is_complete() {
             return None;
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_keep_their_distance_also_after_a_late_one() {
+    fn packets_keep_spacing_after_late_poll() {
         let (mut transfer, _) = Transfer::start(at(0), PGN_DM1, payload(27), 1);
         assert_eq!(transfer.poll(at(49), 1), None);
         assert!(transfer.poll(at(90), 1).is_some());
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_transfer_ends_within_a_second_when_every_poll_is_a_tick_late() {
+    fn longest_transfer_ends_within_a_second_despite_late_polls() {
         let (mut transfer, _) = Transfer::start(at(0), PGN_DM1, payload(27), 1);
         let mut now = at(0);
         while !transfer.is_complete() {

@@ -1,30 +1,30 @@
-//! A trouble code, the lamps, and the payload that DM1 and DM2 share (layout: J1939-73).
+//! Trouble codes, lamps, and the common payload of DM1 and DM2 (layout: J1939-73).
 //!
 //! ```text
 //! byte 0      lamps, 2 bits each: malfunction, red stop, amber warning, protect (00 off, 01 on, 11 not available)
-//! byte 1      the same lamps' flashing: 11 = does not flash
+//! byte 1      flashing of the same lamps: 11 = does not flash
 //! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
-//! No code: four zero bytes. Up to one code: filled with 0xFF to 8 bytes. The highest bit of an occurrence count is the
-//! conversion method: set, the number has one of three older layouts, which cannot be distinguished.
+//! Without a code: four zero bytes. Up to one code: padded with 0xFF to 8 bytes. The highest bit of an occurrence count
+//! is the conversion method. If it is set, the SPN has one of three older layouts, which cannot be distinguished.
 
 use serde::{Deserialize, Serialize};
 
 use super::name::OutOfRange;
 
-/// Most codes in one message: 27, so 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of 10 ms
-/// late, a transfer ends within 0.96 s, before the next DM1 is due. Of a rule's thresholds that share a
-/// parameter number only the most severe is sent: seventeen rules are 17.
+/// Most codes in one message: 27, that is 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of
+/// 10 ms late, a transfer ends within 0.96 s, before the next DM1 is due. If thresholds of a rule share a parameter
+/// number, only the most severe is sent, so 17 rules give 17 codes.
 pub const MAX_CODES: usize = 27;
 
-/// Bytes of a message with [`MAX_CODES`] codes.
+/// Length of a message with [`MAX_CODES`] codes, bytes.
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
 
 /// Largest suspect parameter number: 19 bits.
 const MAX_SPN: u32 = (1 << 19) - 1;
 /// Largest failure mode identifier: 5 bits.
 const MAX_FMI: u8 = 31;
-/// Largest occurrence count; one more means "not available", so counting stops here.
+/// Largest occurrence count; 127 means "not available", so counting stops at 126.
 const MAX_OCCURRENCES: u8 = 126;
 
 /// A failure and its number of occurrences.
@@ -36,10 +36,11 @@ pub struct TroubleCode {
 }
 
 impl TroubleCode {
-    /// A code: suspect parameter number 1 to 524,287, failure mode identifier 0 to 31. The count saturates at 126.
+    /// Creates a code: suspect parameter number 1 to 524,287, failure mode identifier 0 to 31. The count saturates at
+    /// 126.
     ///
     /// # Errors
-    /// A number that does not fit its bits; SPN 0, which would read as "no code".
+    /// A number that does not fit its bits; SPN 0, which would mean "no code".
     pub fn new(spn: u32, fmi: u8, occurrence_count: u32) -> Result<Self, OutOfRange> {
         if !(1..=MAX_SPN).contains(&spn) {
             return Err(OutOfRange { field: "spn", found: spn.into(), lowest: 1, highest: MAX_SPN.into() });
@@ -67,12 +68,12 @@ impl TroubleCode {
         self.fmi
     }
 
-    /// Occurrences, 126 = 126 or more.
+    /// Number of occurrences; 126 = 126 or more.
     pub const fn occurrence_count(self) -> u8 {
         self.occurrence_count
     }
 
-    /// Whether both are about the same failure, whatever their counts.
+    /// Whether both are the same failure, regardless of their counts.
     pub const fn is_same_failure(self, other: Self) -> bool {
         self.spn == other.spn && self.fmi == other.fmi
     }
@@ -83,7 +84,7 @@ impl TroubleCode {
     }
 }
 
-/// The lamp a code lights, weakest first. The malfunction lamp is not among them: it is about emissions only.
+/// The lamp of a code, mildest first. The malfunction lamp is not included, because it is only for emissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lamp {
@@ -97,7 +98,7 @@ pub enum Lamp {
     Red,
 }
 
-/// State of a lamp; the numbers are those on the wire.
+/// State of a lamp; the numbers are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[repr(u8)]
 pub enum LampState {
@@ -106,11 +107,11 @@ pub enum LampState {
     Off = 0b00,
     /// A fault.
     On = 0b01,
-    /// Unknown whether there is a fault.
+    /// It is unknown whether there is a fault.
     NotAvailable = 0b11,
 }
 
-/// The lamps of a message. The malfunction lamp is always off: this program does not monitor emissions.
+/// The lamps of a message. The malfunction lamp is always off, because packwatch does not monitor emissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lamps {
     /// Protect lamp.
@@ -122,8 +123,8 @@ pub struct Lamps {
 }
 
 impl Lamps {
-    /// The lamps for active codes. While not everything is known (`all_known` false) a lamp that no code lights is
-    /// not off but not available: unknown never reads as healthy.
+    /// The lamps for active codes. If not everything is known (`all_known` is false), a lamp that no code lights is
+    /// "not available" instead of off: an unknown state must not look healthy.
     pub fn of(lit: impl IntoIterator<Item = Lamp>, all_known: bool) -> Self {
         let dark = if all_known { LampState::Off } else { LampState::NotAvailable };
         let mut lamps = Self { protect: dark, amber: dark, red: dark };
@@ -165,7 +166,7 @@ impl From<DmPayload> for Vec<u8> {
     }
 }
 
-/// A stored payload; what is longer than [`MAX_PAYLOAD`] is cut off.
+/// A stored payload; bytes beyond [`MAX_PAYLOAD`] are dropped.
 impl From<Vec<u8>> for DmPayload {
     fn from(stored: Vec<u8>) -> Self {
         let mut bytes = [0xFF; MAX_PAYLOAD];
@@ -174,8 +175,8 @@ impl From<Vec<u8>> for DmPayload {
     }
 }
 
-/// Payload of lamps and codes. Of more than [`MAX_CODES`] codes the first are taken: the caller passes the most severe
-/// first.
+/// Payload with lamps and codes. It contains at most the first [`MAX_CODES`] codes, so the caller must pass the most
+/// severe first.
 pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     let mut bytes = [0xFF; MAX_PAYLOAD];
     bytes[0] = lamps.to_byte();
@@ -188,7 +189,7 @@ pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     for (place, code) in bytes[2..].chunks_exact_mut(4).zip(codes) {
         place.copy_from_slice(&code.to_bytes());
     }
-    // One code alone fills a frame.
+    // A single code still fits into a frame.
     let len = if taken < 2 { 8 } else { 2 + 4 * taken };
     DmPayload { bytes, len, left_out: codes.len() - taken }
 }
@@ -204,17 +205,21 @@ mod tests {
     }
 
     #[test]
-    fn no_code_is_four_zero_bytes_and_still_a_message() {
+    fn no_code_is_sent_as_four_zero_bytes() {
         let payload = dm_payload(Lamps::of([], true), &[]);
         assert_eq!(payload.as_slice(), [0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
     }
 
     #[test]
-    fn unknown_is_no_lamp_off() {
+    fn unknown_lamps_are_not_available() {
         let payload = dm_payload(Lamps::of([], false), &[]);
         assert_eq!(payload.as_slice(), [0b00_11_11_11, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
         let lamps = Lamps::of([Lamp::Amber], false);
-        assert_eq!(dm_payload(lamps, &[code(1, 1, 1)]).as_slice()[0], 0b00_11_01_11, "red is not known to be off");
+        assert_eq!(
+            dm_payload(lamps, &[code(1, 1, 1)]).as_slice()[0],
+            0b00_11_01_11,
+            "whether the red lamp is off is unknown"
+        );
     }
 
     #[test]
@@ -240,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn the_malfunction_lamp_is_never_lit() {
+    fn malfunction_lamp_is_never_lit() {
         for lamp in [Lamp::None, Lamp::Protect, Lamp::Amber, Lamp::Red] {
             for all_known in [false, true] {
                 assert_eq!(dm_payload(Lamps::of([lamp], all_known), &[]).as_slice()[0] >> 6, 0, "{lamp:?}");
@@ -249,13 +254,13 @@ mod tests {
     }
 
     #[test]
-    fn counting_stops_at_126() {
+    fn occurrence_count_saturates_at_126() {
         let counts = [0, 1, 126, 127, 128, 255, 256, u32::MAX].map(|count| code(1, 0, count).occurrence_count());
         assert_eq!(counts, [0, 1, 126, 126, 126, 126, 126, 126]);
     }
 
     #[test]
-    fn numbers_that_do_not_fit_are_refused() {
+    fn numbers_that_do_not_fit_are_rejected() {
         let refused = |spn, fmi| TroubleCode::new(spn, fmi, 1).unwrap_err().to_string();
         assert_eq!(refused(0, 1), "spn = 0, must be 1 to 524287");
         assert_eq!(refused(524_288, 1), "spn = 524288, must be 1 to 524287");
@@ -263,23 +268,23 @@ mod tests {
     }
 
     #[test]
-    fn codes_beyond_the_limit_are_counted_as_left_out() {
+    fn codes_beyond_limit_are_counted_as_left_out() {
         let codes: Vec<_> = (1..=30).map(|spn| code(spn, 31, 1)).collect();
         let payload = dm_payload(Lamps::default(), &codes);
         assert_eq!((payload.as_slice().len(), payload.left_out), (110, 3));
-        assert_eq!(payload.as_slice()[106], 27, "the first 27 are in it");
+        assert_eq!(payload.as_slice()[106], 27, "the message contains the first 27");
     }
 
     proptest! {
         #[test]
-        fn a_code_reads_back_as_it_was(spn in 1_u32..=524_287, fmi in 0_u8..=31, count in 0_u32..=126) {
+        fn code_round_trips_through_bytes(spn in 1_u32..=524_287, fmi in 0_u8..=31, count in 0_u32..=126) {
             let [a, b, c, d] = code(spn, fmi, count).to_bytes();
             let read = u32::from(a) | u32::from(b) << 8 | u32::from(c >> 5) << 16;
             prop_assert_eq!((read, c & 31, u32::from(d)), (spn, fmi, count));
         }
 
         #[test]
-        fn a_message_has_every_code_in_order(
+        fn message_contains_every_code_in_order(
             parts in prop::collection::vec((1_u32..=524_287, 0_u8..=31, 0_u32..=126), 0..=MAX_CODES),
         ) {
             let codes: Vec<_> = parts.into_iter().map(|(spn, fmi, count)| code(spn, fmi, count)).collect();

@@ -1,4 +1,4 @@
-//! Signal plans against the bits one by one, and against published vectors.
+//! Signal plans compared with bit-by-bit decoding and with published vectors.
 
 use proptest::prelude::*;
 
@@ -17,7 +17,7 @@ fn layout(start_bit: u16, length_bits: u16, byte_order: ByteOrder, value_type: V
     }
 }
 
-/// The signal's bits one by one, as the DBC's numbering says: the slow truth.
+/// Reference decoder: reads bit by bit in DBC numbering.
 fn bit_by_bit(layout: &SignalLayout, payload: &[u8]) -> u64 {
     let (mut byte, mut bit) = (usize::from(layout.start_bit / 8), layout.start_bit % 8);
     let mut code = 0_u64;
@@ -54,14 +54,14 @@ fn fitting_layout() -> impl Strategy<Value = SignalLayout> {
 }
 
 #[test]
-fn motorola_signal_of_twelve_bits_agrees_with_the_published_vector() {
+fn motorola_12_bit_signal_matches_published_vector() {
     let payload = [0xC6, 0x93, 0x56, 0x5F, 0x94, 0x0A, 0xF9, 0x62];
     let plan = SignalLayout { factor: 0.5, ..layout(23, 12, ByteOrder::BigEndian, ValueType::Signed) }.plan().unwrap();
     assert_eq!(plan.decode(&payload), Ok(690.5));
 }
 
 #[test]
-fn intel_signal_of_sixteen_signed_bits_reads_a_kona_current() {
+fn intel_signed_16_bit_signal_decodes_kona_current() {
     let plan =
         SignalLayout { factor: 0.1, ..layout(32, 16, ByteOrder::LittleEndian, ValueType::Signed) }.plan().unwrap();
     assert_eq!(plan.decode(&[0, 0, 0, 0, 0xF6, 0xFF, 0, 0]), Ok(-1.0));
@@ -69,7 +69,7 @@ fn intel_signal_of_sixteen_signed_bits_reads_a_kona_current() {
 }
 
 #[test]
-fn payload_shorter_than_the_signal_is_a_short_frame() {
+fn short_payload_gives_short_frame_fault() {
     let plan = layout(32, 16, ByteOrder::LittleEndian, ValueType::Unsigned).plan().unwrap();
     assert_eq!(plan.bytes_needed(), 6);
     assert_eq!(plan.decode(&[0; 5]), Err(Fault::ShortFrame));
@@ -89,7 +89,7 @@ fn nan_and_infinity_are_not_finite() {
 }
 
 #[test]
-fn codes_on_the_limit_are_inside_and_the_next_ones_outside() {
+fn codes_on_limit_are_in_range() {
     let plan =
         SignalLayout { factor: 0.1, maximum: 409.4, ..layout(0, 12, ByteOrder::LittleEndian, ValueType::Unsigned) }
             .plan()
@@ -100,7 +100,7 @@ fn codes_on_the_limit_are_inside_and_the_next_ones_outside() {
 }
 
 #[test]
-fn writing_rounds_to_nearest_and_saturates_at_bits_and_range() {
+fn encoding_rounds_to_nearest_and_saturates() {
     let plan = SignalLayout {
         factor: 0.1,
         offset: -40.0,
@@ -113,7 +113,7 @@ fn writing_rounds_to_nearest_and_saturates_at_bits_and_range() {
     assert_eq!(plan.code(-39.96), Some(0));
     assert_eq!(plan.code(-39.94), Some(1));
     assert_eq!(plan.code(f64::NEG_INFINITY), Some(0));
-    assert_eq!(plan.code(1e300), Some(250), "the range ends before the bits do");
+    assert_eq!(plan.code(1e300), Some(250), "the range ends before the bits");
     assert_eq!(plan.code_beyond_range(1e300), Some(255));
     assert_eq!(plan.code(f64::NAN), None);
     let mut payload = [0xAA];
@@ -122,7 +122,7 @@ fn writing_rounds_to_nearest_and_saturates_at_bits_and_range() {
 }
 
 #[test]
-fn negative_factors_turn_the_range_round() {
+fn negative_factor_reverses_range() {
     let plan = SignalLayout {
         factor: -0.5,
         minimum: -10.0,
@@ -145,7 +145,7 @@ fn signed_codes_saturate_at_both_ends() {
 }
 
 #[test]
-fn impossible_layouts_are_refused_with_what_is_allowed() {
+fn invalid_layout_error_states_allowed_values() {
     let good = layout(0, 8, ByteOrder::LittleEndian, ValueType::Unsigned);
     let refused = |l: SignalLayout| l.plan().unwrap_err().to_string();
     assert_eq!(refused(SignalLayout { length_bits: 0, ..good }), "length is 0 bits, must be 1 to 64");
@@ -158,7 +158,7 @@ fn impossible_layouts_are_refused_with_what_is_allowed() {
 }
 
 #[test]
-fn a_code_with_more_bits_than_the_signal_is_refused() {
+fn code_wider_than_signal_is_rejected() {
     let plan = layout(4, 4, ByteOrder::LittleEndian, ValueType::Unsigned).plan().unwrap();
     let mut payload = [0x0A];
     assert_eq!(plan.encode_raw(&mut payload, 16), Err(Fault::OutOfRange));
@@ -167,7 +167,7 @@ fn a_code_with_more_bits_than_the_signal_is_refused() {
 }
 
 #[test]
-fn nearest_is_what_round_gives_at_every_kind_of_number() {
+fn nearest_equals_round_for_special_numbers() {
     let half_below = 0.5_f64.next_down();
     let ends =
         [0.0, -0.0, 0.5, half_below, 0.5_f64.next_up(), 1.5, 2.5, 4503599627370495.5, 4503599627370497.0, 1e18, 1e19];
@@ -178,7 +178,7 @@ fn nearest_is_what_round_gives_at_every_kind_of_number() {
     assert_eq!(nearest(f64::NAN), 0);
 }
 
-/// [`SignalPlan::code`] of integers as it is defined, in numbers that hold every code.
+/// Reference for [`SignalPlan::code`] with integers, calculated in a type that holds every code.
 fn code_by_definition(layout: &SignalLayout, value: f64) -> u64 {
     let (low, high) = layout.code_limits();
     let code = (((value - layout.offset) / layout.factor).round() as i128).clamp(low, high);
@@ -187,12 +187,12 @@ fn code_by_definition(layout: &SignalLayout, value: f64) -> u64 {
 
 proptest! {
     #[test]
-    fn any_number_is_rounded_as_round_does(number in prop_oneof![any::<f64>(), -1e3..1e3f64, (-1000..1000i32).prop_map(|n| f64::from(n) / 2.0)]) {
+    fn nearest_equals_round_for_any_number(number in prop_oneof![any::<f64>(), -1e3..1e3f64, (-1000..1000i32).prop_map(|n| f64::from(n) / 2.0)]) {
         prop_assert_eq!(nearest(number), number.round() as i64);
     }
 
     #[test]
-    fn any_value_gets_the_code_that_the_definition_gives(
+    fn code_matches_reference_for_any_value(
         l in fitting_layout(),
         value in prop_oneof![any::<f64>(), -1e6..1e6f64, Just(f64::INFINITY), Just(f64::NEG_INFINITY), -1e20..1e20f64],
     ) {
@@ -202,17 +202,17 @@ proptest! {
     }
 
     #[test]
-    fn raw_equals_the_bits_one_by_one(l in fitting_layout(), payload in prop::collection::vec(any::<u8>(), 64)) {
+    fn raw_equals_bit_by_bit_decoding(l in fitting_layout(), payload in prop::collection::vec(any::<u8>(), 64)) {
         prop_assert_eq!(l.plan().unwrap().raw(&payload), Ok(bit_by_bit(&l, &payload)));
     }
 
     #[test]
-    fn written_codes_read_back_and_leave_other_bits_alone(
+    fn encoded_codes_decode_and_keep_other_bits(
         l in fitting_layout(), before in prop::collection::vec(any::<u8>(), 64), code in any::<u64>(),
     ) {
         let plan = l.plan().unwrap();
         let code = code & plan.all_ones();
-        // The shortest payload that carries the signal, and the longest there is.
+        // The shortest payload that carries the signal, and the longest possible one.
         for length in [plan.bytes_needed(), 64] {
             let mut after = before[..length].to_vec();
             plan.encode_raw(&mut after, code).unwrap();
@@ -244,11 +244,11 @@ proptest! {
             ValueType::Float64 => 1e-12 * (value.abs() + offset.abs()),
             _ => 0.5000001 * factor.abs() + 1e-12 * (value.abs() + offset.abs()),
         };
-        prop_assert!((back - value).abs() <= allowed, "{value} came back as {back}");
+        prop_assert!((back - value).abs() <= allowed, "{value} decoded as {back}");
     }
 
     #[test]
-    fn any_layout_and_any_bytes_never_panic(
+    fn arbitrary_layouts_and_bytes_never_panic(
         l in any_layout(), factor in any::<f64>(), offset in any::<f64>(), limits in any::<(f64, f64)>(), length in 0..=70_u16,
         mut payload in prop::collection::vec(any::<u8>(), 0..=70), value in any::<f64>(), code in any::<u64>(),
     ) {
@@ -263,7 +263,7 @@ proptest! {
 }
 
 #[test]
-fn bits_are_shared_whatever_the_byte_order() {
+fn overlap_is_detected_across_byte_orders() {
     let layout = |start_bit, length_bits, byte_order| SignalLayout {
         start_bit,
         length_bits,

@@ -1,4 +1,4 @@
-//! Diagnostic answers: which frames belong together, refusals, counts, and what is lost.
+//! Diagnostic responses: reassembly, negative responses, counts, and losses.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "in a test a panic is the message")]
 
@@ -24,7 +24,7 @@ fn question(identifier: u16) -> Question {
     Question { controller: controller(None), service: Service::ByLocalIdentifier, identifier }
 }
 
-/// Cell voltages of 16 bits in mV, one after the other.
+/// Consecutive cell voltages of 16 bits, in mV.
 fn cells(identifier: u16, first: u16, count: u16) -> Answer {
     let layout = SignalLayout {
         start_bit: 7,
@@ -103,13 +103,13 @@ impl Bench {
     }
 }
 
-/// The answer's message with these codes.
+/// The response message with these codes.
 fn message(identifier: u8, codes: &[u16]) -> Vec<u8> {
     [0x61, identifier].into_iter().chain(codes.iter().flat_map(|code| code.to_be_bytes())).collect()
 }
 
 #[test]
-fn answers_of_one_controller_are_told_apart_by_what_they_echo() {
+fn responses_are_distinguished_by_echoed_identifier() {
     let mut bench = Bench::new(&[cells(2, 0, 3), cells(3, 3, 1)]);
     bench.ask(2);
     bench.answer(&message(2, &[3600, 3700, 4000]));
@@ -122,7 +122,7 @@ fn answers_of_one_controller_are_told_apart_by_what_they_echo() {
 }
 
 #[test]
-fn a_value_out_of_range_is_bad_and_a_missing_one_is_short() {
+fn out_of_range_and_truncated_values_have_faults() {
     let mut bench = Bench::new(&[cells(2, 0, 4)]);
     bench.ask(2);
     bench.answer(&message(2, &[3600, 9999, 0xFFFF]));
@@ -131,11 +131,11 @@ fn a_value_out_of_range_is_bad_and_a_missing_one_is_short() {
 }
 
 #[test]
-fn refusals_are_counted_and_wait_is_none() {
+fn refusals_are_counted_without_response_pending() {
     let mut bench = Bench::new(&[cells(2, 0, 1)]);
     bench.ask(2);
     for _ in 0..1000 {
-        bench.answer(&[0x7F, 0x21, PENDING]); // a gateway that says "wait" for ever
+        bench.answer(&[0x7F, 0x21, PENDING]); // a gateway that responds "pending" forever
     }
     bench.answer(&[0x7F, 0x21, 0x12]);
     bench.answer(&[0x7F, 0x21, 0x31]);
@@ -145,13 +145,13 @@ fn refusals_are_counted_and_wait_is_none() {
 }
 
 #[test]
-fn an_answer_that_nobody_asked_for_is_read_and_counted() {
+fn unrequested_response_is_decoded_and_counted() {
     let mut bench = Bench::new(&[cells(2, 0, 1), cells(3, 1, 1)]);
     bench.answer(&message(2, &[3600]));
     assert_eq!((bench.counts().read, bench.counts().unasked), (1, 1));
     bench.ask(3);
     bench.answer(&message(2, &[3600]));
-    assert_eq!(bench.counts().unasked, 2, "another one was asked for");
+    assert_eq!(bench.counts().unasked, 2, "a different response was requested");
     bench.answer(&message(3, &[3600]));
     assert_eq!(bench.counts().unasked, 2);
     bench.now_ms += 6000;
@@ -160,7 +160,7 @@ fn an_answer_that_nobody_asked_for_is_read_and_counted() {
 }
 
 #[test]
-fn an_answer_cut_anywhere_gives_no_reading_and_one_report_a_minute() {
+fn truncated_response_gives_one_report_a_minute() {
     let mut bench = Bench::new(&[cells(2, 0, 10)]);
     let frames = segment(None, &message(2, &[3600; 10]), 0);
     for cut in 1..frames.len() {
@@ -178,18 +178,18 @@ fn an_answer_cut_anywhere_gives_no_reading_and_one_report_a_minute() {
 }
 
 #[test]
-fn a_flood_of_first_frames_of_other_identifiers_takes_no_memory() {
+fn flood_of_foreign_first_frames_uses_no_memory() {
     let mut bench = Bench::new(&[cells(2, 0, 1)]);
     for id in 0..0x7FF {
         bench.hear(CanId::Standard(id), &[0x1F, 0xFF, 1, 2, 3, 4, 5, 6]);
     }
     assert_eq!(bench.listener.counts().count(), 1);
-    // The only ones that concern the listener: the answers' own identifier (a message begun) and the requests'.
+    // The only relevant identifiers: that of the responses (which starts a message) and that of the requests.
     assert_eq!(bench.counts(), ControllerCounts::default());
 }
 
 #[test]
-fn controllers_with_extended_addressing_share_an_identifier() {
+fn extended_addressing_separates_controllers() {
     let mut answers = [cells(2, 0, 1), cells(2, 1, 1)];
     for (answer, extension) in answers.iter_mut().zip([0xF1, 0xF2]) {
         answer.question.controller = controller(Some(extension));
@@ -204,7 +204,7 @@ fn controllers_with_extended_addressing_share_an_identifier() {
 }
 
 #[test]
-fn stored_counts_continue() {
+fn restored_counts_continue() {
     let mut bench = Bench::new(&[cells(2, 0, 1)]);
     bench.answer(&message(2, &[3600]));
     let stored: Vec<_> = bench.listener.counts().collect();
@@ -215,10 +215,10 @@ fn stored_counts_continue() {
 }
 
 #[test]
-fn requests_are_those_of_the_standards() {
+fn requests_match_the_standards() {
     let asked = |service, identifier| Question { controller: controller(None), service, identifier }.request();
     assert_eq!(asked(Service::ByIdentifier, 0x0101), [0x22, 0x01, 0x01]);
     assert_eq!(asked(Service::ByLocalIdentifier, 0x02), [0x21, 0x02]);
     assert_eq!(asked(Service::CurrentData, 0x5B), [0x01, 0x5B]);
-    assert!((0..=255).filter_map(Service::from_code).count() == 3, "nothing else can be asked");
+    assert!((0..=255).filter_map(Service::from_code).count() == 3, "no other service can be requested");
 }

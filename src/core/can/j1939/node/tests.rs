@@ -1,4 +1,4 @@
-//! The node on a fake bus with a fake clock, with a receiver that reassembles transfers.
+//! The node on a simulated bus with a simulated clock, and a receiver that reassembles transfers.
 
 mod peer_log;
 mod properties;
@@ -33,7 +33,7 @@ fn claim_of(identity_number: u32) -> Frame {
     frame(0x18EE_FF00 | u32::from(ADDRESS), &name(identity_number).to_bytes())
 }
 
-/// A complete message as a receiver has it.
+/// A complete message, as received.
 #[derive(Debug, Clone, PartialEq)]
 struct Message {
     ms: i64,
@@ -56,7 +56,7 @@ struct Bench {
     frames: Vec<(i64, Frame)>,
     events: Vec<NodeEvent>,
     messages: Vec<Message>,
-    /// Announced transfer: group, bytes, and what came of it.
+    /// Announced transfer: group, number of bytes, bytes received so far.
     transfer: Option<(u32, usize, Vec<u8>)>,
 }
 
@@ -79,7 +79,7 @@ impl Bench {
         self.node.start(at(-50), &mut self.out);
     }
 
-    /// Claimed, everything known, nothing active; the first DM1 is out at 250 ms.
+    /// A node with its address, everything known, no active code; it sends the first DM1 at 250 ms.
     fn claimed() -> Self {
         let mut bench = Self::new();
         bench.set(&[]);
@@ -149,7 +149,7 @@ impl Bench {
         self.messages.push(Message { ms: self.now_ms, pgn, data });
     }
 
-    /// When each DM of a group was complete, and its codes.
+    /// When each message of a group was complete, and its codes.
     fn received(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
         self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
     }
@@ -160,7 +160,7 @@ impl Bench {
 }
 
 #[test]
-fn nothing_is_sent_before_the_start() {
+fn nothing_is_sent_before_start() {
     let mut bench = Bench::new();
     bench.set(&[active(1, Lamp::Red)]);
     bench.receive(&request(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS));
@@ -169,7 +169,7 @@ fn nothing_is_sent_before_the_start() {
 }
 
 #[test]
-fn the_first_dm1_comes_300_ms_after_the_claim_and_then_one_a_second_without_any_code() {
+fn dm1_starts_300_ms_after_claim_and_repeats_each_second() {
     let mut bench = Bench::claimed();
     bench.run_to(3500);
     let dm1 = 0x18FE_CA00 | u32::from(ADDRESS);
@@ -178,7 +178,7 @@ fn the_first_dm1_comes_300_ms_after_the_claim_and_then_one_a_second_without_any_
 }
 
 #[test]
-fn without_any_word_about_the_alarms_every_lamp_is_unknown() {
+fn lamps_are_unknown_before_first_codes() {
     let mut bench = Bench::new();
     bench.start();
     bench.run_to(250);
@@ -186,7 +186,7 @@ fn without_any_word_about_the_alarms_every_lamp_is_unknown() {
 }
 
 #[test]
-fn a_change_is_sent_at_once_and_the_rhythm_starts_again_from_it() {
+fn change_is_sent_at_once_and_restarts_cycle() {
     let mut bench = Bench::claimed();
     bench.run_to(600);
     bench.set(&[active(1, Lamp::Amber)]);
@@ -195,7 +195,7 @@ fn a_change_is_sent_at_once_and_the_rhythm_starts_again_from_it() {
 }
 
 #[test]
-fn a_flickering_code_changes_once_a_second_on_the_bus() {
+fn flickering_code_changes_once_a_second() {
     let mut bench = Bench::claimed();
     for step in 0..100 {
         let codes = [active(1, Lamp::Amber)];
@@ -215,7 +215,7 @@ fn a_flickering_code_changes_once_a_second_on_the_bus() {
 }
 
 #[test]
-fn two_codes_go_by_bam_with_50_ms_between_packets() {
+fn two_codes_are_sent_by_bam_every_50_ms() {
     let mut bench = Bench::claimed();
     bench.set(&[active(2, Lamp::Amber), active(1, Lamp::Red)]);
     bench.run_to(1000);
@@ -226,7 +226,7 @@ fn two_codes_go_by_bam_with_50_ms_between_packets() {
 }
 
 #[test]
-fn a_changed_set_waits_for_the_transfers_end() {
+fn changed_codes_wait_for_end_of_transfer() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
     bench.run_to(300);
@@ -236,18 +236,18 @@ fn a_changed_set_waits_for_the_transfers_end() {
 }
 
 #[test]
-fn a_transfer_counts_as_seen_at_its_end() {
+fn transferred_change_counts_from_its_end() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
     bench.run_to(400);
     bench.set(&[]);
     bench.run_to(3000);
     let wanted = [(351, vec![1, 2]), (1351, vec![1, 2]), (1351, vec![])];
-    assert_eq!(bench.received(PGN_DM1)[1..4], wanted, "a second after its last packet, behind the cyclic one");
+    assert_eq!(bench.received(PGN_DM1)[1..4], wanted, "a second after the last packet, after the cyclic DM1");
 }
 
 #[test]
-fn dm2_is_sent_only_on_request_and_with_the_present_lamps() {
+fn dm2_is_sent_on_request_with_current_lamps() {
     let mut bench = Bench::claimed();
     bench.set_dm2(&[active(9, Lamp::Amber)], 7..=7);
     bench.run_to(5000);
@@ -264,7 +264,7 @@ fn dm2_is_sent_only_on_request_and_with_the_present_lamps() {
 }
 
 #[test]
-fn a_requested_dm1_is_sent_between_two_cyclic_ones() {
+fn requested_dm1_is_sent_between_cyclic_ones() {
     let mut bench = Bench::claimed();
     bench.run_to(700);
     bench.receive(&request(PGN_DM1, ADDRESS));
@@ -273,7 +273,7 @@ fn a_requested_dm1_is_sent_between_two_cyclic_ones() {
 }
 
 #[test]
-fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
+fn unknown_request_is_rejected_only_if_addressed() {
     let mut bench = Bench::claimed();
     bench.receive(&request(0xFEE5, GLOBAL_ADDRESS));
     bench.receive(&request(0xFEE5, OTHER));
@@ -286,7 +286,7 @@ fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
 }
 
 #[test]
-fn a_request_for_claims_is_answered_with_the_address() {
+fn request_for_claims_is_answered_with_claim() {
     for to in [ADDRESS, GLOBAL_ADDRESS] {
         let mut bench = Bench::claimed();
         bench.receive(&request(PGN_ADDRESS_CLAIMED, to));
@@ -296,7 +296,7 @@ fn a_request_for_claims_is_answered_with_the_address() {
 }
 
 #[test]
-fn a_flood_of_requests_is_answered_every_50_ms_and_the_rest_is_dropped() {
+fn flood_of_requests_is_answered_every_50_ms() {
     let mut bench = Bench::claimed();
     let mut requests = 0;
     while bench.now_ms < 1250 {
@@ -306,9 +306,9 @@ fn a_flood_of_requests_is_answered_every_50_ms_and_the_rest_is_dropped() {
     }
     bench.run_to(1500);
     let refused = bench.ids().iter().filter(|(_, id)| *id == 0x18E8_FFF9).count();
-    assert_eq!(refused, 24, "20 in the second and the 4 that waited");
+    assert_eq!(refused, 24, "20 during the second plus the 4 pending ones");
     assert!(requests > 24);
-    assert_eq!(bench.received(PGN_DM1).len(), 2, "DM1 does not suffer");
+    assert_eq!(bench.received(PGN_DM1).len(), 2, "DM1 continues");
 }
 
 #[test]
@@ -324,7 +324,7 @@ fn equal_requests_are_answered_once() {
 }
 
 #[test]
-fn long_dm1_and_dm2_take_turns_under_a_flood() {
+fn long_dm1_and_dm2_alternate_during_flood() {
     let mut bench = Bench::claimed();
     let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
     bench.set_dm2(&codes, 28..=54);
@@ -340,7 +340,7 @@ fn long_dm1_and_dm2_take_turns_under_a_flood() {
 }
 
 #[test]
-fn a_dm1_of_one_frame_passes_a_dm2_under_way() {
+fn single_frame_dm1_is_sent_during_dm2_transfer() {
     let mut bench = Bench::claimed();
     bench.set_dm2(&[], 1..=27);
     bench.receive(&request(PGN_DM2, ADDRESS));
@@ -353,7 +353,7 @@ fn a_dm1_of_one_frame_passes_a_dm2_under_way() {
 }
 
 #[test]
-fn of_too_many_codes_the_most_severe_are_sent_and_the_rest_is_reported() {
+fn too_many_codes_send_most_severe_and_report_rest() {
     let mut bench = Bench::claimed();
     let codes: Vec<_> = (1..=30).map(|spn| active(spn, if spn > 5 { Lamp::Red } else { Lamp::Protect })).collect();
     bench.set(&codes);
@@ -361,7 +361,7 @@ fn of_too_many_codes_the_most_severe_are_sent_and_the_rest_is_reported() {
     let received = bench.received(PGN_DM1);
     assert_eq!(received[1].1, (6..=30).chain(1..=2).collect::<Vec<u32>>());
     assert_eq!(received[1].1.len(), MAX_CODES);
-    assert_eq!(bench.messages[1].data[0], 0x11, "the lamps are those of all");
+    assert_eq!(bench.messages[1].data[0], 0x11, "the lamps include all codes");
     assert_eq!(bench.events[1..], [NodeEvent::CodesLeftOut { codes: 3 }]);
     bench.set(&[]);
     bench.run_to(4000);
@@ -369,7 +369,7 @@ fn of_too_many_codes_the_most_severe_are_sent_and_the_rest_is_reported() {
 }
 
 #[test]
-fn the_longest_dm1_still_comes_once_a_second() {
+fn longest_dm1_is_sent_once_a_second() {
     let mut bench = Bench::claimed();
     let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
     bench.set(&codes);
@@ -380,7 +380,7 @@ fn the_longest_dm1_still_comes_once_a_second() {
 }
 
 #[test]
-fn losing_the_address_stops_everything_even_within_a_transfer() {
+fn losing_address_stops_even_running_transfer() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
     bench.run_to(310);
@@ -398,14 +398,14 @@ fn losing_the_address_stops_everything_even_within_a_transfer() {
     }
     bench.receive(&request(PGN_ADDRESS_CLAIMED, ADDRESS));
     bench.run_to(11_000);
-    assert_eq!(bench.frames.len(), sent + 1, "the address is another's, it answers");
+    assert_eq!(bench.frames.len(), sent + 1, "the other node has the address and answers");
     bench.receive(&request(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS));
     bench.run_to(12_000);
     assert_eq!(bench.ids()[sent + 1].1, 0x18EE_FFFE);
 }
 
 #[test]
-fn a_weaker_contender_is_answered_and_dm1_continues() {
+fn weaker_contender_is_answered_and_dm1_continues() {
     let mut bench = Bench::claimed();
     bench.receive(&claim_of(101));
     bench.run_to(1300);
@@ -415,7 +415,7 @@ fn a_weaker_contender_is_answered_and_dm1_continues() {
 }
 
 #[test]
-fn after_a_gap_the_address_is_claimed_again_and_the_codes_are_sent_again() {
+fn gap_repeats_claim_and_codes() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red)]);
     bench.run_to(300);
@@ -428,7 +428,7 @@ fn after_a_gap_the_address_is_claimed_again_and_the_codes_are_sent_again() {
 }
 
 #[test]
-fn a_code_active_during_the_address_claim_is_sent() {
+fn code_active_during_claim_is_sent() {
     let mut bench = Bench::new();
     bench.start();
     bench.set(&[active(1, Lamp::Red)]);
@@ -459,7 +459,7 @@ fn short_claims_and_requests_are_ignored() {
 }
 
 #[test]
-fn the_filters_let_through_what_concerns_the_node() {
+fn filters_pass_frames_for_this_node() {
     let node = Bench::new().node;
     let passes = |id: u32| node.wanted().iter().any(|(wanted, mask)| id & mask == *wanted);
     for id in [0x18EE_FFF9, 0x1CEE_FFF9, 0x18EA_F900, 0x18EA_FFFE, 0x00EA_FF21] {

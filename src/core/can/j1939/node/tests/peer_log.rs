@@ -1,4 +1,4 @@
-//! What the node sends, as the log that `tests/vcan/j1939_peers.test` plays to other J1939 implementations.
+//! The frames that the node sends, as the log that `tests/vcan/j1939_peers.test` plays to other J1939 implementations.
 
 use std::fmt::Write as _;
 
@@ -10,7 +10,8 @@ fn code(spn: u32, fmi: u8, count: u32, lamp: Lamp) -> ActiveCode {
     ActiveCode { code: TroubleCode::new(spn, fmi, count).unwrap(), lamp }
 }
 
-/// The claim; then DM1 with none, one, two, five and 27 codes and with nothing known, DM2 with none, one and three; two seconds each.
+/// The claim; then DM1 with no, one, two, five and 27 codes and with nothing known, and DM2 with no, one and three
+/// codes; two seconds each.
 fn played() -> Bench {
     let mut bench = Bench::new();
     bench.set(&[]);
@@ -41,11 +42,11 @@ fn played() -> Bench {
 }
 
 #[test]
-fn the_log_that_peers_are_played_is_what_the_node_sends() {
+fn peer_log_matches_sent_frames() {
     let mut log = String::new();
     for (ms, frame) in played().frames {
         let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
         let _ = writeln!(log, "({}.{:03}000) vcan0 {}#{data}", 1_700_000_000 + ms / 1000, ms % 1000, frame.id());
     }
-    assert!(log == LOG, "write tests/vcan/j1939_peers.log again:\n{log}");
+    assert!(log == LOG, "replace tests/vcan/j1939_peers.log with:\n{log}");
 }

@@ -18,7 +18,7 @@ enum Act {
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    // Identifiers that concern the node more often than chance would bring them.
+    // Identifiers that concern the node, more often than a random choice would give them.
     let id = prop_oneof![
         Just(0x18EE_FFF9_u32),
         Just(0x18EA_F921),
@@ -50,7 +50,8 @@ fn lamp_of(number: u8) -> Lamp {
 fn perform(bench: &mut Bench, act: &Act) {
     match act {
         Act::Wait(ms) => {
-            // As a driver that sleeps until something is due, and polls at most once a tick (here 1 ms), as the busy one does.
+            // Simulates a driver that sleeps until something is due, and polls at most once a tick (here 1 ms) like the
+            // busy driver.
             let (end, mut next_tick) = (bench.now_ms + i64::from(*ms), bench.now_ms);
             while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end) && next_tick <= end) {
                 bench.now_ms = next_tick.max(due.nanos().saturating_add(999_999) / 1_000_000);
@@ -82,7 +83,7 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
-/// The same acts on a node that is polled only when something is due, and on one that is polled every millisecond.
+/// The same inputs for a node that is polled only when something is due, and for one that is polled every millisecond.
 fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
     for act in acts {
@@ -101,9 +102,10 @@ fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     (sleeper, busy)
 }
 
-/// Found by the property below: during the transfer of a DM2 the second code leaves the DM1, which then fits into one frame.
+/// Found by the property below: during the transfer of a DM2, the second code leaves the DM1, which then fits into one
+/// frame.
 #[test]
-fn a_dm1_that_becomes_short_during_a_transfer_is_due() {
+fn dm1_shortened_during_transfer_is_due() {
     let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };
     let dm2 = Act::Frame { id: 0x18EA_FF21, data: pgn_bytes(PGN_DM2).to_vec() };
     let waits = |ms: &[u16]| ms.iter().map(|&ms| Act::Wait(ms)).collect::<Vec<_>>();
@@ -117,16 +119,16 @@ fn a_dm1_that_becomes_short_during_a_transfer_is_due() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, ..ProptestConfig::default() })]
 
-    /// A driver may leave out every poll before the due time: replay does, a live daemon may not.
+    /// A driver may skip every poll before the due time: a replay does, a live daemon does not.
     #[test]
-    fn polls_before_the_due_time_change_nothing(acts in proptest::collection::vec(act(), 1..60)) {
+    fn polls_before_due_time_change_nothing(acts in proptest::collection::vec(act(), 1..60)) {
         let (sleeper, busy) = sleeping_and_polled(&acts);
         prop_assert_eq!(sleeper.frames, busy.frames);
         prop_assert_eq!(sleeper.events, busy.events);
     }
 
     #[test]
-    fn the_node_keeps_its_promises_for_any_input(acts in proptest::collection::vec(act(), 1..120)) {
+    fn node_keeps_its_limits_for_any_input(acts in proptest::collection::vec(act(), 1..120)) {
         let sent_ids = NodeConfig { name: name(100), address: ADDRESS }.sent_ids();
         let mut bench = Bench::new();
         for act in &acts {
@@ -139,7 +141,7 @@ proptest! {
                 prop_assert!(is_claim || !claims_only, "{frame:?} from a silent node");
                 prop_assert!(sent_ids.contains(&frame.id()));
             }
-            // A driver that sleeps until something is due neither spins nor sleeps for ever.
+            // A driver that sleeps until something is due neither spins nor sleeps forever.
             bench.node.poll(at(bench.now_ms), &mut bench.out);
             bench.take();
             if let Some(due) = bench.node.next_due() {
@@ -153,7 +155,7 @@ proptest! {
     }
 
     #[test]
-    fn no_code_changes_twice_within_a_second_and_none_is_lost(
+    fn codes_change_once_a_second_and_none_is_lost(
         sets in proptest::collection::vec((0_i64..900, proptest::collection::btree_set(1_u32..6, 0..5)), 1..40)
     ) {
         let mut bench = Bench::claimed();
@@ -171,7 +173,7 @@ proptest! {
         bench.run_to(bench.now_ms + 4000);
         let received = bench.received(PGN_DM1);
         let last: std::collections::BTreeSet<u32> = received.last().unwrap().1.iter().copied().collect();
-        prop_assert_eq!(&last, &before, "in the end the bus knows what is");
+        prop_assert_eq!(&last, &before, "the last message must show the current codes");
         for (spn, from) in became_active {
             prop_assert!(received[from..].iter().any(|(_, codes)| codes.contains(&spn)), "{} was never sent", spn);
             let mut changes = Vec::new();
