@@ -200,7 +200,7 @@ fn each_rejects_unsuitable_options_by_name() {
     let out = folder.path().join("out").display().to_string();
     assert!(refused(&[&same_name, "--events", &out], 1).contains("would replace those of"));
     let onto_itself = refused(&["--estimates", &folder.path().display().to_string()], 1);
-    assert!(onto_itself.contains("is read, cannot be written too"), "{onto_itself}");
+    assert!(onto_itself.contains("is an input, must not be the output too"), "{onto_itself}");
     assert!(stdout_of(&replay(&[&log, &other, "-j", "2"]).code(2)).is_empty(), "--jobs requires --each");
 }
 

@@ -1,7 +1,7 @@
 //! A file written by its own thread, so that a slow disk never delays the loop.
 //!
-//! Bytes are collected and sent to the thread in pieces. When the waiting pieces reach their limit because the disk is too
-//! slow, or a write failed, every further write is an error: the caller abandons the file and continues.
+//! Bytes are collected and sent to the thread in pieces. After a failed write, or when too many pieces wait because the
+//! disk is too slow, every further write is an error: the caller gives up the file and continues.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -15,10 +15,10 @@ use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Bytes collected before they are sent to the thread, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Pieces waiting at most: 4 MB, ten seconds of a full 1 Mbit/s bus.
+/// Most waiting pieces: 4 MB, ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
-/// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
+/// Longest wait for the last bytes at the end; half of the time after which systemd kills the service.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
 
 /// A file and the thread that writes it.
@@ -41,7 +41,7 @@ impl BackgroundFile {
         Self::start(move |queue| write_all(file, queue))
     }
 
-    /// As [`create`](Self::create), in segments that begin with `header`; the text itself brings the first header.
+    /// Like [`create`](Self::create), but in segments that begin with `header`. The text itself contains the first header.
     ///
     /// # Errors
     /// When the first segment cannot be created.
@@ -61,7 +61,7 @@ impl BackgroundFile {
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 
-    /// Writes the rest, synchronises the file with the disk, and waits for that.
+    /// Writes the remaining bytes, synchronises the file to disk and waits for both.
     ///
     /// # Errors
     /// The first error of any write.
@@ -81,10 +81,10 @@ impl BackgroundFile {
             Ok(()) => Ok(()),
             Err(TrySendError::Full(_)) => {
                 self.pieces = None;
-                Err(io::Error::new(io::ErrorKind::TimedOut, "disk more than 4 MB behind"))
+                Err(io::Error::new(io::ErrorKind::TimedOut, "disk too slow: more than 4 MB wait to be written"))
             }
             Err(TrySendError::Disconnected(_)) => {
-                Err(self.join().err().unwrap_or_else(|| io::Error::other("writer gone")))
+                Err(self.join().err().unwrap_or_else(|| io::Error::other("the writing thread has ended")))
             }
         }
     }
@@ -93,27 +93,27 @@ impl BackgroundFile {
         self.pieces = None;
         let Some(writer) = self.writer.take() else { return Ok(()) };
         if !ends_in_time(&writer) {
-            let why = "the disk does not respond, the file is incomplete";
+            let why = "the disk does not respond; the file is incomplete";
             return Err(io::Error::new(io::ErrorKind::TimedOut, why));
         }
-        writer.join().unwrap_or_else(|_| Err(io::Error::other("writer panicked")))
+        writer.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")))
     }
 }
 
-/// Waits for a thread to end, up to [`MAX_FINISH`]; returns whether it has.
+/// Waits up to [`MAX_FINISH`] for a thread to end; returns whether it has ended.
 pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
     let began = Instant::now();
     while !thread.is_finished() {
         if began.elapsed() > MAX_FINISH {
             return false;
         }
-        // Period of looking whether the thread has ended.
+        // Polling period.
         std::thread::sleep(Duration::from_millis(5));
     }
     true
 }
 
-/// Renames the file of an earlier run to `NAME.1`: it may show what led to a crash.
+/// Renames the file of an earlier run to `NAME.1`, because it may show what led to a crash.
 fn keep_earlier(path: &Path) -> io::Result<()> {
     let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
     if !earlier.is_file() || earlier.len() == 0 {
@@ -140,7 +140,7 @@ fn write_all(mut file: File, queue: &Receiver<Vec<u8>>) -> io::Result<()> {
     for piece in queue {
         file.write_all(&piece)?;
     }
-    // A pipe or a device cannot be synchronised, and need not be.
+    // Pipes and devices cannot be synchronised (EINVAL), which is fine.
     file.sync_all().or_else(|error| if error.raw_os_error() == Some(22) { Ok(()) } else { Err(error) })
 }
 
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn everything_written_is_in_the_file_after_finish() {
+    fn finish_writes_all_bytes() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("record");
         let mut file = BackgroundFile::create(&path).unwrap();
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_an_error_at_the_latest_at_the_end() {
+    fn full_disk_fails_write_or_finish() {
         if let Ok(mut file) = BackgroundFile::create(Path::new("/dev/full")) {
             let early = file.write_all(b"x");
             assert!(early.is_err() || file.finish().is_err());

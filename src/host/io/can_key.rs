@@ -1,8 +1,7 @@
-//! The key of authenticated frames: read once at the start, from a credential of the service manager or a file, and shown
-//! nowhere.
+//! The key of authenticated frames: read once at the start from a systemd credential or a file, and never shown.
 //!
-//! In: where the key is. Out: AES-128-CMAC of any bytes. A key that is missing, readable by others, or not 16 bytes (or 32 hex
-//! digits) is an error that does not contain it.
+//! In: the key's location. Out: AES-128-CMAC of any bytes. A key that is missing, readable by others, or not 16 bytes (or 32
+//! hex digits) is an error; the error does not contain the key.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -20,7 +19,7 @@ use crate::config::KeySource;
 /// Bytes of a key.
 const KEY_BYTES: usize = 16;
 
-/// See the module.
+/// A key for AES-128-CMAC.
 #[derive(Clone)]
 pub struct CanKey(Cmac<Aes128>);
 
@@ -31,10 +30,10 @@ impl fmt::Debug for CanKey {
 }
 
 impl CanKey {
-    /// Reads the key; `credentials` is the folder of the service manager's credentials (`$CREDENTIALS_DIRECTORY`).
+    /// Reads the key. `credentials` is the folder of the service manager's credentials (`$CREDENTIALS_DIRECTORY`).
     ///
     /// # Errors
-    /// Why it cannot be used, and where it was looked for.
+    /// Why the key cannot be used, and its location.
     pub fn load(source: &KeySource, credentials: Option<OsString>) -> Result<Self, String> {
         match source {
             KeySource::Credential(name) => {
@@ -51,20 +50,20 @@ impl CanKey {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
         let file = File::open(path).map_err(|why| error(why.to_string()))?;
         let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
-        // Access of others to the file.
+        // Permissions of other users.
         if is_private && mode & 0o077 != 0 {
             return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
         }
         let mut content = Vec::new();
-        // Longest file that can be a key: hex digits and a line feed of any kind, and one byte more.
+        // The longest key (hex digits and a line break) and one byte more, to detect longer files.
         file.take(2 * KEY_BYTES as u64 + 3).read_to_end(&mut content).map_err(|why| error(why.to_string()))?;
         Self::parse(&content).map_err(error)
     }
 
-    /// A key as it is, or as hex digits with or without a line feed.
+    /// A key from raw bytes, or from hex digits with or without a line break.
     ///
     /// # Errors
-    /// When it is neither, or one byte repeated.
+    /// When it is neither, or if all bytes are equal.
     pub fn parse(content: &[u8]) -> Result<Self, String> {
         let found = content.len();
         let neither = || format!("{found} bytes, must be {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES);
@@ -104,7 +103,7 @@ mod tests {
 
     use super::*;
 
-    /// Key and messages of RFC 4493, section 4, which are the examples of NIST SP 800-38B, D.1.
+    /// Key and messages of RFC 4493, section 4, also used as examples in NIST SP 800-38B, D.1.
     const KEY: &[u8] = b"2b7e151628aed2a6abf7158809cf4f3c";
     const MESSAGE: &str = "6bc1bee22e409f96e93d7e117393172aae2d8a571e03ac9c9eb76fac45af8e5130c81c46a35ce411e5fbc1191a0a52eff69f2445df4f9b17ad2b417be66c3710";
 
@@ -116,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn cmac_gives_the_vectors_of_rfc_4493_and_nist() {
+    fn cmac_matches_vectors_of_rfc_4493() {
         let key = CanKey::parse(KEY).unwrap();
         let message = hex(MESSAGE);
         for (len, mac) in [
@@ -131,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_is_16_bytes_or_32_hex_digits_and_never_shown() {
+    fn key_is_raw_or_hex_and_never_shown() {
         let raw = hex(std::str::from_utf8(KEY).unwrap());
         let wanted = CanKey::parse(KEY).unwrap().mac(b"x");
         for same in [raw.as_slice(), b"2B7E151628AED2A6ABF7158809CF4F3C\n", b"2b7e151628aed2a6abf7158809cf4f3c\r\n"] {
@@ -146,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_that_cannot_be_used_is_an_error_that_says_where() {
+    fn unusable_key_error_states_location() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("can.key");
         let source = KeySource::File(path.clone());

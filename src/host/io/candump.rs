@@ -1,12 +1,12 @@
-//! candump log lines: the grammar that `candump -L` writes and `canplayer` reads, both ways.
+//! candump log lines: parses and writes the format that `candump -L` writes and `canplayer` reads.
 //!
-//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. Accepted, beyond the usual `(1700000000.123456) can0 123#1122`:
-//! nanosecond and relative stamps, padded names, the direction suffix of `-x`, remote frames, raw length codes,
-//! CAN FD, error frames, bytes separated by dots, drop counts of `-d`. CAN XL is recognised and not decoded.
-//! A line that does not begin with `(` is no frame line ([`Line::Other`]), as for canplayer; a line that does
-//! and breaks the grammar is a [`LineError`] with its column.
+//! Input is text that begins with a line; output is a [`Line`] that borrows the interface name. Beyond the usual form
+//! `(1700000000.123456) can0 123#1122`, the parser accepts nanosecond and relative stamps, padded names, the direction suffix
+//! of `-x`, remote frames, raw length codes, CAN FD, error frames, bytes separated by dots, and drop counts of `-d`. CAN XL is
+//! recognised but not decoded. Like canplayer, the parser ignores lines that do not begin with `(` ([`Line::Other`]). A line
+//! that begins with `(` and violates the grammar is a [`LineError`] with its column.
 //!
-//! FD payloads of a length the bus cannot carry are padded with zeros to the next one, as canplayer does.
+//! FD payloads of a length that the bus cannot carry are padded with zeros to the next valid length, as canplayer does.
 
 mod digits;
 mod parser;
@@ -43,7 +43,7 @@ pub enum Line<'a> {
         /// CAN_ERR_* class bits.
         class: u32,
     },
-    /// A CAN XL frame: well formed, not supported.
+    /// A CAN XL frame: valid but not supported.
     Xl {
         /// Its stamp.
         time: Timestamp,
@@ -57,22 +57,22 @@ pub enum Line<'a> {
         /// Frames lost since the last such line.
         frames: u64,
     },
-    /// Anything that does not begin with `(`: comment, blank, another tool's line.
+    /// Any line that does not begin with `(`: a comment, a blank line, another tool's line.
     Other,
 }
 
-/// Position and reason at which a line breaks the grammar.
+/// Where and why a line violates the grammar.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("column {column}: expected {expected}")]
 pub struct LineError {
     /// Byte position in the line, from 1.
     pub column: usize,
-    /// Input that the grammar allows there.
+    /// What the grammar allows there.
     pub expected: &'static str,
 }
 
 impl LineError {
-    /// The error with what was found in `line`, the line that was parsed.
+    /// The error and what was found in `line`, the parsed line.
     pub fn describe(&self, line: &[u8]) -> String {
         const SHOWN: usize = 24;
         let rest = line.get(self.column - 1..).unwrap_or_default();
@@ -87,25 +87,25 @@ impl LineError {
     }
 }
 
-/// Reads one line (without its line feed; a carriage return at its end is ignored).
+/// Parses one line (without its line feed; a carriage return at its end is ignored).
 ///
 /// # Errors
-/// When the line begins with `(` and breaks the grammar.
+/// When the line begins with `(` and violates the grammar.
 pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
     LineParser::new(&[]).parse(line).map(|parsed| parsed.line)
 }
 
-/// Reads a stamp `(seconds.fraction)` at the start of `text`; the rest of the text with it.
+/// Parses a stamp `(seconds.fraction)` at the start of `text`; also returns the rest of the text.
 ///
 /// # Errors
-/// When there is none.
+/// When the text does not begin with a stamp.
 pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
     let mut cursor = Cursor { text, at: 0 };
     let time = cursor.stamp()?;
     Ok((time, &text[cursor.at..]))
 }
 
-/// Reads an interface's name and a frame at the start of `text`; the rest of the text with them. `None` = they are not there.
+/// Parses an interface's name and a frame at the start of `text`; also returns the rest of the text. `None` = not found.
 pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
     let (interface, at) = Cursor { text, at: 0 }.interface().ok()?;
     let mut cursor = Cursor { text, at };
@@ -118,13 +118,13 @@ pub fn parse_frame(text: &[u8]) -> Option<(&[u8], Frame, &[u8])> {
 /// Decimals of a written stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StampDigits {
-    /// Six, as `candump -L` (the rest is cut off).
+    /// Six, like `candump -L` (further digits are cut off).
     Micros,
-    /// Nine, as `candump -L -N`.
+    /// Nine, like `candump -L -N`.
     Nanos,
 }
 
-/// Writes one line as `candump -L` does, line feed included.
+/// Writes one line like `candump -L`, including the line feed.
 ///
 /// # Errors
 /// Those of `out`.
@@ -145,7 +145,7 @@ pub fn write_line(
     out.write_all(&text.bytes[..text.len])
 }
 
-/// A frame as [`write_line`] writes it.
+/// A frame in the notation of [`write_line`].
 pub fn frame_text(frame: &Frame) -> String {
     let mut text = FrameText { bytes: [0; 8 + 3 + 2 * MAX_DATA + 1], len: 0 };
     text.frame(frame);
@@ -165,7 +165,7 @@ pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -
     }
 }
 
-/// A frame's text on the stack: identifier, `##`, flags, 64 bytes in hex, line feed.
+/// Text of a frame, on the stack: identifier, `##`, flags, 64 bytes in hex, line feed.
 struct FrameText {
     bytes: [u8; 8 + 3 + 2 * MAX_DATA + 1],
     len: usize,

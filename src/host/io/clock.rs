@@ -1,17 +1,17 @@
-//! The clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since then (which counts sleep).
+//! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since then (which counts suspend).
 //!
-//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a set clock), or with the adapter's own
-//! clock, whose origin is anything. [`MappedClock`] and [`HardwareClock`] move both onto ours:
+//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a clock set by hand), or with the adapter's own
+//! clock, whose origin is arbitrary. [`StampMapper`] maps both to our clock:
 //!
-//! * a software stamp becomes `stamp - (realtime - boottime)` with that difference measured when the frame is read.
-//!   Around a step of the clock the difference of the previous reading is tried too and the later time taken; a
-//!   stamp that fits neither becomes the time of reading;
-//! * what "fits" means is known exactly: a frame that is read now arrived after the socket was last found empty. So
-//!   the error of any one stamp is bounded by the time since then, and a step bends no time difference by more;
-//! * a hardware stamp becomes `stamp + offset`, the offset being the least seen lately of (arrival - stamp): queueing
-//!   only ever adds, so the least is the truest, and forgetting old ones lets the adapter's quartz drift.
+//! * A software stamp becomes `stamp - (realtime - boottime)`, with this difference measured when the frame is read. Around a
+//!   step of the clock the previous difference is tried too, and the later plausible time is used. A stamp that is plausible
+//!   with neither is replaced by the time of reading.
+//! * A time is plausible if it is after the socket was last found empty and before the frame was read. The error of any
+//!   stamp is therefore bounded by that interval, and so is the distortion of time differences by a step.
+//! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent (arrival - stamp), because queueing only
+//!   adds to it. Old values are forgotten, so that the offset follows the drift of the adapter's quartz.
 //!
-//! Times of one interface never go backwards. All functions but [`Reading::now`] are pure: tests bring their own clock.
+//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own clock.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Half the memory of the least hardware offset, ns. A quartz 100 ppm off bends times by 1 ms over it.
+/// Half of the time for which the smallest hardware offset is remembered, ns. Over it, a quartz 100 ppm off drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
 /// Most readings of the wall clock for one [`Reading`].
@@ -36,13 +36,13 @@ pub struct Reading {
 }
 
 impl Reading {
-    /// Reads both clocks. A kernel without CLOCK_BOOTTIME does not exist since 2.6.39; zero stands for it.
+    /// Reads both clocks. Every kernel since 2.6.39 has CLOCK_BOOTTIME; otherwise the reading is zero.
     pub fn now() -> Self {
         Self::between(nanos_of)
     }
 
-    /// The reading between two of the boot clock that lie closest together: on a busy processor this thread may wait for
-    /// milliseconds between two calls, and the clocks' difference would be wrong by as much.
+    /// Reads the wall clock between two readings of the boot clock, and keeps the attempt in which they are closest. On a busy
+    /// processor this thread may wait for milliseconds between two calls, which would falsify the clocks' difference.
     fn between(clock: impl Fn(ClockId) -> i64) -> Self {
         let read = || {
             let before_ns = clock(ClockId::CLOCK_BOOTTIME);
@@ -52,7 +52,7 @@ impl Reading {
         };
         let mut closest = read();
         for _ in 1..MOST_READINGS {
-            // Readings of the boot clock that lie this close together, ns, need no repetition: two system calls on a slow processor.
+            // If the boot clock readings are this close, ns, no further attempt is needed: two system calls on a slow processor.
             if closest.0 <= 20_000 {
                 break;
             }
@@ -73,12 +73,12 @@ fn nanos_of(clock: ClockId) -> i64 {
     clock_gettime(clock).map_or(0, nanos)
 }
 
-/// Nanoseconds of a kernel's time, which is never negative; seconds have 32 or 64 bits, as the computer has.
+/// Nanoseconds of a kernel time, which is never negative. Its seconds have 32 or 64 bits, depending on the machine.
 pub(super) fn nanos(time: TimeSpec) -> i64 {
     i64::try_from(Duration::from(time).as_nanos()).unwrap_or(i64::MAX)
 }
 
-/// Stamps the kernel gave a frame, ns on their own clocks.
+/// Stamps that the kernel gave a frame, ns on their own clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelStamps {
     /// On CLOCK_REALTIME.
@@ -90,7 +90,7 @@ pub struct KernelStamps {
 /// The program's clock.
 #[derive(Debug, Clone, Copy)]
 pub struct MappedClock {
-    /// Wall time minus boot time when the program started.
+    /// Wall time minus boot time at the program's start, ns.
     origin_ns: i64,
 }
 
@@ -115,16 +115,16 @@ impl MappedClock {
 #[derive(Debug, Clone)]
 pub struct StampMapper {
     clock: MappedClock,
-    /// When the socket was last found empty, boot time.
+    /// Boot time when the socket was last found empty, ns.
     emptied_ns: i64,
-    /// The realtime offset then.
+    /// Wall time minus boot time at that moment, ns.
     emptied_offset_ns: i64,
     hardware: HardwareClock,
     latest: Timestamp,
 }
 
 impl StampMapper {
-    /// A mapper for a socket opened at `reading`: nothing can have arrived earlier.
+    /// A mapper for a socket opened at `reading`; nothing can have arrived earlier.
     pub fn new(clock: MappedClock, reading: Reading) -> Self {
         Self {
             clock,
@@ -135,20 +135,20 @@ impl StampMapper {
         }
     }
 
-    /// Notes that the socket was found empty at `reading`: later frames are younger.
+    /// Notes that the socket was found empty at `reading`: later frames arrived after that.
     pub fn socket_empty(&mut self, reading: Reading) {
         self.emptied_ns = reading.boottime_ns;
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// Notes that the call that returned the latest frame, read at `reading`, emptied the socket: later frames are younger
-    /// than that frame.
+    /// Notes that the call that returned the latest frame, read at `reading`, emptied the socket: later frames arrived after
+    /// that frame.
     pub fn socket_emptied(&mut self, reading: Reading) {
         self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// When a frame read at `reading` arrived; never before an earlier result.
+    /// Arrival time of a frame read at `reading`; never before an earlier result.
     pub fn arrival(&mut self, stamps: KernelStamps, reading: Reading) -> Timestamp {
         let software = self.software(stamps.software_ns, reading);
         let arrived_ns = match stamps.hardware_ns {
@@ -161,7 +161,7 @@ impl StampMapper {
         self.never_back(Timestamp::from_nanos(self.clock.origin_ns + arrived_ns))
     }
 
-    /// Time of an event of the interface, noticed at `reading`; in order with its frames.
+    /// Time of an interface event noticed at `reading`, in order with its frames.
     pub fn event(&mut self, reading: Reading) -> Timestamp {
         self.never_back(self.clock.at(reading))
     }
@@ -171,35 +171,35 @@ impl StampMapper {
         self.latest
     }
 
-    /// A realtime stamp on the boot clock.
+    /// Converts a realtime stamp to the boot clock.
     fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
         let candidates =
             [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
-        // Both fit only around a step. Frames are read soon after they arrive: the later one.
+        // Both are plausible only around a step. Frames are read soon after they arrive, so the later one is used.
         candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
     }
 
     /// Whether a frame read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        // A stamp may be this much older than the moment the socket was last found empty, ns: between stamping and
-        // queueing lie a soft interrupt and, with USB adapters, a batch.
+        // Tolerance, ns, for stamps older than the moment the socket was last found empty: between stamping and queueing there
+        // is a soft interrupt and, with USB adapters, a batch.
         (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }
 
-/// The least of (arrival - stamp), remembered for one to two windows.
+/// The smallest (arrival - stamp), remembered for one to two windows.
 #[derive(Debug, Clone, Default)]
 struct HardwareClock {
-    /// Least of this window and of the one before; `None` before the first stamp.
+    /// Smallest of this window and of the previous one; `None` before the first stamp.
     least_ns: Option<(i64, i64)>,
     window_start_ns: i64,
 }
 
 impl HardwareClock {
-    /// An adapter's stamp on the boot clock; `arrived_ns` is when the frame came by the software stamp.
+    /// Converts an adapter's stamp to the boot clock; `arrived_ns` is the arrival according to the software stamp.
     fn map(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         if arrived_ns.saturating_sub(self.window_start_ns) > 2 * HARDWARE_WINDOW_NS {
-            // After a silence the old offsets say nothing: the quartz has drifted on.
+            // After a long silence the old offsets are useless, because the quartz has drifted.
             return self.restart(stamp_ns, arrived_ns);
         }
         let offset = arrived_ns.saturating_sub(stamp_ns);
@@ -213,7 +213,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// The adapter's clock jumped (it was reset, or slept): starts again.
+    /// Starts again after the adapter's clock jumped (it was reset, or slept).
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };
@@ -261,7 +261,7 @@ mod tests {
             .collect()
     }
 
-    /// A reading when the thread waits `waits_ns[n]` before its n-th call, each of which takes 1 us.
+    /// A reading by a thread that waits `waits_ns[n]` before its n-th call. Each call takes 1 us.
     fn reading_with_waits(waits_ns: &[i64]) -> Reading {
         let (calls, now_ns) = (Cell::new(0), Cell::new(0));
         Reading::between(|clock| {
@@ -271,23 +271,23 @@ mod tests {
     }
 
     #[test]
-    fn a_thread_that_waits_between_two_clocks_bends_no_stamp() {
+    fn thread_delay_between_clocks_distorts_no_stamp() {
         let busy = [4 * MS, 3 * MS, 0, 0, 0, 2 * MS, 0, 0, 0];
         for reading in [reading_with_waits(&[]), reading_with_waits(&busy), reading_with_waits(&[0, MS])] {
             assert_eq!(reading.offset_ns(), OFFSET, "{reading:?}");
         }
-        // Always busy: the calls that lie closest together.
+        // Always busy: the closest calls are used.
         let reading = reading_with_waits(&[0, MS, MS, 0, 9 * MS, MS, 0, MS, 0, 0, 9 * MS, MS]);
         assert!((reading.offset_ns() - OFFSET).abs() <= MS / 2, "{reading:?}");
     }
 
     #[test]
-    fn a_software_stamp_is_the_arrival_not_the_reading() {
+    fn software_stamp_gives_arrival_not_reading() {
         assert_eq!(arrivals(0, 0, true)[0], 100 * MS);
     }
 
     #[test]
-    fn a_stepping_wall_clock_changes_no_time_difference() {
+    fn wall_clock_step_keeps_time_differences() {
         // Between two frames, and between stamp and reading of one frame.
         for step_at in [1950 * MS, 2001 * MS] {
             for step in [3600 * S, -3600 * S, S / 2, -S / 2, 50 * MS, -50 * MS] {
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_waited_long_in_the_kernel_keep_their_distance() {
+    fn frames_delayed_in_kernel_keep_distance() {
         let mut mapper = mapper();
         mapper.socket_empty(at(S, 0));
         let read = at(31 * S, 0);
@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stamp_from_the_future_or_from_before_the_socket_was_empty_becomes_the_reading() {
+    fn implausible_stamp_becomes_time_of_reading() {
         let mut mapper = mapper();
         mapper.socket_empty(at(10 * S, 0));
         for wrong in [OFFSET + 12 * S, OFFSET + 9 * S, 0, i64::MIN, i64::MAX] {
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_one_interface_never_go_backwards() {
+    fn interface_times_never_go_backwards() {
         let mut mapper = mapper();
         let late = mapper.event(at(5 * S, 0));
         let stamps = KernelStamps { software_ns: Some(OFFSET + 4 * S), hardware_ns: None };
@@ -331,13 +331,13 @@ mod tests {
     }
 
     #[test]
-    fn sleep_counts_as_time() {
+    fn suspend_counts_as_time() {
         let clock = MappedClock::new(at(0, 0));
         assert_eq!(clock.at(at(8 * 3600 * S, 0)).since(clock.at(at(0, 0))), 28_800.0);
     }
 
     #[test]
-    fn hardware_stamps_lose_the_jitter_of_reading_and_follow_the_quartz() {
+    fn hardware_stamps_remove_jitter_and_follow_drift() {
         let mut mapper = mapper();
         // The adapter's clock started at 7 s of ours and runs 100 ppm fast; stamping in software is up to 3 ms late.
         for k in 1..600_i64 {
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn after_hours_of_silence_old_offsets_do_not_bend_the_stamps() {
+    fn silence_of_hours_discards_old_offsets() {
         let mut clock = HardwareClock::default();
         // The adapter's quartz is 50 ppm slow: 1.44 s in eight silent hours.
         let stamp = |t: i64| t - t / 20_000;
@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn an_adapter_whose_clock_restarts_is_followed() {
+    fn restarted_adapter_clock_is_followed() {
         let mut mapper = mapper();
         for (k, hardware) in [(1, 500 * S), (2, 501 * S), (3, 0), (4, S), (5, 2 * S)] {
             let stamps = KernelStamps { software_ns: Some(OFFSET + k * S), hardware_ns: Some(hardware) };

@@ -1,29 +1,29 @@
-//! Places of a server's connections: bounded in total and for each client. A new connection takes the place of the one that
-//! has been idle longest, so that silent and slow clients cannot keep others out.
+//! Limits a server's connections, in total and per client. A new connection replaces the one that has been idle longest, so
+//! that silent and slow clients cannot keep others out.
 //!
-//! A connection is idle while the client has to act: to send a request, or to read the answer. One whose request is being
-//! worked on is never closed. A connection is not closed within [`GRACE`] of becoming idle; when every place is taken by
-//! such connections, the new one is refused.
+//! A connection is idle while the client has to act: to send a request, or to read the answer. A connection whose request is
+//! being processed is never closed, and an idle one not within [`GRACE`] of becoming idle. If all slots are taken by such
+//! connections, a new one is rejected.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tokio::task::AbortHandle;
 
-/// Time for a client to send its request or to read its answer before another takes the place: far more than a working client
-/// needs.
+/// Time in which a client may send its request or read its answer before another client takes the slot; far more than a
+/// working client needs.
 pub(crate) const GRACE: Duration = Duration::from_millis(250);
 
-/// Connections at once.
+/// Most connections at once.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SlotLimits {
-    /// Of all clients.
+    /// Of all clients together.
     pub total: usize,
-    /// Of one client.
+    /// Of each client.
     pub per_client: usize,
 }
 
-/// The places; a client is known by `K`.
+/// The slots; a client is identified by `K`.
 #[derive(Debug)]
 pub(crate) struct ConnectionSlots<K> {
     limits: SlotLimits,
@@ -37,22 +37,22 @@ struct Slot<K> {
     task: AbortHandle,
 }
 
-/// Since when a connection is idle; `None` = its request is being worked on.
+/// Time since which a connection is idle; `None` = its request is being processed.
 #[derive(Debug, Clone)]
 pub(crate) struct Activity(Arc<Mutex<Option<Instant>>>);
 
 impl Activity {
-    /// A new connection is idle.
+    /// The activity of a new connection, which is idle.
     pub(crate) fn new() -> Self {
         Self(Arc::new(Mutex::new(Some(Instant::now()))))
     }
 
-    /// A request has been received.
+    /// Call when a request has been received.
     pub(crate) fn begin_request(&self) {
         self.set(None);
     }
 
-    /// The answer is there to be sent.
+    /// Call when the answer is ready to be sent.
     pub(crate) fn end_request(&self) {
         self.set(Some(Instant::now()));
     }
@@ -67,12 +67,12 @@ impl Activity {
 }
 
 impl<K: PartialEq> ConnectionSlots<K> {
-    /// Places without a connection.
+    /// Slots without connections.
     pub(crate) fn new(limits: SlotLimits) -> Self {
         Self { limits, taken: Vec::new() }
     }
 
-    /// Makes room for a connection of `client`; `false` = there is none.
+    /// Makes room for a connection of `client`; `false` = there is no room.
     pub(crate) fn make_room(&mut self, client: &K, now: Instant) -> bool {
         self.taken.retain(|place| !place.task.is_finished());
         let of_client = self.taken.iter().filter(|place| place.client == *client).count();
@@ -82,7 +82,7 @@ impl<K: PartialEq> ConnectionSlots<K> {
         self.taken.len() < self.limits.total || self.close_idlest(now, |_| true)
     }
 
-    /// Notes the connection for which there is room.
+    /// Registers a connection after [`make_room`](Self::make_room).
     pub(crate) fn take(&mut self, client: K, activity: Activity, task: AbortHandle) {
         self.taken.push(Slot { client, activity, task });
     }
@@ -99,7 +99,7 @@ impl<K: PartialEq> ConnectionSlots<K> {
 mod tests {
     use super::*;
 
-    /// A connection that never ends by itself.
+    /// A connection that never ends on its own.
     fn connect(
         places: &mut ConnectionSlots<u32>,
         client: u32,
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_longest_idle_connection_gives_way_and_a_busy_one_does_not() {
+    async fn longest_idle_connection_is_closed_first() {
         let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
         let now = Instant::now();
         let (busy, mut busy_task) = connect(&mut places, 1, now).unwrap();
@@ -130,7 +130,7 @@ mod tests {
         fourth.begin_request();
         assert!(
             tokio::time::timeout(Duration::from_millis(20), &mut busy_task).await.is_err(),
-            "a request is under way"
+            "its request is being processed"
         );
         busy_task.abort();
         assert!(busy_task.await.is_err());
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_client_with_many_connections_closes_its_own() {
+    async fn client_with_many_connections_loses_its_own() {
         let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
         let now = Instant::now();
         let (_other, mut other_task) = connect(&mut places, 1, now).unwrap();

@@ -1,10 +1,10 @@
 //! CSV logs: one row per sample, columns found by name, values in the program's units.
 //!
-//! Files of the Battery Data Format are read by its columns ([`BDF_COLUMNS`]). Positive current is discharge unless
-//! [`CsvOptions::charge_positive`] or the Battery Data Format says otherwise. An empty field is no reading. A row with a
-//! field that is no finite number, or that lacks a field, is a bad row. Where a section column exists (`cycle`,
-//! `segment` or `ref` unless named), time starts again at each of its values: with a table of start times the
-//! stamps become absolute, without one the gap between sections is unknown.
+//! Files in the Battery Data Format are recognised by its columns ([`BDF_COLUMNS`]). Positive current is discharge, except
+//! with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no reading". A row is bad if a
+//! field is missing or is not a finite number. If there is a section column (`cycle`, `segment` or `ref` unless the user
+//! names one), time restarts at each new value. A table of start times makes the stamps absolute; without it the gap between
+//! sections is unknown.
 
 use std::collections::HashMap;
 use std::io::Read;
@@ -15,23 +15,23 @@ use super::table::{self, Header, PART_COLUMNS, Quotes, Row, Table, TableError};
 use crate::can::decode::{Channel, SensorIndex};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// How CSV files are to be read.
+/// How to read CSV files.
 #[derive(Debug, Clone, Default)]
 pub struct CsvOptions {
-    /// Role to column: `time`, `current`, `voltage`, `temperature`, `section`, or with `{n}` in role and column for
+    /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `section`. With `{n}` in role and column there is
     /// one column per cell or sensor, counted from 1.
     pub columns: Vec<(String, String)>,
     /// Whether the file counts a charging current as positive.
     pub charge_positive: bool,
-    /// Table of absolute start times per section.
+    /// Table with the absolute start time of each section.
     pub start_times: Option<PathBuf>,
-    /// Cells the configuration has.
+    /// Number of cells in the configuration.
     pub cells: u16,
     /// Whether the voltage is the pack's total.
     pub pack_total: bool,
 }
 
-/// Time of a row, and whether a section begins with it.
+/// Time of a row, and whether a section begins there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RowTime {
     /// Time of the row.
@@ -52,7 +52,7 @@ pub struct CsvLog {
     pub values: Vec<(Channel, Option<f64>)>,
 }
 
-/// The section column, and where it stands.
+/// The section column and the current section.
 struct Sections {
     column: usize,
     starts: Option<HashMap<Vec<u8>, Timestamp>>,
@@ -76,7 +76,7 @@ impl CsvLog {
         Ok(Self { table, time_column, channels, charge_positive, sections, values })
     }
 
-    /// Reads one row into [`values`](Self::values); `None` = the file has ended, an inner error = the row cannot be used.
+    /// Reads one row into [`values`](Self::values); `None` = end of file, inner error = the row cannot be used.
     ///
     /// # Errors
     /// The source fails.
@@ -102,7 +102,7 @@ impl CsvLog {
 }
 
 impl Sections {
-    /// The time of a row, which may begin a new section.
+    /// The time of a row, which may start a new section.
     fn place(&mut self, row: &Row<'_>, time: Timestamp) -> Result<RowTime, TableError> {
         let section = row.bytes(self.column).ok_or_else(|| row.fault(self.column, "a section"))?;
         let is_new = self.current.as_deref() != Some(section);
@@ -117,24 +117,24 @@ impl Sections {
     }
 }
 
-/// Columns of the Battery Data Format: ours, the format's label, its name for machines; the first of several that is there counts.
+/// Columns of the Battery Data Format: our name, the format's label, its machine-readable name. The first existing one is used.
 pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
     ("time_s", "Test Time / s", "test_time_second"),
     ("current_a", "Current / A", "current_ampere"),
     ("voltage_v", "Voltage / V", "voltage_volt"),
     ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
     ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
-    // With the other sign, as the current.
+    // With the opposite sign, like the current.
     ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
 ];
 
-/// Finds the columns of samples: those that the user maps, else ours, or those of the Battery Data Format.
+/// Finds the columns of samples: those mapped by the user, else ours or those of the Battery Data Format.
 pub struct SampleColumns<'a> {
     header: &'a Header,
-    /// Role to column; `None` = the user cannot map columns.
+    /// Maps a role to a column; `None` = the user cannot map columns.
     mapping: Option<&'a [(String, String)]>,
-    /// Whether the file is of the Battery Data Format. Positive current is charge there: the format does not state it, but
-    /// counts its net capacity as charged minus discharged, and cyclers write it so.
+    /// Whether the file is in the Battery Data Format. Its positive current is charge: the format does not state it, but counts
+    /// net capacity as charged minus discharged, and cyclers write it so.
     pub is_bdf: bool,
 }
 
@@ -165,7 +165,7 @@ impl<'a> SampleColumns<'a> {
         self.header.find_any(names).ok_or_else(missing)
     }
 
-    /// Number of the column of a role, `ours` where the user maps none.
+    /// Index of the column of a role; `ours` if the user maps none.
     ///
     /// # Errors
     /// The file does not have it.
@@ -173,7 +173,7 @@ impl<'a> SampleColumns<'a> {
         self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
     }
 
-    /// Number of the column of a role, `ours` where the user maps none; `None` = the file does not have it.
+    /// Index of the column of a role, `ours` if the user maps none; `None` = the file does not have it.
     ///
     /// # Errors
     /// The file does not have the column that the user maps.
@@ -184,7 +184,7 @@ impl<'a> SampleColumns<'a> {
         }
     }
 
-    /// Number of the column at whose values time starts again.
+    /// Index of the section column, at whose values time restarts.
     ///
     /// # Errors
     /// The file does not have the column that the user maps.
@@ -197,12 +197,12 @@ impl<'a> SampleColumns<'a> {
     }
 }
 
-/// Names in the Battery Data Format.
+/// Our column's names in the Battery Data Format.
 fn bdf_names(ours: &str) -> Vec<&'static str> {
     BDF_COLUMNS.iter().filter(|of| of.0 == ours).flat_map(|of| [of.1, of.2]).collect()
 }
 
-/// The columns of a log by its options.
+/// The columns of a log, according to its options.
 struct Columns<'a> {
     named: SampleColumns<'a>,
     options: &'a CsvOptions,
@@ -229,7 +229,7 @@ impl Columns<'_> {
         Ok(channels)
     }
 
-    /// One column for the first sensor, or a pattern with as many as the file has; none is allowed.
+    /// One column for the first sensor, or a pattern for as many sensors as the file has; optional.
     fn temperatures(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
         if let Some(pattern) = self.named.mapped("temperature{n}") {
             self.named.find("temperature{n}", &[&numbered(pattern, 0)])?;
@@ -280,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn battery_data_format_counts_charge_as_positive() {
+    fn battery_data_format_current_changes_sign() {
         let text = "Test Time / s,Voltage / V,Current / A\n0,3.5,-2\n";
         let options = CsvOptions { cells: 1, ..CsvOptions::default() };
         let mut log = CsvLog::open(Box::new(text.as_bytes()), "cell.csv", &options).expect("opens");

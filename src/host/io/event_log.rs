@@ -1,5 +1,5 @@
-//! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are logged
-//! once, then as a count: a bus without a partner makes thousands a second. As JSON lines, every event is written.
+//! Writes core events as log lines: on change, with fields, by severity. Error frames and lost or unsent frames are logged
+//! once and then as counts, because a bus without a partner causes thousands a second. As JSON lines, every event is written.
 
 mod text;
 
@@ -21,13 +21,13 @@ use crate::monitor::{BusEvent, Event, EventKind, ModelState, Source};
 use crate::quantity::catalogue::Quantity;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
-/// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
+/// Writes one event as a line of JSON, the format of `--events` in `run` and `replay`.
 pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(&serde_json::to_vec(event)?)?;
     out.write_all(b"\n")
 }
 
-/// Writes the first line of a file of events, which names the vehicle; nothing where none is stated.
+/// Writes the first line of an event file, which identifies the vehicle; nothing if no vehicle is configured.
 pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result<()> {
     if !vehicle.is_stated() {
         return Ok(());
@@ -36,33 +36,33 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
     out.write_all(b"\n")
 }
 
-/// Frames of one kind on one interface that are logged as a sum.
+/// Frames of one kind on one interface, logged as counts.
 #[derive(Debug, Clone, Copy, Default)]
 struct EventSum {
     reported: Option<Timestamp>,
     unreported: u64,
-    /// Until the next sum, s.
+    /// Time until the next count is logged, s.
     period_s: f64,
 }
 
 impl EventSum {
-    /// Adds frames; returns how many to log, when it is time.
+    /// Adds frames. Returns the number to log if a line is due.
     fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
         self.unreported = self.unreported.saturating_add(frames);
         let since_s = self.reported.map_or(f64::INFINITY, |reported| time.since(reported));
         if since_s < self.period_s {
             return None;
         }
-        // After a pause it is logged at once again.
+        // After a pause the next frames are logged at once. While frames continue, counts are logged after 10 s, then after
+        // twice the previous time, up to an hour.
         let continues = since_s < 2.0 * self.period_s;
-        // Repeated faults of one interface are logged as a sum after this long, s; then after twice that, up to an hour.
         self.period_s = if continues { (2.0 * self.period_s).min(3600.0) } else { 10.0 };
         self.reported = Some(time);
         Some(std::mem::take(&mut self.unreported))
     }
 }
 
-/// The sums of one interface.
+/// The counts of one interface.
 #[derive(Debug, Clone, Copy, Default)]
 struct InterfaceSums {
     errors: EventSum,
@@ -70,7 +70,7 @@ struct InterfaceSums {
     unsent: EventSum,
 }
 
-/// Logs events.
+/// Writes events to the log.
 #[derive(Debug)]
 pub struct EventLog {
     interfaces: Vec<String>,
@@ -78,7 +78,7 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// A log for these interfaces, in the order of the configuration.
+    /// A log for these interfaces, in configuration order.
     pub fn new(interfaces: Vec<String>) -> Self {
         let sums = vec![InterfaceSums::default(); interfaces.len()];
         Self { interfaces, sums }
@@ -104,33 +104,33 @@ impl EventLog {
             }
             EventKind::Protection(change) => self.log_protection(change),
             EventKind::Flood(FloodChange { bus, id, active: true, .. }) => {
-                tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
+                tracing::warn!(interface = self.name(bus), %id, "frame rate too high, dropping frames");
             }
             EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
-                tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+                tracing::info!(interface = self.name(bus), %id, dropped, "frame rate normal again");
             }
             EventKind::SecondSender(SenderChange { bus, id, active: true, frames_per_s, expected_per_s }) => {
                 let expected_per_s = rounded(expected_per_s);
                 tracing::warn!(interface = self.name(bus), %id, frames_per_s, expected_per_s, "second sender");
             }
             EventKind::SecondSender(SenderChange { bus, id, .. }) => {
-                tracing::info!(interface = self.name(bus), %id, "second sender gone");
+                tracing::info!(interface = self.name(bus), %id, "second sender stopped");
             }
             EventKind::OwnIdentifier(OwnIdChange { bus, id, active: true, .. }) => {
-                tracing::warn!(interface = self.name(bus), %id, "another sender uses an identifier of ours");
+                tracing::warn!(interface = self.name(bus), %id, "another node sends one of our identifiers");
             }
             EventKind::OwnIdentifier(OwnIdChange { bus, id, frames, .. }) => {
-                tracing::info!(interface = self.name(bus), %id, frames, "no other sender uses identifiers of ours");
+                tracing::info!(interface = self.name(bus), %id, frames, "no other node sends our identifiers");
             }
             EventKind::MessageLoss(MessageLoss { bus, id, fault, lost }) => {
                 tracing::warn!(interface = self.name(bus), %id, lost, "diagnostic message lost: {}", fault.words());
             }
             EventKind::Poll(change) => log_poll(change),
-            EventKind::BusAsleep { asleep: true, .. } => tracing::info!("the buses sleep"),
+            EventKind::BusAsleep { asleep: true, .. } => tracing::info!("buses asleep"),
             EventKind::BusAsleep { asleep: false, seconds } => {
-                tracing::info!(seconds = seconds.map(rounded), "the buses are awake");
+                tracing::info!(seconds = seconds.map(rounded), "buses awake");
             }
-            EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
+            EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter restarted"),
             EventKind::Model { .. } => log_model(&event.kind),
             EventKind::Finding(CellFault { kind, cells, size, probability, .. }) => {
                 let (first, last) = cells.map(|(first, last)| (number(first), number(last))).unzip();
@@ -139,7 +139,7 @@ impl EventLog {
             }
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds = rounded(seconds), "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
-                tracing::warn!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate not to be trusted");
+                tracing::warn!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate untrusted");
             }
             EventKind::Trust { cell, trusted: true, mean_nis } => {
                 tracing::info!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate trusted again");
@@ -162,14 +162,14 @@ impl EventLog {
                 );
             }
             EventKind::Test { rule, running } => {
-                tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
+                tracing::info!(?rule, "{}", if running { "alarm test started" } else { "alarm test ended" });
             }
             EventKind::PackReplaced { capacity_ah, capacity_std_ah } => {
                 let (capacity_ah, capacity_std_ah) = (capacity_ah.map(rounded), capacity_std_ah.map(rounded));
                 tracing::warn!(
                     capacity_ah,
                     capacity_std_ah,
-                    "another pack: learned values of the old one no longer apply"
+                    "pack replaced: learned values of the old pack no longer apply"
                 );
             }
             EventKind::PackReturned { identity, capacity_ah, capacity_std_ah } => {
@@ -178,11 +178,11 @@ impl EventLog {
                     identity,
                     capacity_ah,
                     capacity_std_ah,
-                    "a known pack is back: its learned values are restored"
+                    "known pack connected: its learned values are restored"
                 );
             }
             EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),
-            EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),
+            EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "configuration changed"),
             EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
                 let cell = cell.map(number);
                 tracing::warn!(
@@ -191,7 +191,7 @@ impl EventLog {
                     cell,
                     active,
                     occurrences,
-                    "stored alarm dropped, nothing watches it now"
+                    "stored alarm dropped: no rule monitors it now"
                 );
             }
             EventKind::Store { works: true } => tracing::info!("files can be written"),
@@ -222,7 +222,7 @@ impl EventLog {
             BusEvent::Missing => tracing::warn!(interface, "interface missing"),
             BusEvent::Dropped { frames } => {
                 if let Some(frames) = sums.dropped.add(time, frames) {
-                    tracing::warn!(interface, frames, "frames lost on receiving");
+                    tracing::warn!(interface, frames, "received frames lost");
                 }
             }
             BusEvent::SendFailed { frames } => {
@@ -239,28 +239,28 @@ impl EventLog {
     }
 }
 
-/// Without the digits that binary arithmetic adds: nine significant ones are more than any value has.
+/// Removes the digits that binary arithmetic adds: rounds to nine significant digits, more than any value has.
 fn rounded(value: f64) -> f64 {
     format!("{value:.8e}").parse().unwrap_or(value)
 }
 
-/// A cell's number as people count, from 1.
+/// The number of a cell for users, counted from 1.
 fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
 }
 
 fn log_poll(change: PollChange) {
     match change {
-        PollChange::Silent { reason } => tracing::info!("diagnostic requests stop: {}", reason.words()),
-        PollChange::Asking => tracing::info!("diagnostic requests are sent"),
+        PollChange::Silent { reason } => tracing::info!("diagnostic requests paused: {}", reason.words()),
+        PollChange::Asking => tracing::info!("diagnostic requests started"),
         PollChange::Refused { id, service, identifier, code } => {
             let request = format!("{service:02X} {identifier:04X}");
-            tracing::warn!(%id, request, "diagnostic request refused for good, code {code:02X}: it is not sent again");
+            tracing::warn!(%id, request, "diagnostic request rejected with code {code:02X}: not sent again");
         }
     }
 }
 
-/// Logs what is known of the cells' model.
+/// Logs a change of the cell model.
 fn log_model(kind: &EventKind) {
     let EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back } = *kind else {
         return;
@@ -272,7 +272,7 @@ fn log_model(kind: &EventKind) {
         ModelState::Unfit => {
             tracing::warn!(fits_better = chemistry, "the voltages contradict the chemistry on the label")
         }
-        _ if is_taken_back => tracing::warn!(?state, capacity_ah, "the cell model before was better and holds again"),
+        _ if is_taken_back => tracing::warn!(?state, capacity_ah, "cell model reverted: the previous one was better"),
         _ => tracing::info!(?state, capacity_ah, capacity_std_ah, residual_v, "cell model learned"),
     }
 }
@@ -286,8 +286,8 @@ fn log_alarm(kind: &EventKind) {
     let (probability, threshold) = (probability.map(rounded), rounded(threshold));
     let what = match change {
         Change::Raised => "alarm raised",
-        Change::Suppressed => "alarm raised earlier, its value is not known now",
-        Change::Resumed => "alarm raised earlier, its value is known again",
+        Change::Suppressed => "alarm still raised, value unknown",
+        Change::Resumed => "alarm still raised, value known again",
         Change::Latched => "alarm latched",
         Change::Cleared => "alarm cleared",
         Change::Acknowledged => "alarm acknowledged",
@@ -347,7 +347,7 @@ mod tests {
     use crate::quantity::catalogue::{RECORDED, RecordedValues};
 
     #[test]
-    fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
+    fn day_of_errors_gives_forty_complete_lines() {
         let mut sum = EventSum::default();
         let logged: Vec<u64> =
             (0..86_400 * 4).filter_map(|n| sum.add(Timestamp::from_secs(f64::from(n) * 0.25), 2)).collect();
@@ -357,14 +357,14 @@ mod tests {
     }
 
     #[test]
-    fn a_sum_of_the_largest_numbers_stays_the_largest() {
+    fn count_saturates_at_maximum() {
         let mut sum = EventSum::default();
         let sums = [0.0, 1.0, 2.0, 10.0].map(|at_s| sum.add(Timestamp::from_secs(at_s), u64::MAX));
         assert_eq!(sums, [Some(u64::MAX), None, None, Some(u64::MAX)]);
     }
 
     #[test]
-    fn a_number_is_logged_without_the_digits_of_binary_arithmetic() {
+    fn rounding_removes_binary_digits() {
         assert_eq!(format!("{:?}", rounded(0.7 * 2.6)), "1.82");
         assert_eq!(
             (rounded(45.0), rounded(-0.1), rounded(1e-12), rounded(123_456.789)),
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn learned_values_are_logged_with_no_more_digits_than_they_have() {
+    fn learned_values_are_logged_rounded() {
         let (x, known, cell) = (0.7 * 2.6, Some(0.7 * 2.6), CellIndex(72));
         let (size, since) = (ScalarGaussian { mean: x, variance: x }, Timestamp::ZERO);
         let finding = CellFault {
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_pause_it_is_told_at_once_again() {
+    fn count_after_pause_is_logged_at_once() {
         let mut sum = EventSum::default();
         let mut add = |at_s: f64| sum.add(Timestamp::from_secs(at_s), 1);
         assert_eq!([add(0.0), add(1.0), add(10.0), add(11.0)], [Some(1), None, Some(2), None]);

@@ -1,7 +1,7 @@
-//! The journal: every input of the core, in order, so that a replay gives what the live run gave.
+//! The journal: every input of the core, in order, so that a replay reproduces the live run.
 //!
-//! A text file whose frames are candump lines with nanosecond stamps, so that `canplayer` can play it; the rest
-//! are lines that canplayer skips. First line `PACKWATCH-JOURNAL 1`, then
+//! A text file. Frames are candump lines with nanosecond stamps, which `canplayer` can play; it skips the other lines.
+//! First line `PACKWATCH-JOURNAL 1`, then
 //!
 //! ```text
 //! (1700000000.123456789) can0 123#1122
@@ -15,11 +15,10 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED`: a frame of an authenticated message, with the freshness with which its authenticator was right (`-`: with none),
-//! so that a replay needs no key. `RELOAD`: from here on another configuration is in force, which the journal does not contain.
-//! `RESTORE` is the first line of a run that restored a stored state, with the time it did not run (`-`: as the stamps
-//! say).
-//! A last line without line feed was torn by a power cut and is a bad line, even where it could be read.
+//! `SECURED`: a frame of an authenticated message, with the freshness value for which its authenticator was valid (`-`: not
+//! valid), so that a replay needs no key. `RELOAD`: from here on another configuration applies, which the journal does not
+//! contain. `RESTORE`: the first line of a run that restored a stored state, with the downtime (`-`: follows from the
+//! stamps). A last line without line feed was torn by a power cut and counts as a bad line, even if it can be parsed.
 
 use std::io::{self, Write};
 
@@ -31,15 +30,15 @@ use crate::quantity::{BusIndex, Timestamp};
 /// First line of every journal.
 pub const HEADER: &str = "PACKWATCH-JOURNAL 1";
 
-/// Words that lines other than frames begin with.
+/// Keywords of lines that are not frames.
 const KEYWORDS: [&[u8]; 8] = [b"SECURED", b"TICK", b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"];
 
-/// Whether a line that does not begin with `(` is one of the journal's.
+/// Whether a line that does not begin with `(` is a journal line.
 pub fn is_mark(line: &[u8]) -> bool {
     line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }
 
-/// Reads such a line; `None` = of an interface that `bus` does not know.
+/// Parses such a line; `None` = its interface is unknown to `bus`.
 ///
 /// # Errors
 /// When the line breaks the journal's grammar.
@@ -51,10 +50,12 @@ pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> R
     let rest_text = rest.strip_prefix(b" ").unwrap_or_default();
     let alone = |record: Record| rest.is_empty().then_some(record);
     let (record, expected) = match &line[..space] {
-        b"TICK" => (alone(Record::tick(time)), "the line's end after the stamp"),
-        b"GAP" => (alone(Record::unknown_gap(time)), "the line's end after the stamp"),
-        b"RELOAD" => (alone(Record::reload(time)), "the line's end after the stamp"),
-        b"RESTORE" => (parse_away(rest_text).map(|away| Record::restore(time, away)), "seconds away, - or unknown"),
+        b"TICK" => (alone(Record::tick(time)), "the end of the line after the stamp"),
+        b"GAP" => (alone(Record::unknown_gap(time)), "the end of the line after the stamp"),
+        b"RELOAD" => (alone(Record::reload(time)), "the end of the line after the stamp"),
+        b"RESTORE" => {
+            (parse_away(rest_text).map(|away| Record::restore(time, away)), "the downtime in seconds, - or unknown")
+        }
         b"COMMAND" => {
             let command = serde_json::from_slice(rest_text).ok();
             (command.map(|command| Record::command(time, command)), "a command as JSON")
@@ -67,7 +68,7 @@ pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> R
             Some((interface, frame, freshness)) => {
                 return Ok(bus(interface).map(|bus| Record::secured_frame(time, bus, &frame, freshness)));
             }
-            None => (None, "an interface, a frame, and its freshness or -"),
+            None => (None, "an interface, a frame, and its freshness value or -"),
         },
         _ => match parse_bus(rest_text) {
             Some((interface, event)) => return Ok(bus(interface).map(|bus| Record::bus(time, bus, event))),
@@ -127,7 +128,7 @@ impl<W: Write> JournalWriter<W> {
         Ok(Self { out, interfaces })
     }
 
-    /// Notes that a stored state was restored, and how old it was; before any input.
+    /// Records that a stored state was restored and how old it was. Must precede every input.
     ///
     /// # Errors
     /// Those of the file.
@@ -135,7 +136,7 @@ impl<W: Write> JournalWriter<W> {
         write_mark(&mut self.out, "RESTORE", now, format_args!(" {away}"))
     }
 
-    /// Notes that another configuration is in force.
+    /// Records that another configuration applies from now on.
     ///
     /// # Errors
     /// Those of the file.
@@ -177,7 +178,7 @@ impl<W: Write> JournalWriter<W> {
         }
     }
 
-    /// Hands everything to the operating system.
+    /// Passes everything to the operating system.
     ///
     /// # Errors
     /// Those of the file.
@@ -185,7 +186,7 @@ impl<W: Write> JournalWriter<W> {
         self.out.flush()
     }
 
-    /// The file.
+    /// The underlying file.
     pub fn into_inner(self) -> W {
         self.out
     }
@@ -199,7 +200,7 @@ fn write_mark(out: &mut impl Write, keyword: &str, time: Timestamp, rest: impl s
 
 fn name(interfaces: &[String], index: usize) -> io::Result<&str> {
     interfaces.get(index).map(String::as_str).ok_or_else(|| {
-        let text = format!("interface number {index}, configured are {}", interfaces.len());
+        let text = format!("interface number {index}, must be below {}, the number of interfaces", interfaces.len());
         io::Error::new(io::ErrorKind::InvalidInput, text)
     })
 }

@@ -1,8 +1,8 @@
-//! Lines of a file, plain, gzip or zstd, read in large blocks and borrowed without copying.
+//! Lines of a plain, gzip or zstd file, read in large blocks and borrowed without copying.
 //!
-//! The content decides the compression, never the name. A line longer than the block is returned as
-//! [`RawLine::TooLong`] and skipped to its end. Bytes read from the file are counted for the progress bar. Compressed
-//! files are unpacked on a thread of their own; plain files need none.
+//! The content decides the compression, not the name. A line longer than the block is returned as [`RawLine::TooLong`] and
+//! skipped to its end. Bytes read from the file are counted for the progress bar. Compressed files are decompressed on a
+//! separate thread.
 
 mod read_ahead;
 
@@ -22,13 +22,13 @@ const BLOCK: usize = 256 * 1024;
 pub enum RawLine<'a> {
     /// A whole line.
     Whole(&'a [u8]),
-    /// The file's last line, which has no line feed: perhaps torn.
+    /// The file's last line, if it has no line feed; it may be torn.
     Last(&'a [u8]),
     /// A line longer than 256 KiB; it was skipped.
     TooLong,
 }
 
-/// Opens a log: `-` is standard input; gzip and zstd are unpacked. `read_bytes` counts the bytes read from the file.
+/// Opens a log. `-` is standard input; gzip and zstd are decompressed. `read_bytes` counts the bytes read from the file.
 ///
 /// # Errors
 /// When the file cannot be opened or its first bytes cannot be read.
@@ -36,7 +36,7 @@ pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read
     open_parts(&[path.to_owned()], read_bytes)
 }
 
-/// As [`open`], of files that are one log in parts.
+/// Like [`open`], for several files that together form one log.
 ///
 /// # Errors
 /// When the first file cannot be opened or its first bytes cannot be read.
@@ -94,13 +94,13 @@ impl Lines {
         self.number
     }
 
-    /// Bytes read and not returned yet; may end within a line, or be empty before the end of the source.
+    /// Bytes read but not yet returned. They may end within a line, or be empty before the end of the source.
     #[inline]
     pub(super) fn unread(&self) -> &[u8] {
         &self.buffer[self.start..self.end]
     }
 
-    /// Takes the first `len` bytes of [`unread`](Self::unread), which are `count` lines with their line feeds.
+    /// Consumes the first `len` bytes of [`unread`](Self::unread), which are `count` lines with their line feeds.
     #[inline]
     pub(super) fn take_lines(&mut self, len: usize, count: u64) {
         debug_assert_eq!(memchr::memchr_iter(b'\n', &self.unread()[..len]).count() as u64, count, "whole lines");
@@ -112,7 +112,7 @@ impl Lines {
     /// The next line, or `None` at the end.
     ///
     /// # Errors
-    /// Those of the source: a damaged compressed file, say.
+    /// Errors of the source, such as a damaged compressed file.
     pub fn next_line(&mut self) -> io::Result<Option<RawLine<'_>>> {
         let mut searched = self.start;
         let mut too_long = false;
@@ -135,10 +135,10 @@ impl Lines {
         }
     }
 
-    /// The first line without taking it (the line feed stripped where there is one).
+    /// The first line without consuming it (without its line feed).
     ///
     /// # Errors
-    /// Those of the source.
+    /// Errors of the source.
     pub fn peek(&mut self) -> io::Result<&[u8]> {
         loop {
             let unread = self.start..self.end;
@@ -151,7 +151,7 @@ impl Lines {
         }
     }
 
-    /// The unread bytes, then the rest of the source, as one reader.
+    /// The unread bytes and the rest of the source as one reader.
     pub fn into_reader(self) -> impl Read {
         Cursor::new(self.buffer[self.start..self.end].to_vec()).chain(self.source)
     }
@@ -162,7 +162,7 @@ impl Lines {
         self.start = 0;
     }
 
-    /// Reads more; `false` at the end of the source.
+    /// Reads more; `false` = end of the source.
     fn fill(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);
@@ -211,20 +211,20 @@ mod tests {
     }
 
     #[test]
-    fn a_last_line_without_line_feed_is_recognised() {
+    fn last_line_without_line_feed_is_marked() {
         assert_eq!(all(b"ab\n\nc"), [(2, true), (0, true), (1, false)]);
         assert_eq!(all(b""), []);
     }
 
     #[test]
-    fn a_line_longer_than_the_block_is_skipped_and_the_next_is_whole() {
+    fn overlong_line_is_skipped() {
         let mut text = vec![b'x'; 3 * BLOCK + 5];
         text.extend(b"\nshort\n");
         assert_eq!(all(&text), [(usize::MAX, false), (5, true)]);
     }
 
     #[test]
-    fn lines_across_block_borders_are_whole() {
+    fn lines_across_blocks_are_whole() {
         let text: Vec<u8> = (0..100_000).flat_map(|n| format!("{n}\n").into_bytes()).collect();
         let lengths: Vec<_> = (0..100_000).map(|n| (n.to_string().len(), true)).collect();
         assert_eq!(all(&text), lengths);

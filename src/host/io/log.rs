@@ -1,8 +1,8 @@
-//! One stream of the core's inputs from logs of any form: journals, candump logs, CSV; plain, gzip or zstd.
+//! One stream of core inputs from logs of any format: journals, candump logs, CSV; plain, gzip or zstd.
 //!
-//! The first line decides the form (for CSV also the name). Several logs are read one after another on one clock:
-//! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
-//! after it, and an unknown gap is put before it. Everything that becomes no record is counted in [`LogCounts`].
+//! The first line decides the format (CSV also by file name). Several logs are read one after another on one clock. If a log,
+//! or a CSV section without a start time, begins before the end of the records so far, it is moved to one second after them,
+//! preceded by an unknown gap. [`LogCounts`] counts everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -25,20 +25,20 @@ pub use super::record::Batch;
 use super::record::UNUSED;
 pub use super::table::TableError as LogError;
 
-/// Names of unconfigured interfaces counted apart; more are counted together under "...".
+/// Most names of unconfigured interfaces that are counted separately; further ones are counted together under "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
-/// Most interfaces, configured and adopted: a log has a handful.
+/// Most interfaces, configured and adopted together; a log has a handful.
 pub const MAX_ADOPTED: usize = 64;
 
 /// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
-/// How logs are to be read.
+/// How to read logs.
 pub struct LogOptions {
     /// Configured interface names, in the order of their numbers.
     pub interfaces: Vec<String>,
-    /// A bad line ends the reading.
+    /// Whether a bad line ends the reading.
     pub strict: bool,
     /// How CSV logs are read.
     pub csv: CsvOptions,
@@ -46,34 +46,34 @@ pub struct LogOptions {
     pub encode_row: RowEncoder,
 }
 
-/// Counts of what was read, and of what became no record.
+/// Counts of lines, frames, and of everything that did not become a record.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
-    /// Lines and CSV rows read, bad ones included.
+    /// Lines and CSV rows read, including bad ones.
     pub lines: u64,
     /// Frames returned.
     pub frames: u64,
-    /// Lines that break their grammar, and files that end damaged.
+    /// Lines that violate their grammar, and files with a damaged end.
     pub bad_lines: u64,
-    /// The first of them: file, line, found and allowed.
+    /// The first bad line: file, line, found and allowed.
     pub first_bad_line: Option<String>,
     /// Lines without a record: headers, comments, blank ones.
     pub ignored_lines: u64,
-    /// CAN XL frames, not supported.
+    /// CAN XL frames, which are not supported.
     pub xl_frames: u64,
     /// Error frames.
     pub error_frames: u64,
-    /// Frames the recorder says it lost.
+    /// Frames lost according to the recorder.
     pub dropped_frames: u64,
-    /// Frames and events of interfaces that are not configured, by name.
+    /// Frames and events of unconfigured interfaces, by name.
     pub foreign: BTreeMap<String, u64>,
-    /// Records with a stamp before the one before them.
+    /// Records with a stamp before the preceding one.
     pub time_backwards: u64,
-    /// Parts with an unknown gap before them.
+    /// Parts that follow an unknown gap.
     pub unknown_gaps: u64,
     /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
-    /// Segments of a journal before the first one read: deleted, or not named.
+    /// Segments of a journal missing before the first one read (deleted or not given).
     pub deleted_segments: u64,
 }
 
@@ -99,27 +99,27 @@ enum LogForm {
     Csv(Box<CsvLog>),
 }
 
-/// State shared by the parsers: counts, names, the clock.
+/// State shared by the parsers: counts, names, clock.
 struct ReadState {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
-    /// Knows the interfaces.
+    /// Parser that knows the interfaces.
     parser: LineParser,
-    /// Interfaces that are not configured get a number too.
+    /// Whether unconfigured interfaces get a number too.
     adopt: bool,
     shift_ns: i64,
     latest: Option<Timestamp>,
-    /// Whether the next record begins a file or a section.
+    /// Whether the next record begins a file or section.
     fresh: bool,
-    /// Whether the time between the records so far and that one is unknown.
+    /// Whether the time between the records so far and the next one is unknown.
     unknown: bool,
-    /// Whether a file's stamps were moved behind those of the file before.
+    /// Whether a file's stamps were moved after those of the previous file.
     has_moved_stamps: bool,
 }
 
 impl LogSource {
-    /// Logs to be read in this order.
+    /// Reads these logs in this order.
     pub fn new(files: impl IntoIterator<Item = PathBuf>, options: LogOptions) -> Self {
         Self {
             files: files.into_iter().collect(),
@@ -144,12 +144,12 @@ impl LogSource {
         }
     }
 
-    /// Returns records of interfaces that are not configured too: each gets the next number, up to [`MAX_ADOPTED`] of them.
+    /// Also returns records of unconfigured interfaces: each interface gets the next number, up to [`MAX_ADOPTED`] in total.
     pub fn adopt_foreign(&mut self) {
         self.state.adopt = true;
     }
 
-    /// Names of the interfaces by their numbers, adopted ones last.
+    /// Names of the interfaces by number; adopted ones come last.
     pub fn interfaces(&self) -> &[String] {
         &self.state.interfaces
     }
@@ -159,17 +159,17 @@ impl LogSource {
         &self.state.counts
     }
 
-    /// Whether a file began before the end of the file before, so that its stamps were moved: they are no dates.
+    /// Whether a file began before the end of the previous file, so that its stamps were moved and are not real dates.
     pub fn has_moved_stamps(&self) -> bool {
         self.state.has_moved_stamps
     }
 
-    /// Bytes taken from the files so far, compressed as they are.
+    /// Bytes read from the files so far (compressed size).
     pub fn read_bytes(&self) -> &Arc<AtomicU64> {
         &self.read_bytes
     }
 
-    /// Whether the log being read carries its own ticks.
+    /// Whether the current log contains its own ticks.
     pub fn carries_ticks(&self) -> bool {
         matches!(self.current, Some(OpenLog { form: LogForm::Text { journal: true, .. }, .. }))
     }
@@ -177,7 +177,7 @@ impl LogSource {
     /// The next record; `None` at the end of the last log.
     ///
     /// # Errors
-    /// When a log cannot be opened, a CSV's header does not fit, or, if strict, at the first bad line.
+    /// When a log cannot be opened, a CSV header does not fit, or, if strict, at the first bad line.
     pub fn next_record(&mut self) -> Result<Option<Record>, LogError> {
         loop {
             if let Some(record) = self.queue.pop_front() {
@@ -226,11 +226,10 @@ impl LogSource {
         }
     }
 
-    /// The next records, at least one: those available without waiting for more of the file. `false` at the end of the last
-    /// log.
+    /// The next records, at least one: those available without reading more of the file. `false` = end of the last log.
     ///
     /// # Errors
-    /// As [`next_record`](Self::next_record), after every record before the error was returned.
+    /// Those of [`next_record`](Self::next_record), after all records before the error were returned.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current
@@ -257,7 +256,7 @@ impl LogSource {
         let journal = first == journal::HEADER.as_bytes();
         if first.starts_with(b"PACKWATCH-JOURNAL") && !journal {
             let found = String::from_utf8_lossy(first);
-            return Err(LogError::Data(format!("{name}:1: found {found:?}, this program reads {:?}", journal::HEADER)));
+            return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
         let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
         (self.state.fresh, self.state.unknown) = (true, false);
@@ -277,8 +276,8 @@ fn named_csv(path: &Path) -> bool {
 }
 
 impl ReadState {
-    /// Fills slots with the next records of a text log, as long as they are frames in whole lines that were read from the file,
-    /// and not the first of the file; returns how many.
+    /// Fills slots with the next records of a text log while they are frames in whole lines already read from the file, but not
+    /// the first record of the file. Returns how many.
     fn next_frames(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
@@ -287,7 +286,7 @@ impl ReadState {
             && let Ok(LineHead { time, interface, bus, rest }) = self.parser.parse_head(text)
         {
             let time = time.plus_nanos(self.shift_ns);
-            // Two assignments: the usual frame is made in its place, not copied to it.
+            // Two assignments, so that the usual frame is built in place instead of being copied.
             let (len, is_known) = if let (Some(bus), Some((frame, len))) = (bus, rest.usual_frame_and_end()) {
                 *slot = Record::frame(time, bus, &frame);
                 (len, true)
@@ -331,7 +330,7 @@ impl ReadState {
         Ok(())
     }
 
-    /// The next record of a text log on its own clock.
+    /// The next record of a text log, on the log's own clock.
     fn next_text(&mut self, lines: &mut Lines, journal: bool, name: &str) -> Result<Option<Record>, LogError> {
         loop {
             let number = lines.number() + 1;
@@ -340,7 +339,7 @@ impl ReadState {
                 Ok(Some(RawLine::Last(bytes))) if !journal => bytes,
                 Ok(Some(RawLine::Last(_))) => {
                     self.counts.lines += 1;
-                    self.bad(|| format!("{name}:{number}: the last line is torn (no line feed)"))?;
+                    self.bad(|| format!("{name}:{number}: the last line is incomplete (no line feed)"))?;
                     continue;
                 }
                 Ok(Some(RawLine::TooLong)) => {
@@ -354,7 +353,7 @@ impl ReadState {
                     return Ok(None);
                 }
             };
-            // The next segment begins.
+            // Header of the next segment.
             if journal && number > 1 && bytes == journal::HEADER.as_bytes() {
                 continue;
             }
@@ -391,7 +390,7 @@ impl ReadState {
             Line::Dropped { interface, frames } => {
                 self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
-                // The line has no stamp: it belongs to the frame before it, if there was one.
+                // The line has no stamp. It belongs to the frame before it, if there is one.
                 let time = self.latest?.plus_nanos(-self.shift_ns);
                 (!self.fresh).then_some(Record::bus(time, bus, BusEvent::Dropped { frames }))
             }
@@ -406,7 +405,7 @@ impl ReadState {
         }
     }
 
-    /// The interface's number; one that is not configured is counted.
+    /// The interface's number; unconfigured interfaces are counted.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
         let name = String::from_utf8_lossy(interface);
         if let Some(index) = self.interfaces.iter().position(|known| *known == name) {
@@ -423,7 +422,7 @@ impl ReadState {
         None
     }
 
-    /// The next good row's time on the file's own clock.
+    /// The next good row's time, on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
             let row = match log.next_row() {
@@ -447,14 +446,14 @@ impl ReadState {
         }
     }
 
-    /// A file's own stamp on the common clock; a gap to go before it, where one is needed.
+    /// Converts a file's stamp to the common clock; also returns the gap that must precede the record, if any.
     fn place(&mut self, raw: Timestamp) -> (Option<Record>, Timestamp) {
         let mut gap = false;
         if std::mem::take(&mut self.fresh) {
             self.shift_ns = 0;
             gap = std::mem::take(&mut self.unknown);
             if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
-                // Distance between the records so far and a part with an unknown gap before it.
+                // A part after an unknown gap starts 1 s after the records so far.
                 self.shift_ns = latest.plus_nanos(1_000_000_000).nanos().saturating_sub(raw.nanos());
                 (gap, self.has_moved_stamps) = (true, true);
             }

@@ -1,11 +1,11 @@
-//! Names of the files of one command: no file twice, and short names that distinguish them.
+//! File names of a command: rejects duplicates, and makes short names that distinguish the files.
 
 use std::path::{Path, PathBuf};
 
-/// Rejects a file that is named twice.
+/// Rejects a file that is given twice.
 ///
 /// # Errors
-/// The file, named twice.
+/// When a file is given twice.
 pub fn check_distinct(files: &[PathBuf]) -> Result<(), String> {
     match files.iter().enumerate().find(|(index, file)| files[..*index].contains(file)) {
         Some((_, file)) => Err(format!("{}: named twice", file.display())),
@@ -13,7 +13,7 @@ pub fn check_distinct(files: &[PathBuf]) -> Result<(), String> {
     }
 }
 
-/// Short names that distinguish the files: folder and name without endings, the whole path where two are the same.
+/// Short names that distinguish the files: folder and name without extensions, or the whole path if two are equal.
 pub fn short_names(files: &[PathBuf]) -> Vec<String> {
     let short = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -33,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_distinguish_files() {
+    fn short_names_distinguish_files() {
         let files = ["a/25C/x.csv.gz", "a/10C/x.csv.gz", "b/10C/x.csv", "y.csv"].map(PathBuf::from);
         assert_eq!(short_names(&files), ["25C/x", "a/10C/x.csv.gz", "b/10C/x.csv", "y"]);
     }

@@ -1,20 +1,20 @@
-//! Places of the daemon's files that the command line or systemd names.
+//! Locations of the daemon's files, as given by the command line or systemd.
 
 use std::path::{Path, PathBuf};
 
-/// Place of a socket or of the state of the daemon.
+/// Location of a socket, or of the daemon's state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PlaceSetting {
-    /// The folder that systemd made, else the standard one; where that cannot be used, the daemon runs without.
+    /// The folder created by systemd, else the standard one; if it cannot be used, the daemon runs without.
     Standard,
-    /// There is none.
+    /// None.
     Off,
-    /// There; a socket that cannot be made there keeps the daemon from its start.
+    /// This path; if a socket cannot be created there, the daemon does not start.
     At(PathBuf),
 }
 
 impl PlaceSetting {
-    /// Reads the value of the command line: a path, or `none`.
+    /// From the command line's value: a path, or `none`.
     pub fn from_path(path: Option<PathBuf>) -> Self {
         match path {
             None => Self::Standard,
@@ -23,7 +23,7 @@ impl PlaceSetting {
         }
     }
 
-    /// The path and whether it is required; `None` = there is none.
+    /// The path and whether it is required; `None` = none.
     pub fn resolve(&self, standard: impl FnOnce() -> (PathBuf, bool)) -> Option<(PathBuf, bool)> {
         match self {
             Self::Off => None,
@@ -33,7 +33,7 @@ impl PlaceSetting {
     }
 }
 
-/// The first folder of a variable of systemd, which separates several by colons: the unit's own.
+/// The first folder in a systemd variable, which may list several separated by colons; the first is the unit's own.
 pub fn first_folder(variable: &str) -> Option<PathBuf> {
     let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
     std::env::split_paths(&folders).next()

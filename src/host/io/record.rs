@@ -1,9 +1,9 @@
-//! Many records at once, in reused memory.
+//! Batches of records in reused memory.
 
 use crate::monitor::Record;
 use crate::quantity::Timestamp;
 
-/// An unused place.
+/// Content of an unused slot.
 pub(super) const UNUSED: Record = Record::tick(Timestamp::ZERO);
 
 /// Consecutive records in reused memory.
@@ -17,11 +17,11 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Most records at once: 12 KiB, which stay in the processor's nearest memory together with the estimators'.
+    /// Most records of a batch: 12 KiB, which fit into the processor's first-level cache together with the estimators.
     pub const MAX: usize = 128;
 
-    /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may be read a little further
-    /// than the records used say.
+    /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may already have read beyond
+    /// the records that are used.
     pub fn new(max: usize) -> Self {
         Self { slots: vec![UNUSED; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
     }
@@ -31,7 +31,7 @@ impl Batch {
         &self.slots[..self.len]
     }
 
-    /// Whether the log they are from carries its own ticks.
+    /// Whether the log contains its own ticks.
     pub fn carries_ticks(&self) -> bool {
         self.carries_ticks
     }

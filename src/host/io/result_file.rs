@@ -1,7 +1,7 @@
-//! Files a command writes: complete or not at all, and every failure is reported.
+//! Files that a command writes: complete or not at all; every failure is reported.
 //!
-//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete; an abandoned one is deleted.
-//! `-` is standard output; a device or pipe is written directly.
+//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete; an abandoned part is deleted.
+//! `-` is standard output. A device or pipe is written directly.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -20,10 +20,10 @@ pub struct ResultFile {
 }
 
 impl ResultFile {
-    /// Begins to write `path`.
+    /// Starts writing `path`.
     ///
     /// # Errors
-    /// When it cannot be created; the message names it.
+    /// When the file cannot be created; the message names it.
     pub fn create(path: &Path) -> io::Result<Self> {
         let (file, part): (File, _) = if path == Path::new("-") {
             (io::stdout().as_fd().try_clone_to_owned()?.into(), None)
@@ -33,21 +33,21 @@ impl ResultFile {
             let part = with_suffix(path, ".part");
             (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
-        // Bytes collected before a system call.
+        // The buffer size.
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(256 * 1024, file) })
     }
 
-    /// Completes the file: everything written, on the disk, under its name.
+    /// Completes the file: all bytes are on disk under the final name.
     ///
     /// # Errors
-    /// Disk full and the like; the message names the file.
+    /// When the file cannot be written; the message names it.
     pub fn finish(mut self) -> io::Result<()> {
         self.out.flush().map_err(|e| named(&self.path, e))?;
         let Some(part) = self.part.as_ref() else { return Ok(()) };
         self.out.get_ref().sync_data().map_err(|e| named(&self.path, e))?;
         fs::rename(part, &self.path).map_err(|e| named(&self.path, e))?;
         self.part = None;
-        // The new name itself must survive a power cut too.
+        // The new name must also survive a power cut.
         let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(|e| named(&self.path, e))
     }
@@ -66,7 +66,7 @@ impl Write for ResultFile {
 impl Drop for ResultFile {
     fn drop(&mut self) {
         if let Some(part) = &self.part {
-            // An incomplete file is deleted. A failure here cannot be reported.
+            // Deletes an incomplete file. A failure here cannot be reported.
             let _ = fs::remove_file(part);
         }
     }
@@ -75,35 +75,35 @@ impl Drop for ResultFile {
 /// Writes a whole file.
 ///
 /// # Errors
-/// As [`ResultFile::create`] and [`ResultFile::finish`].
+/// Those of [`ResultFile::create`] and [`ResultFile::finish`].
 pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(bytes)?;
     file.finish()
 }
 
-/// Checks, before hours of work, that a result can be written to its path and is not one of the files that are read.
+/// Checks, before hours of work, that the result's path can be written and is not one of the inputs.
 ///
 /// # Errors
-/// Names the result and what is wrong with its place.
+/// Names the result and what is wrong with its path.
 pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathBuf>) -> Result<(), String> {
     if result == Path::new("-") {
         return Ok(());
     }
     let folder = result.parent().filter(|folder| !folder.as_os_str().is_empty());
     if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
-        return Err(format!("{}: cannot be written: there is no folder {}", result.display(), folder.display()));
+        return Err(format!("{}: cannot be written: folder {} does not exist", result.display(), folder.display()));
     }
-    // By whatever name.
+    // Detects the same file under another name.
     let place = fs::canonicalize(result).ok();
     let is_read = |input: &PathBuf| input == result || (place.is_some() && fs::canonicalize(input).ok() == place);
     if inputs.any(is_read) {
-        return Err(format!("{}: is read, cannot be written too", result.display()));
+        return Err(format!("{}: is an input, must not be the output too", result.display()));
     }
     Ok(())
 }
 
-/// The error with the file's name and its kind, so that a closed pipe is still recognised.
+/// Adds the file's name to an error and keeps its kind, so that a closed pipe is still recognised.
 fn named(path: &Path, error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::Interrupted {
         return error;
@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_abandoned_file_leaves_the_old_one_and_no_part() {
+    fn abandoned_file_leaves_old_content() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("out.csv");
         fs::write(&path, "old").expect("written");
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_result_has_a_folder_and_is_no_input_by_whatever_name() {
+    fn result_needs_folder_and_is_no_input() {
         let folder = tempfile::tempdir().expect("a folder");
         let [log, other] = ["a.log", "b.log"].map(|name| folder.path().join(name));
         fs::write(&log, "").expect("written");
@@ -136,13 +136,13 @@ mod tests {
         let check = |result: &Path| check_place(result, inputs.iter());
         assert_eq!((check(&other), check(Path::new("-"))), (Ok(()), Ok(())));
         let again = folder.path().join(".").join("a.log");
-        assert!(check(&again).is_err_and(|error| error.ends_with("a.log: is read, cannot be written too")));
+        assert!(check(&again).is_err_and(|error| error.ends_with("a.log: is an input, must not be the output too")));
         let nowhere = folder.path().join("none").join("x.csv");
-        assert!(check(&nowhere).is_err_and(|error| error.contains("there is no folder")));
+        assert!(check(&nowhere).is_err_and(|error| error.ends_with("does not exist")));
     }
 
     #[test]
-    fn a_full_disk_is_an_error_that_names_the_file() {
+    fn full_disk_error_names_file() {
         let mut file = ResultFile::create(Path::new("/dev/full")).expect("opened");
         file.write_all(b"x").expect("buffered");
         let error = file.finish().expect_err("no room");

@@ -1,22 +1,22 @@
-//! Bounds what a table's reader takes for one row: a packed file of a few kilobytes may unpack to one line of gigabytes.
+//! Limits the bytes of one row: a compressed file of a few kilobytes may expand to one line of gigabytes.
 //!
-//! In: the source of the table. Out: the same bytes, or an error once more than [`MAX_ROW_BYTES`] came since the last row.
+//! In: the source of the table. Out: the same bytes, or an error after more than [`MAX_ROW_BYTES`] without a row.
 
 use std::cell::Cell;
 use std::io::{Error, ErrorKind, Read, Result};
 use std::rc::Rc;
 
-/// Longest row, bytes, with what is read ahead: the largest pack has 3,000 columns of 20 bytes.
+/// Longest row, bytes, including what is read ahead. The largest pack has 3,000 columns of 20 bytes.
 pub(super) const MAX_ROW_BYTES: usize = 1 << 20;
 
-/// A source that ends with an error where a row is too long.
+/// A source that fails when a row is too long.
 pub(super) struct RowLimit {
     source: Box<dyn Read>,
     since_row: Rc<Cell<usize>>,
 }
 
 impl RowLimit {
-    /// Limits a source. The caller sets the counter to 0 with every row.
+    /// Limits a source. The caller resets the counter to 0 after every row.
     pub(super) fn new(source: Box<dyn Read>) -> (Self, Rc<Cell<usize>>) {
         let since_row = Rc::new(Cell::new(0));
         (Self { source, since_row: Rc::clone(&since_row) }, since_row)
@@ -26,7 +26,7 @@ impl RowLimit {
 impl Read for RowLimit {
     fn read(&mut self, buffer: &mut [u8]) -> Result<usize> {
         if self.since_row.get() > MAX_ROW_BYTES {
-            let error = format!("a row of more than {MAX_ROW_BYTES} bytes, must be at most that many");
+            let error = format!("row too long, must be at most {MAX_ROW_BYTES} bytes");
             return Err(Error::new(ErrorKind::InvalidData, error));
         }
         let read = self.source.read(buffer)?;

@@ -1,9 +1,9 @@
-//! A recording in segments: compressed parts of one text, of which the oldest are deleted beyond a limit.
+//! A recording in segments: compressed parts of one text. When their total size exceeds a limit, the oldest are deleted.
 //!
-//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a whole zstd frame that begins with
-//! the header of the text and holds whole lines, so it can be read alone; read one after another they are the text, whose
-//! repeated headers the reader skips. A power cut tears the last segment at most: what was flushed before is readable. The
-//! segments of an earlier run become `FILE.1.000001.zst` and so on; both together stay within the limit.
+//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame with whole lines
+//! that begins with the text's header, so it can be read alone. Read one after another, the segments are the text with
+//! repeated headers, which the reader skips. A power cut tears only the last segment, which is readable up to its last flush.
+//! The segments of an earlier run become `FILE.1.000001.zst` and so on; the limit covers both runs.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -14,12 +14,12 @@ use zstd::stream::write::Encoder;
 
 use super::place::with_suffix;
 
-/// Least and greatest size of a segment, bytes: below, headers would fill it; above, deleting one loses days.
+/// Smallest and largest size of a segment, bytes. Smaller ones would be mostly headers; deleting a larger one loses days.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
-/// Size of a segment where none is set, bytes: six hours of a pack of 96 cells.
+/// Default size of a segment, bytes: six hours of a pack of 96 cells.
 pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;
 
-/// Sizes of a recording in segments.
+/// Size limits of a recording in segments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SegmentLimits {
     /// Size of all segments together, bytes.
@@ -29,10 +29,10 @@ pub struct SegmentLimits {
 }
 
 impl SegmentLimits {
-    /// Limits that leave room for two segments at least, the one being written and the one before it.
+    /// Checks limits, which must allow at least two segments: the one being written and the one before it.
     ///
     /// # Errors
-    /// What is allowed.
+    /// States the allowed values.
     pub fn new(total_bytes: u64, segment_bytes: u64) -> Result<Self, String> {
         if !SEGMENT_BYTES.contains(&segment_bytes) {
             let (least, greatest) = (SEGMENT_BYTES.start() >> 10, SEGMENT_BYTES.end() >> 30);
@@ -47,28 +47,28 @@ impl SegmentLimits {
     }
 }
 
-/// A segment on the disk.
+/// A segment on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Segment {
     path: PathBuf,
     number: u64,
 }
 
-/// The name of segment `number` of `base`.
+/// The path of segment `number` of `base`.
 fn path_of(base: &Path, number: u64) -> PathBuf {
     with_suffix(base, &format!(".{number:06}.zst"))
 }
 
-/// Base and number of a path that is named like a segment.
+/// Base and number of a path that has the form of a segment's path.
 fn parse(path: &Path) -> Option<(PathBuf, u64)> {
     let text = path.to_str()?.strip_suffix(".zst")?;
     let (base, digits) = text.rsplit_once('.')?;
-    // Digits of a segment's number, at least.
+    // A segment's number has at least six digits.
     let is_number = digits.len() >= 6 && digits.bytes().all(|byte| byte.is_ascii_digit());
     Some((PathBuf::from(base), digits.parse().ok().filter(|_| is_number)?))
 }
 
-/// The segments of `base`, by number.
+/// The segments of `base`, sorted by number.
 fn find(base: &Path) -> io::Result<Vec<Segment>> {
     let folder = base.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut segments = Vec::new();
@@ -81,15 +81,15 @@ fn find(base: &Path) -> io::Result<Vec<Segment>> {
     Ok(segments)
 }
 
-/// The files that are one log, and how many segments before them are deleted.
+/// The files that form one log, and the number of deleted segments before them.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct LogParts {
     pub paths: Vec<PathBuf>,
     pub deleted: u64,
 }
 
-/// Takes the next log from a list of files: a file, all segments of a base name that is no file, or the segments named one
-/// after another.
+/// Takes the next log from a list of files: a single file; all segments of a base name, if no file has that name; or
+/// consecutive segments in the list.
 ///
 /// # Errors
 /// When a segment between two others is missing.
@@ -114,17 +114,17 @@ pub(super) fn next_log(files: &mut VecDeque<PathBuf>) -> io::Result<Option<LogPa
     Ok(Some(LogParts { paths, deleted }))
 }
 
-/// Files read as one, opened one at a time.
+/// Files that are read as one, opened one at a time.
 pub(super) struct JoinedFiles {
     open: File,
     rest: VecDeque<PathBuf>,
 }
 
 impl JoinedFiles {
-    /// Opens the first.
+    /// Opens the first file.
     ///
     /// # Errors
-    /// When it cannot be opened, or there is none.
+    /// When it cannot be opened, or the list is empty.
     pub(super) fn open(paths: &[PathBuf]) -> io::Result<Self> {
         let mut rest: VecDeque<PathBuf> = paths.iter().cloned().collect();
         let first = rest.pop_front().ok_or(io::ErrorKind::NotFound)?;
@@ -145,7 +145,7 @@ impl Read for JoinedFiles {
     }
 }
 
-/// A file that counts what was written.
+/// A file that counts the bytes written.
 #[derive(Debug)]
 struct CountedFile {
     file: File,
@@ -164,7 +164,7 @@ impl Write for CountedFile {
     }
 }
 
-/// Writes segments.
+/// Writes a recording in segments.
 pub(super) struct SegmentWriter {
     base: PathBuf,
     /// First line of every segment.
@@ -172,12 +172,12 @@ pub(super) struct SegmentWriter {
     limits: SegmentLimits,
     number: u64,
     open: Encoder<'static, CountedFile>,
-    /// Complete segments with their sizes, oldest first.
+    /// Complete segments and their sizes, oldest first.
     complete: VecDeque<(PathBuf, u64)>,
 }
 
 impl SegmentWriter {
-    /// Renames the segments of an earlier run and begins the first. The text itself brings the first `header`.
+    /// Renames the segments of an earlier run and starts the first segment. The text itself contains the first `header`.
     ///
     /// # Errors
     /// When a file cannot be renamed, deleted or created.
@@ -230,12 +230,12 @@ impl SegmentWriter {
 }
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
-    // Compression level of zstd. The frames of a pack of 96 cells become 8.0 times smaller; with level 3, which takes 2 MB more
-    // memory, 7.2 times. The vehicle's package (`packaging/debian/build`) leaves out the compressors of the other levels.
+    // Compression level of zstd. Frames of a pack of 96 cells shrink by a factor of 8.0; level 3, which needs 2 MB more memory,
+    // gives 7.2. The vehicle's package (`packaging/debian/build`) leaves out the compressors of the other levels.
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
-/// Renames the segments of the last run to those of `base.1`, whose own are deleted. Returns them with their sizes.
+/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns them with their sizes.
 fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     let earlier = with_suffix(base, ".1");
     for segment in find(&earlier)? {
@@ -250,7 +250,7 @@ fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     Ok(kept)
 }
 
-/// Deletes a file; one that is gone already is no error.
+/// Deletes a file. A file that no longer exists is not an error.
 fn remove(path: &Path) -> io::Result<()> {
     fs::remove_file(path).or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }

@@ -1,4 +1,4 @@
-//! The core's state as a file: JSON, written whole or not at all.
+//! The core's state as a JSON file, written completely or not at all.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -6,10 +6,10 @@ use std::path::Path;
 use crate::io::result_file::ResultFile;
 use crate::monitor::Snapshot;
 
-/// Stores a state so that after a power cut there is the old one or the new one, whole.
+/// Stores a state. After a power cut the file contains either the old or the new state, complete.
 ///
 /// # Errors
-/// Disk full and the like; the message names the file.
+/// When the file cannot be written; the message names it.
 pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(&serde_json::to_vec(snapshot)?)?;
@@ -20,7 +20,7 @@ pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
 /// Reads a stored state.
 ///
 /// # Errors
-/// When the file cannot be read or is no snapshot: file, line and why.
+/// When the file cannot be read or is not a snapshot: file, line and reason.
 pub fn read(path: &Path) -> Result<Snapshot, String> {
     let bytes = std::fs::read(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
     serde_json::from_slice(&bytes)

@@ -1,8 +1,8 @@
-//! Points in time as people and tables write them: seconds, or ISO 8601 dates taken as UTC.
+//! Points in time as users and tables write them: seconds, or ISO 8601 dates in UTC.
 
 use crate::quantity::Timestamp;
 
-/// Reads decimal seconds (`12.5`, `-3`, `1e3`) without losing digits; `None` when it is no finite number.
+/// Parses decimal seconds (`12.5`, `-3`, `1e3`) without losing digits; `None` if it is not a finite number.
 pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     let text = text.trim_ascii();
     parse_exact(text).or_else(|| {
@@ -11,7 +11,7 @@ pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     })
 }
 
-/// Digits with at most nine decimals, exact; `None` for every other form.
+/// Parses digits with at most nine decimals, exactly; `None` for every other form.
 fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     let (negative, digits) = match text.strip_prefix(b"-") {
         Some(rest) => (true, rest),
@@ -32,7 +32,7 @@ fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     Some(Timestamp::from_nanos(if negative { -nanos } else { nanos }))
 }
 
-/// Reads `2008-04-02T13:08:17.921` (a space for the T, a final Z and missing seconds allowed) as UTC, or seconds.
+/// Parses `2008-04-02T13:08:17.921` as UTC (a space instead of the T, a final Z and missing seconds are allowed), or seconds.
 pub fn parse_stamp(text: &str) -> Option<Timestamp> {
     let text = text.trim();
     match text.split_once(['T', ' ']) {
@@ -56,13 +56,13 @@ fn parse_iso(date: &str, time: &str) -> Option<Timestamp> {
     Some(seconds.plus_nanos(whole.checked_mul(1_000_000_000)?))
 }
 
-/// At most nine digits, so that no calculation overflows.
+/// A number of at most nine digits, so that later calculations cannot overflow.
 fn number(text: &str) -> Option<i64> {
     (text.len() <= 9 && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
 }
 
-/// Days from 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years). A date that does not
-/// exist gives the days of another one.
+/// Days since 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years). For a date that does
+/// not exist it returns the number of another date.
 fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     let shifted = if month <= 2 { year - 1 } else { year };
     let (era, of_era) = (shifted.div_euclid(400), shifted.rem_euclid(400));
@@ -70,7 +70,7 @@ fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     era * 146_097 + of_era * 365 + of_era / 4 - of_era / 100 + of_year - 719_468
 }
 
-/// A point in time as people read it, UTC, to the second: `2008-04-02T13:08:17Z`.
+/// A point in time for readers, UTC, to the second: `2008-04-02T13:08:17Z`.
 pub fn format_utc(time: Timestamp) -> String {
     let seconds = time.nanos().div_euclid(1_000_000_000);
     let (days, of_day) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
@@ -79,14 +79,14 @@ pub fn format_utc(time: Timestamp) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
-/// The same to the microsecond: `2008-04-02T13:08:17.921000Z`.
+/// Like [`format_utc`], to the microsecond: `2008-04-02T13:08:17.921000Z`.
 pub fn format_utc_micros(time: Timestamp) -> String {
     let whole = format_utc(time);
     let micros = time.nanos().rem_euclid(1_000_000_000) / 1000;
     format!("{}.{micros:06}Z", whole.trim_end_matches('Z'))
 }
 
-/// Year, month and day of a number of days from 1970-01-01; the reverse of `days_from_epoch`.
+/// Year, month and day of a number of days since 1970-01-01; inverse of `days_from_epoch`.
 fn date_of(days: i64) -> (i64, i64, i64) {
     let days = days + 719_468;
     let (era, of_era) = (days.div_euclid(146_097), days.rem_euclid(146_097));
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dates_are_written_as_they_are_read() {
+    fn formatted_dates_parse_to_same_time() {
         for days in (-100_000..100_000).step_by(17).chain([-1, 0, 11_016, 11_017]) {
             let time = Timestamp::from_nanos((days * 86_400 + 47_297) * 1_000_000_000);
             let text = format_utc(time);

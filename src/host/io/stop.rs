@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::{Instant, sleep_until};
 
-/// Waits for the end of the loop.
+/// Waits for the signal or time that ends the loop.
 #[derive(Debug)]
 pub struct Stop {
     terminate: Signal,

@@ -1,9 +1,9 @@
-//! The program's one reader of CSV tables: columns by name, rows streamed, every fault with its place.
+//! The only reader of CSV tables: columns by name, rows streamed, every fault with its position.
 //!
-//! In: CSV with one header line, plain, gzip or zstd. Out: [`Row`]s of fields that are read as text, numbers or stamps.
-//! A row of more than a megabyte ends the reading. Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header: a field that a
-//! row lacks reads as empty. A fault reads `FILE:LINE: column NAME: found X, must be ALLOWED`; it never ends the reading,
-//! so that the caller may skip the row.
+//! In: CSV with one header line; plain, gzip or zstd. Out: [`Row`]s whose fields are read as text, numbers or stamps. Blanks
+//! around fields and a byte order mark are removed. Rows may be shorter or longer than the header; a missing field reads as
+//! empty. A row of more than a megabyte ends the reading. A fault reads `FILE:LINE: column NAME: found X, must be ALLOWED`. It
+//! does not end the reading, so the caller may skip the row.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -17,25 +17,25 @@ use super::row_limit::RowLimit;
 use super::{lines, stamp};
 use crate::quantity::Timestamp;
 
-/// Columns at whose values time starts again, where the user names none.
+/// Default columns at whose values time restarts.
 pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
 /// Allowed forms of a point in time.
 const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
 
-/// A table that cannot be read or a field that cannot be used, with its place.
+/// A table that cannot be read or a field that cannot be used, with its position.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TableError {
     /// Content that cannot be used.
     #[error("{0}")]
     Data(String),
-    /// The operating system does not let the file be read.
+    /// The operating system cannot read the file.
     #[error("{0}")]
     File(String),
 }
 
 impl TableError {
-    /// A failed read: of the file where the operating system gave the error, else of its content, as a damaged compressed file.
+    /// A failed read: [`File`](Self::File) if the operating system reported it, else [`Data`](Self::Data), such as a damaged compressed file.
     pub fn of_io(text: String, error: &std::io::Error) -> Self {
         if error.raw_os_error().is_some() { Self::File(text) } else { Self::Data(text) }
     }
@@ -46,8 +46,8 @@ impl TableError {
 pub enum Quotes {
     /// Quotes may enclose fields that hold commas or line breaks.
     Enclose,
-    /// A line is a row, whatever quotes it holds: one stray quote would swallow every row after it. Quotes around a whole
-    /// number or column name are still removed.
+    /// Every line is a row, whatever quotes it contains, because one stray quote would swallow all later rows. Quotes around a
+    /// whole number or column name are still removed.
     Literal,
 }
 
@@ -88,7 +88,7 @@ impl Table {
         Self::new(source, file, Quotes::Enclose)
     }
 
-    /// Reads the header of unpacked text; `file` is its name for messages.
+    /// Reads the header of decompressed text; `file` is its name in messages.
     ///
     /// # Errors
     /// The source cannot be read.
@@ -111,7 +111,7 @@ impl Table {
     /// The next row; `None` at the end.
     ///
     /// # Errors
-    /// The source fails, as a damaged compressed file does.
+    /// The source fails, for example a damaged compressed file.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
         self.since_row.set(0);
         let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
@@ -134,17 +134,17 @@ impl Header {
         &self.names
     }
 
-    /// Number of the column called `name`.
+    /// Index of the column called `name`.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.names.iter().position(|known| known == name)
     }
 
-    /// Number of the first of these columns that the table has.
+    /// Index of the first of these columns that the table has.
     pub fn find_any(&self, names: &[&str]) -> Option<usize> {
         names.iter().find_map(|name| self.find(name))
     }
 
-    /// Number of the first of these columns that the table has.
+    /// Index of the first of these columns that the table has.
     ///
     /// # Errors
     /// The table has none of them.
@@ -165,12 +165,12 @@ impl Header {
 }
 
 impl<'t> Row<'t> {
-    /// A field as written; `None` when the row is too short.
+    /// A field as written; `None` if the row is too short.
     pub fn bytes(&self, column: usize) -> Option<&'t [u8]> {
         self.record.get(column)
     }
 
-    /// A field as text; empty when the row is too short.
+    /// A field as text; empty if the row is too short.
     pub fn text(&self, column: usize) -> Cow<'t, str> {
         self.bytes(column).map_or(Cow::Borrowed(""), String::from_utf8_lossy)
     }
@@ -183,10 +183,10 @@ impl<'t> Row<'t> {
         self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
     }
 
-    /// A number of `range`; `None` for an empty field.
+    /// A number in `range`; `None` for an empty field.
     ///
     /// # Errors
-    /// The field is neither; the message says `allowed`.
+    /// The field is neither; the message contains `allowed`.
     pub fn number_in(
         &self,
         column: usize,
@@ -220,7 +220,7 @@ impl<'t> Row<'t> {
     }
 }
 
-/// Reads a field: `Some(None)` when it is empty, `None` when it is no finite number.
+/// Parses a field: `Some(None)` if it is empty, `None` if it is not a finite number.
 pub(super) fn parse_field(field: &[u8]) -> Option<Option<f64>> {
     let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
     if field.is_empty() {
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_are_read_by_the_names_of_their_columns() {
+    fn fields_are_found_by_column_name() {
         let mut table = table(TEXT, Quotes::Enclose);
         assert_eq!(table.header().names(), ["time", "soc", "name"]);
         let [time, soc] = ["time", "soc"].map(|name| table.header().find(name).expect("there"));
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_file_line_column_found_and_allowed_and_the_next_row_is_read() {
+    fn fault_states_position_and_reading_continues() {
         let mut table = table(TEXT, Quotes::Enclose);
         let missing = table.header().required(&["ah", "capacity_ah"]).expect_err("missing");
         assert_eq!(missing.to_string(), "t.csv:1: no column ah or capacity_ah, found time,soc,name");
@@ -275,17 +275,14 @@ mod tests {
     }
 
     #[test]
-    fn a_row_without_an_end_is_an_error_and_takes_little_memory() {
+    fn endless_row_is_an_error() {
         for (start, quotes) in [("a\n", Quotes::Literal), ("a\n\"", Quotes::Enclose), ("", Quotes::Literal)] {
             let endless = Box::new(start.as_bytes().chain(std::io::repeat(b'7')));
             let error = match Table::new(endless, "t.csv".to_owned(), quotes) {
                 Ok(mut table) => table.next_row().expect_err("never ends"),
                 Err(error) => error,
             };
-            assert_eq!(
-                error.to_string(),
-                "t.csv: damaged: a row of more than 1048576 bytes, must be at most that many"
-            );
+            assert_eq!(error.to_string(), "t.csv: damaged: row too long, must be at most 1048576 bytes");
         }
         // Rows of the allowed length follow each other.
         let row = format!("{}\n", "7".repeat(crate::io::row_limit::MAX_ROW_BYTES - 10_000));
@@ -296,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stray_quote_costs_one_row_where_quotes_are_literal() {
+    fn literal_stray_quote_costs_one_row() {
         let mut table = table("a,b\n1,\"2\n3,\"4\"\n", Quotes::Literal);
         assert!(table.next_row().expect("reads").expect("a row").number(1).is_err());
         assert_eq!(table.next_row().expect("reads").expect("a row").number(1), Ok(Some(4.0)));
@@ -304,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn compressed_tables_are_unpacked_and_damage_is_an_error() {
+    fn compressed_table_is_read_damage_reported() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("t.csv.gz");
         let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());

@@ -1,6 +1,6 @@
-//! Tables of text for people.
+//! Text tables for readers.
 
-/// Columns as wide as their widest entry: the first `left` are aligned to the left, the others to the right.
+/// Formats columns as wide as their widest entry. The first `left` columns are left-aligned, the others right-aligned.
 pub fn text_table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec<String>>, left: usize) -> String {
     let heads: Vec<String> = heads.iter().map(|head| head.as_ref().to_owned()).collect();
     let rows: Vec<Vec<String>> = Some(heads).filter(|heads| !heads.is_empty()).into_iter().chain(rows).collect();

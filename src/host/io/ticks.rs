@@ -1,34 +1,34 @@
-//! The ticks of a log that carries none: the moments between two records at which the core receives a tick.
+//! Generates the ticks for logs that contain none: the times between two records at which the core receives a tick.
 //!
-//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
-//! says only when frames arrived, so the same ticks are made here, at multiples of the period: a tick at T comes after
-//! every record of T and before the first later one. After a record the recorder stays awake for the sleep gap, as a
-//! daemon on a silent bus does (so that a lost input is noticed); after it, the recorder is assumed to be asleep. The first record, and the
-//! first after sleep, wake it: one tick at that record's own time. Nothing follows the last record.
+//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log states
+//! only when frames arrived, so this module generates the same ticks at multiples of the period: a tick at T comes after
+//! every record of T and before the first later one. After a record, the recorder stays awake for the sleep gap, like a
+//! daemon on a silent bus (so that a lost input is detected); after that it is assumed to be asleep. The first record,
+//! and the first one after sleep, wake it: one tick at that record's time. There are no ticks after the last record.
 //!
-//! The caller passes the time at which the core next needs a tick ([`Ticks::pop`]'s `due`). Ticks before that are skipped:
-//! they would change nothing.
+//! The caller passes the time at which the core next needs a tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
+//! because they would change nothing.
 
 use crate::monitor::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Makes ticks between records.
+/// Generates ticks between records.
 #[derive(Debug, Clone)]
 pub struct Ticks {
     period_ns: i64,
     sleep_gap_ns: i64,
     /// Stamp of the next tick.
     next_ns: i64,
-    /// Ticks before this may be popped.
+    /// Ticks before this time may be popped.
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time at which ticks continue once those before the hole are popped.
+    /// Time at which ticks continue after those before the hole have been popped.
     wake_ns: Option<i64>,
 }
 
 impl Ticks {
-    /// Ticks every `period_ms` (at least 1), and for `sleep_gap_s` into a hole that is longer than that.
+    /// Ticks every `period_ms` (at least 1), which stop `sleep_gap_s` after a record if no other record follows.
     pub fn new(period_ms: u32, sleep_gap_s: f64) -> Self {
         Self {
             period_ns: i64::from(period_ms.max(1)) * 1_000_000,
@@ -40,9 +40,9 @@ impl Ticks {
         }
     }
 
-    /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then process the record. Returns whether the
-    /// recorder was asleep before it (the first record, or one after a hole). A time a little before the latest (interfaces
-    /// merged out of order) makes no tick.
+    /// Announces a record at `time`. The caller then calls [`pop`](Self::pop) until `None`, and processes the record.
+    /// Returns whether the recorder was asleep before it (the first record, or one after a hole). A record slightly older
+    /// than the latest (interfaces merged out of order) causes no tick.
     #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();
@@ -53,7 +53,7 @@ impl Ticks {
             return true;
         };
         if time_ns < latest_ns.saturating_sub(MERGE_TOLERANCE_NS) {
-            // The recorder's clock was set back: the grid continues from there.
+            // The recorder's clock was set back, so the ticks continue from there.
             (self.limit_ns, self.latest_ns, self.wake_ns) = (i64::MIN, Some(time_ns), Some(time_ns));
             return true;
         }
@@ -68,21 +68,21 @@ impl Ticks {
         asleep
     }
 
-    /// The log ends here, or continues after an unknown gap: the ticks left up to the latest record may be popped,
-    /// and the next record wakes the recorder whatever its stamp.
+    /// Ends the log, or starts an unknown gap: the remaining ticks up to the latest record may be popped, and the next
+    /// record wakes the recorder whatever its stamp.
     pub fn sleep(&mut self) {
         if let Some(latest_ns) = self.latest_ns.take() {
             self.limit_ns = latest_ns.saturating_add(1);
         }
     }
 
-    /// Whether [`pop`](Self::pop) has work to do, whatever the core needs: for most records it has none.
+    /// Whether [`pop`](Self::pop) has work to do, regardless of what the core needs; false for most records.
     #[inline]
     pub fn is_pending(&self) -> bool {
         self.next_ns < self.limit_ns || self.wake_ns.is_some()
     }
 
-    /// The next tick that is due and that the core needs: none before `due` (`None` = it needs none).
+    /// The next due tick at or after `due`, the time at which the core needs one (`None` = it needs none).
     pub fn pop(&mut self, due: Option<Timestamp>) -> Option<Timestamp> {
         if self.next_ns < self.limit_ns {
             let due_ns = due.map_or(self.limit_ns, |d| d.nanos().min(self.limit_ns));
@@ -114,7 +114,7 @@ mod tests {
 
     const EVERY: Option<Timestamp> = Some(Timestamp::from_nanos(i64::MIN));
 
-    /// Ticks in ms made by records at `records` ms, `due` as given, ended properly.
+    /// The ticks, ms, between records at `records` ms and at the end of the log.
     fn ticks_ms(records: &[i64], due: Option<Timestamp>) -> Vec<i64> {
         let mut ticks = Ticks::new(10, 0.05);
         let mut made = Vec::new();

@@ -1,4 +1,4 @@
-//! Unix sockets and their files: the file of a dead daemon is replaced, that of a live one is not.
+//! Unix sockets and their files. A socket file left by a dead daemon is replaced; that of a running daemon is kept.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -11,17 +11,17 @@ use tokio::time::timeout;
 
 use super::place::first_folder;
 
-/// The folder of the service, and of a daemon that root starts from a shell.
+/// The folder of the service, and of a daemon started by root from a shell.
 const STANDARD_FOLDER: &str = "/run/packwatch";
 
-/// Default folder of a daemon's sockets: the one systemd made; else `/run/packwatch` for root, and the user's own folder for others.
+/// Default folder of a daemon's sockets: created by systemd, else `/run/packwatch` for root, else the user's own folder.
 pub fn runtime_folder() -> PathBuf {
     let is_root = || std::fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
     let own = || own_folder().filter(|_| !is_root());
     first_folder("RUNTIME_DIRECTORY").or_else(own).unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
-/// Default folder in which a client looks: the service's where there is one, else that of the user's own daemon.
+/// Default folder in which a client looks for sockets: the service's if it exists, else the user's own.
 pub fn client_folder() -> PathBuf {
     let standard = PathBuf::from(STANDARD_FOLDER);
     let own = || own_folder().filter(|own| !standard.exists() && own.exists());
@@ -32,11 +32,11 @@ fn own_folder() -> Option<PathBuf> {
     Some(first_folder("XDG_RUNTIME_DIR")?.join("packwatch"))
 }
 
-/// Creates the default folder where systemd did not. Where that fails, so does the bind, which is reported.
+/// Creates the default folder if systemd did not. If that fails, the bind fails too and is reported.
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
     if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
-        // Others may look into the folder that is made; the sockets' own modes decide who may connect.
+        // Others may list this folder; the modes of the sockets decide who may connect.
         let _ = std::fs::set_permissions(folder, Permissions::from_mode(0o755));
     }
 }
@@ -55,12 +55,12 @@ pub struct SocketFile {
     inode: (u64, u64),
 }
 
-/// Reason why there is no socket.
+/// Why there is no socket.
 #[derive(Debug)]
 pub enum BindError {
-    /// Another daemon uses it.
+    /// Another daemon uses the path.
     Taken(String),
-    /// It cannot be made.
+    /// The socket cannot be created.
     Io(io::Error),
 }
 
@@ -71,26 +71,26 @@ impl From<io::Error> for BindError {
 }
 
 impl BindError {
-    /// What it means for a server whose path `--OPTION` names: `None` = it runs without, which is logged.
+    /// Decides how the server with option `--OPTION` continues; `None` = without the socket, which is logged.
     ///
     /// # Errors
-    /// When another daemon uses the socket, or it is needed.
+    /// When another daemon uses the socket, or the socket is required.
     pub fn without_socket<T>(self, path: &Path, is_needed: bool, option: &str) -> Result<Option<T>, String> {
         let shown = path.display();
         match self {
             Self::Taken(owner) => Err(format!(
-                "{shown}: {owner} listens there already; stop it, or start this one with --{option} and another path"
+                "{shown}: already in use by {owner}; stop that process, or choose another path with --{option}"
             )),
             Self::Io(error) if is_needed => Err(format!("{shown}: {error}")),
             Self::Io(error) => {
-                tracing::info!(path = %shown, %error, "no {option} socket; name its path with --{option}");
+                tracing::info!(path = %shown, %error, "no {option} socket; choose its path with --{option}");
                 Ok(None)
             }
         }
     }
 }
 
-/// Binds a socket at `path`; the file mode `mode` decides who may connect.
+/// Binds a socket at `path`. The file mode `mode` decides who may connect.
 pub async fn bind(path: &Path, mode: u32) -> Result<BoundSocket, BindError> {
     make_default_folder(path);
     remove_stale(path).await?;
@@ -106,11 +106,11 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
         Err(error) => return Err(error.into()),
         Ok(found) if !found.file_type().is_socket() => {
-            return Err(io::Error::new(ErrorKind::AlreadyExists, "is there and no socket").into());
+            return Err(io::Error::new(ErrorKind::AlreadyExists, "exists and is not a socket").into());
         }
         Ok(_) => {}
     }
-    // Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
+    // A stopped daemon does not accept and its queue may be full, so the wait is limited.
     match timeout(Duration::from_secs(1), UnixStream::connect(path)).await {
         Ok(Err(error)) if error.kind() == ErrorKind::ConnectionRefused => Ok(std::fs::remove_file(path)?),
         Ok(Err(error)) if error.kind() == ErrorKind::NotFound => Ok(()),
@@ -120,7 +120,7 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
     }
 }
 
-/// The listening process, as the kernel knows it.
+/// The process that listens, as reported by the kernel.
 fn owner(stream: &UnixStream) -> String {
     match stream.peer_cred() {
         Ok(who) => {
@@ -137,13 +137,13 @@ fn inode(path: &Path) -> io::Result<(u64, u64)> {
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        // Another daemon may have put its own socket there meanwhile.
+        // Another daemon may have created its own socket there.
         if inode(&self.path).is_ok_and(|found| found == self.inode)
             && let Err(error) = std::fs::remove_file(&self.path)
         {
             tracing::warn!(path = %self.path.display(), %error, "socket not removed");
         }
-        // The default folder goes with its last socket, unless it is systemd's.
+        // The default folder is removed with its last socket, unless systemd created it.
         if let Some(folder) = self.path.parent().filter(|folder| *folder == runtime_folder())
             && first_folder("RUNTIME_DIRECTORY").is_none()
         {

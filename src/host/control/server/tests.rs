@@ -182,7 +182,7 @@ fn a_file_that_is_no_socket_is_not_touched() {
         std::fs::write(&path, "mine").unwrap();
         let (sender, _requests) = mpsc::channel(1);
         let error = ControlServer::start(&PlaceSetting::At(path.clone()), sender.clone()).await.unwrap_err();
-        assert!(error.ends_with("is there and no socket"), "{error}");
+        assert!(error.ends_with("exists and is not a socket"), "{error}");
         assert_eq!(std::fs::read(&path).unwrap(), b"mine");
         assert!(ControlServer::start(&PlaceSetting::Off, sender).await.unwrap().is_none());
     });

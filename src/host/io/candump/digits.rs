@@ -1,11 +1,11 @@
-//! Digits of a candump line, converted several bytes at a time: as lanes of a `u64`, the first byte lowest, or by loops that
-//! become vector instructions.
+//! Converts the digits of a candump line several bytes at a time: as lanes of a `u64` (first byte lowest), or in loops that
+//! compile to vector instructions.
 
-/// Every byte of a word 1, and its highest bit.
+/// 1 in every byte of a word, and the highest bit of every byte.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
-/// Hex digit values; for anything else more than a number with such a digit in any place may be.
+/// Values of the hex digits; for other characters a value larger than any number with that many digits.
 pub(super) static HEX: [u32; 256] = {
     let mut table = [u16::MAX as u32; 256];
     let mut digit = 0;
@@ -17,7 +17,7 @@ pub(super) static HEX: [u32; 256] = {
     table
 };
 
-/// Eight bytes of the text; zeros beyond its end, which no caller reaches.
+/// Eight bytes of the text; zeros beyond its end, which callers never use.
 #[inline(always)]
 pub(super) fn word(text: &[u8], at: usize) -> u64 {
     text.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |bytes| u64::from_le_bytes(*bytes))
@@ -26,23 +26,23 @@ pub(super) fn word(text: &[u8], at: usize) -> u64 {
 /// Six digits and `) `, in nanoseconds.
 #[inline(always)]
 pub(super) fn six_decimals(text: u64) -> Option<i64> {
-    // Two zeros before the six digits make eight.
+    // Two leading zeros make the six digits eight.
     lanes(text ^ u64::from_le_bytes(*b"000000) "), 0x7F7F_7676_7676_7676).map(|digits| number::<1000>(digits << 16))
 }
 
-/// The number of eight digits, the first the highest.
+/// The number of eight decimal digits, most significant first.
 #[inline(always)]
 pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// The lanes, unless adding `wrong` brings one of them to 0x80 or more.
+/// Returns the lanes, or `None` if adding `wrong` brings any of them to 0x80 or more.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)
 }
 
-/// The number of eight lanes of 0 to 9, the first the highest, times `UNIT`; below 2^32 with it.
+/// The number of eight lanes of 0 to 9, most significant first, times `UNIT`; the result must be below 2^32.
 #[inline(always)]
 fn number<const UNIT: u64>(digits: u64) -> i64 {
     let pairs = (digits.wrapping_mul(10 << 8 | 1) >> 8) & 0x00FF_00FF_00FF_00FF;
@@ -50,8 +50,8 @@ fn number<const UNIT: u64>(digits: u64) -> i64 {
     (fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32).cast_signed()
 }
 
-/// Eight bytes of two hex digits each, the first byte lowest. Loops over sixteen bytes: the compiler makes one instruction of
-/// each step.
+/// Eight bytes from sixteen hex digits, first byte lowest. Every step is a loop over sixteen bytes, which compiles to one
+/// vector instruction.
 #[inline(always)]
 pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
     let (mut values, mut wrong) = ([0; 16], [0; 16]);
@@ -67,7 +67,7 @@ pub(super) fn eight_hex_bytes(text: [u8; 16]) -> Option<u64> {
         return None;
     }
     let mut words = [word(&values, 0), word(&values, 8)];
-    // Step by step over both words, as above. Twelve bits up, the upper half of a byte comes to stand above the lower one.
+    // Each step handles both words. A shift by twelve bits moves the upper digit of a byte above the lower one.
     for word in &mut words {
         *word = (word.wrapping_mul(0x1001) >> 8) & 0x00FF_00FF_00FF_00FF;
     }

@@ -1,8 +1,9 @@
 //! Parser of candump lines.
 //!
-//! In: text that begins with a line; what follows its line feed is not looked at. Out: the line, or the first place where it
-//! breaks the grammar. Nothing is allocated and nothing is read twice. What nearly every line shares is converted several bytes
-//! at a time: the second of the line before, a known interface, a payload of eight bytes.
+//! In: text that begins with a line; the parser ignores what follows the line feed. Out: the line, or the first position at
+//! which it violates the grammar. Nothing is allocated and nothing is read twice. The parts that nearly all lines share have
+//! fast paths that convert several bytes at a time: the same second as in the previous line, a known interface, a payload of
+//! eight bytes.
 
 use super::digits::{HEX, eight_digits, eight_hex_bytes, six_decimals, word};
 use super::{Line, LineError};
@@ -11,15 +12,15 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
-/// Two words that no line begins with: where they overlap, they differ.
+/// Two words that match no line: they contradict each other where they overlap.
 const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
 /// An interface with a name of up to seven bytes.
 #[derive(Debug, Clone, Copy)]
 struct Interface {
-    /// The name and the space that ends it; two names have the same word only if they are the same.
+    /// The name and the space after it; different names have different words.
     name: u64,
-    /// The bytes of a word that these are, and their number.
+    /// Selects the bytes of the name and the space in a word of text.
     mask: u64,
     len: usize,
     bus: BusIndex,
@@ -42,22 +43,22 @@ impl Interface {
     }
 }
 
-/// Reads lines one after another; remembers the second of the last one, since thousands of lines share it.
+/// Parses lines one after another. Remembers the second of the previous line, since thousands of lines share it.
 #[derive(Debug, Clone)]
 pub struct LineParser {
     interfaces: Vec<Interface>,
-    /// The first twelve bytes of a line with a stamp of ten digits, up to the decimal point, as two words that overlap.
+    /// The first twelve bytes of the previous line (a stamp of ten digits, up to the decimal point) as two overlapping words.
     head: [u64; 2],
-    /// Its second, ns.
+    /// The second that these bytes encode, ns.
     second_ns: i64,
 }
 
-/// A line and its length.
+/// A parsed line and its length.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ParsedLine<'a> {
-    /// Content.
+    /// The line.
     pub line: Line<'a>,
-    /// Bytes before the line feed, or all of the text where it has none; of [`Line::Other`] and [`Line::Dropped`] 0.
+    /// Bytes before the line feed, or of the whole text if it has none; 0 for [`Line::Other`] and [`Line::Dropped`].
     pub len: usize,
 }
 
@@ -66,10 +67,10 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface, if the parser knows the name; always `None` for names of more than seven bytes and after more than
-    /// one space.
+    /// Number of the interface if the parser knows its name; always `None` for names of more than seven bytes, and after
+    /// more than one space.
     pub bus: Option<BusIndex>,
-    /// The place behind it.
+    /// The rest of the line.
     pub rest: Cursor<'a>,
 }
 
@@ -82,17 +83,17 @@ pub(crate) enum Body {
 }
 
 impl LineParser {
-    /// A parser that knows the interfaces of these names, numbered in their order.
+    /// A parser that knows these interfaces, numbered in this order.
     pub fn new(interfaces: &[String]) -> Self {
         let known = (0..u8::MAX).map(BusIndex).zip(interfaces);
         let interfaces = known.filter_map(|(bus, name)| Interface::new(name.as_bytes(), bus)).collect();
         Self { interfaces, head: NO_HEAD, second_ns: 0 }
     }
 
-    /// Reads the line at the start of `text`.
+    /// Parses the line at the start of `text`.
     ///
     /// # Errors
-    /// When the line begins with `(` and breaks the grammar.
+    /// When the line begins with `(` and violates the grammar.
     pub fn parse<'a>(&mut self, text: &'a [u8]) -> Result<ParsedLine<'a>, LineError> {
         if text.first() != Some(&b'(') {
             return Ok(ParsedLine { line: drop_count(text).unwrap_or(Line::Other), len: 0 });
@@ -107,7 +108,7 @@ impl LineParser {
         Ok(ParsedLine { line, len })
     }
 
-    /// Reads the beginning of a line with a stamp at the start of `text`.
+    /// Parses the stamp and the interface's name at the start of `text`.
     #[inline(always)]
     pub(crate) fn parse_head<'a>(&mut self, text: &'a [u8]) -> Result<LineHead<'a>, LineError> {
         let mut rest = Cursor { text, at: 0 };
@@ -131,12 +132,12 @@ impl LineParser {
         Ok(time)
     }
 
-    /// Any stamp and the space after it, and where that ends.
+    /// Any stamp and the space after it, and the position after both.
     #[inline(never)]
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
         let (text, second_ns) = (cursor.text, time.nanos() - time.nanos().rem_euclid(1_000_000_000));
-        // Ten digits, and any fraction of the second fits as well.
+        // Only stamps of ten digits, and only if any fraction of the second fits too.
         if text.get(11) == Some(&b'.') && text.get(1) != Some(&b'-') && second_ns.checked_add(1_000_000_000).is_some() {
             (self.head, self.second_ns) = ([word(text, 0), word(text, 4)], second_ns);
         }
@@ -144,15 +145,15 @@ impl LineParser {
         Ok((time, cursor.at))
     }
 
-    /// The interface's name, its number if it is known, and the space after it.
+    /// The interface's name, its number if known, and the space after it.
     #[inline(always)]
     fn interface<'a>(&self, cursor: &mut Cursor<'a>) -> Result<(&'a [u8], Option<BusIndex>), LineError> {
-        // The position after the name depends on its length. Comparing known names lets the processor predict it; counting would
-        // make it wait.
+        // The position after the name depends on its length. Comparing with known names lets the processor predict it,
+        // whereas counting bytes would make it wait.
         let ahead = cursor.ahead().unwrap_or(&[0; 8]);
         let name = u64::from_le_bytes(*ahead);
         let is_known = |known: &&Interface| name & known.mask == known.name;
-        // Most logs are of one interface: no loop for the first.
+        // Most logs have one interface, so the first is compared without a loop.
         let known = self.interfaces.first().filter(is_known);
         if let Some(known) = known.or_else(|| self.interfaces.iter().skip(1).find(is_known)) {
             cursor.at += known.len;
@@ -164,7 +165,7 @@ impl LineParser {
     }
 }
 
-/// The fraction of a stamp of ten digits in nanoseconds, and the length of the stamp and the space after it.
+/// The fraction of a ten-digit stamp in nanoseconds, and the length of the stamp and the space after it.
 #[inline(always)]
 fn fraction(text: &[u8; 24]) -> Option<(i64, usize)> {
     if text[18] == b')' {
@@ -185,7 +186,7 @@ fn drop_count(line: &[u8]) -> Option<Line<'_>> {
     Some(Line::Dropped { interface, frames })
 }
 
-/// A place in a line. Functions for rare forms take it by value, so that it stays in registers.
+/// A position in a line. Functions for rare forms take it by value, so that it stays in registers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cursor<'a> {
     pub(super) text: &'a [u8],
@@ -222,13 +223,13 @@ impl<'a> Cursor<'a> {
         found
     }
 
-    /// Value of the hex digit at `offset` from here; above 15 when there is none.
+    /// Value of the hex digit at `offset` from here; above 15 if there is none.
     fn hex_at(&self, offset: usize) -> u32 {
         self.text.get(self.at + offset).map_or(u32::MAX, |&b| HEX[usize::from(b)])
     }
 
-    /// `(` seconds `.` six or nine digits `)`, to nanoseconds. A minus sign is taken too: it is what
-    /// [`super::write_stamp`] writes for a time before the clock's origin.
+    /// `(` seconds `.` six or nine digits `)`, in nanoseconds. A minus sign is accepted because [`super::write_stamp`] writes
+    /// one for times before the clock's origin.
     pub(super) fn stamp(&mut self) -> Result<Timestamp, LineError> {
         self.demand(b'(', "a stamp in parentheses")?;
         let negative = self.take(b'-');
@@ -249,7 +250,7 @@ impl<'a> Cursor<'a> {
         Ok(Timestamp::from_nanos(if negative { -total } else { total }))
     }
 
-    /// Decimal digits (saturating far above what a stamp may be) and how many there were.
+    /// Decimal digits (saturating far above any stamp) and their number.
     fn decimal(&mut self) -> (i64, usize) {
         let start = self.at;
         let mut value: i64 = 0;
@@ -266,7 +267,7 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Any name of an interface with the spaces around it, and where those end.
+    /// Any interface name with the spaces around it, and the position after them.
     #[inline(never)]
     pub(super) fn interface(mut self) -> Result<(&'a [u8], usize), LineError> {
         while self.take(b' ') {}
@@ -279,7 +280,7 @@ impl<'a> Cursor<'a> {
         Ok((name, self.at))
     }
 
-    /// A frame with a standard identifier and eight bytes, and where the line ends after it; `None` = there is something else.
+    /// A frame with a standard identifier and eight bytes, and the position of the line's end after it; `None` = another form.
     #[inline(always)]
     pub(crate) fn usual_frame_and_end(&self) -> Option<(Frame, usize)> {
         let text: &[u8; 21] = self.ahead()?;
@@ -291,8 +292,8 @@ impl<'a> Cursor<'a> {
         Some((Frame::of_word(id, eight_hex_bytes(*text[4..].first_chunk()?)?, 8), self.at + 20))
     }
 
-    /// Any frame, the line's end after it, and where that is: what the line holds, and whether it was sent by the machine that
-    /// recorded it.
+    /// Any frame and the line's end after it: the content, whether it was sent by the machine that recorded it, and the
+    /// position of the line's end.
     #[inline(never)]
     pub(crate) fn frame_and_end(mut self) -> Result<(Body, bool, usize), LineError> {
         let body = self.frame()?;
@@ -328,7 +329,7 @@ impl<'a> Cursor<'a> {
         if let Some(id) = CanId::extended(raw) {
             return self.payload(id).map(Body::Frame);
         }
-        // The bit that marks an error frame.
+        // This bit marks an error frame.
         if raw & !MAX_EXTENDED != 0x2000_0000 {
             self.at -= 9;
             return self.fail("an identifier of at most 1FFFFFFF, or an error frame's (bit 20000000)");
@@ -378,7 +379,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
-    /// `_9` to `_F` after a length of 8: the length code that was on the wire; the payload is 8 bytes all the same.
+    /// `_9` to `_F` after a length of 8: the length code on the wire. The payload still has 8 bytes.
     fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
         if len != 8 || !self.take(b'_') {
             return Ok(());
@@ -399,7 +400,7 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::fd_padded(id, flags & 1 != 0, flags & 2 != 0, len, &data), "at most 64 bytes")
     }
 
-    /// Bytes of two hex digits, dots between them allowed, as many as there are up to the room in `data`.
+    /// Bytes of two hex digits, optionally separated by dots, up to the room in `data`.
     fn bytes(&mut self, data: &mut [u8]) -> Result<usize, LineError> {
         let mut len = 0;
         while len < data.len() {
@@ -439,7 +440,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The direction that `-x` adds, then nothing but blanks. Whether the frame was sent here.
+    /// The direction that `-x` adds, then only blanks. Returns whether the frame was sent by the recording machine.
     fn suffix(&mut self) -> Result<bool, LineError> {
         let blank = |b: Option<u8>| matches!(b, None | Some(b' ' | b'\r' | b'\t'));
         if !blank(self.peek()) {

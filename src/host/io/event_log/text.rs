@@ -1,4 +1,4 @@
-//! Channels and commands in words, for log lines. Cells and sensors count from 1, as in every display.
+//! Channels and commands in words, for log lines. Cells and sensors are counted from 1, as everywhere for users.
 
 use crate::alarm::Selector;
 use crate::monitor::Command;
@@ -46,13 +46,13 @@ mod tests {
     use crate::quantity::{CellIndex, SensorIndex};
 
     #[test]
-    fn cells_and_sensors_have_their_displayed_numbers() {
+    fn cells_and_sensors_count_from_one() {
         assert_eq!(channel(Channel::CellVoltage(CellIndex(72))), "cell voltage 73");
         assert_eq!(channel(Channel::Temperature(SensorIndex(0))), "temperature 1");
     }
 
     #[test]
-    fn a_command_names_what_it_selects() {
+    fn command_words_name_selection() {
         let rule = Some(Rule::CapacityLow);
         let which = Selector { rule, severity: Some(Severity::Severe), cell: Some(CellIndex(72)) };
         assert_eq!(command(&Command::Clear(which)), "clear capacity_low of severity severe of cell 73");

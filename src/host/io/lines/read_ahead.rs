@@ -1,19 +1,19 @@
-//! A reader that works ahead on a thread of its own: unpacking costs several times what reading the text does.
+//! A reader that decompresses ahead on its own thread, because decompression costs several times as much as parsing.
 //!
-//! Bytes and errors come out in their order and place. At most [`BLOCKS`] blocks are in flight and they are used again, so
-//! memory is bounded and nothing is allocated on the way. When the reader is dropped the thread ends with its next block;
-//! no caller waits for it, since its source may be a pipe that is silent for long.
+//! Bytes and errors keep their order. At most [`BLOCKS`] blocks are in flight and are reused, so memory is bounded and nothing
+//! is allocated while reading. After the reader is dropped, the thread ends with its next block. Nobody waits for it,
+//! because its source may be a pipe that stays silent for long.
 
 use std::io::{self, Read};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread;
 
-/// Blocks in flight: one being filled, one being read, two to even out the delays between them.
+/// Blocks in flight: one being filled, one being read, two to absorb delays.
 const BLOCKS: usize = 4;
 
 /// The reading end.
 pub(super) struct ReadAhead {
-    /// Blocks in their order; an empty one is the end.
+    /// Blocks in order; an empty block marks the end.
     pieces: Receiver<io::Result<Vec<u8>>>,
     used: Sender<Vec<u8>>,
     block: Vec<u8>,
@@ -23,7 +23,7 @@ pub(super) struct ReadAhead {
 }
 
 impl ReadAhead {
-    /// Begins to read `source` in blocks of `block_len` bytes.
+    /// Starts reading `source` in blocks of `block_len` bytes.
     pub(super) fn new(source: impl Read + Send + 'static, block_len: usize) -> io::Result<Self> {
         let (full, pieces) = sync_channel(BLOCKS);
         let (used, empty) = channel();
@@ -34,12 +34,12 @@ impl ReadAhead {
         Ok(Self { pieces, used, block: Vec::new(), given: 0, ended: false })
     }
 
-    /// Waits for the next block; `false` at the end.
+    /// Waits for the next block; `false` = end of the source.
     fn next_block(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);
         }
-        let stopped = |_| Err(io::Error::other("unpacking stopped for an unknown reason"));
+        let stopped = |_| Err(io::Error::other("decompression stopped for an unknown reason"));
         let next = self.pieces.recv().unwrap_or_else(stopped);
         self.ended = next.as_ref().map_or(true, Vec::is_empty);
         let used = std::mem::replace(&mut self.block, next?);
@@ -66,14 +66,14 @@ impl Read for ReadAhead {
     }
 }
 
-/// Fills empty blocks until the source ends or fails, or the reading end is gone.
+/// Fills empty blocks until the source ends or fails, or the reader is dropped.
 fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<io::Result<Vec<u8>>>) {
     while let Ok(mut block) = empty.recv() {
         block.clear();
         let room = block.capacity() as u64;
         let read = source.by_ref().take(room).read_to_end(&mut block);
         let is_end = block.is_empty();
-        // What was read before an error comes before it.
+        // Bytes read before an error are delivered before the error.
         if (!is_end || read.is_ok()) && full.send(Ok(block)).is_err() {
             return;
         }
@@ -91,7 +91,7 @@ fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<io::
 mod tests {
     use super::*;
 
-    /// Gives `bytes` in pieces of 1 to 7, then `end`.
+    /// Returns `bytes` in pieces of 1 to 7 bytes, then `end`.
     struct Drip {
         bytes: Vec<u8>,
         at: usize,
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn all_bytes_come_through_in_their_order() {
+    fn bytes_arrive_complete_and_in_order() {
         for len in [0, 1, 99, 100, 101, 12_345] {
             let mut out = Vec::new();
             ReadAhead::new(drip(len, None), 100).expect("a thread").read_to_end(&mut out).expect("no error");
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_comes_after_every_byte_before_it_and_then_the_end() {
+    fn error_follows_all_earlier_bytes() {
         let mut ahead = ReadAhead::new(drip(1234, Some(io::ErrorKind::InvalidData)), 100).expect("a thread");
         let mut out = Vec::new();
         let error = ahead.read_to_end(&mut out).expect_err("the source's error");
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_panics_is_an_error_and_no_end() {
+    fn panicking_source_is_an_error() {
         struct Panics;
         impl Read for Panics {
             fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_stops_early_does_not_wait_for_the_rest() {
+    fn dropping_reader_early_does_not_block() {
         let endless = io::repeat(b'x');
         let mut ahead = ReadAhead::new(endless, 100).expect("a thread");
         assert_eq!(ahead.read(&mut [0; 8]).expect("bytes"), 8);

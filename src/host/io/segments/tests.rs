@@ -1,4 +1,4 @@
-//! Segments written and read again.
+//! Segments: written and read back.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -19,7 +19,7 @@ fn text(lines: u64) -> Vec<String> {
     lines
 }
 
-/// Writes the lines in pieces that end anywhere.
+/// Writes the lines in pieces that do not end at line breaks.
 fn write(base: &Path, limits: SegmentLimits, lines: &[String]) {
     let mut writer = SegmentWriter::create(base, HEADER, limits).unwrap();
     let whole = lines.concat();
@@ -41,7 +41,7 @@ fn parts_of(files: &[PathBuf]) -> io::Result<LogParts> {
 const SMALL: SegmentLimits = SegmentLimits { total_bytes: 10 << 20, segment_bytes: 64 << 10 };
 
 #[test]
-fn segments_hold_whole_lines_and_are_the_text_but_for_repeated_headers() {
+fn segments_join_to_text_with_repeated_headers() {
     let folder = tempfile::tempdir().unwrap();
     let base = folder.path().join("journal");
     let lines = text(20_000);
@@ -59,7 +59,7 @@ fn segments_hold_whole_lines_and_are_the_text_but_for_repeated_headers() {
 }
 
 #[test]
-fn the_oldest_are_deleted_beyond_the_limit_and_that_is_known() {
+fn oldest_segments_are_deleted_beyond_limit() {
     let folder = tempfile::tempdir().unwrap();
     let base = folder.path().join("journal");
     let limits = SegmentLimits { total_bytes: 200 << 10, ..SMALL };
@@ -73,7 +73,7 @@ fn the_oldest_are_deleted_beyond_the_limit_and_that_is_known() {
 }
 
 #[test]
-fn an_earlier_run_is_kept_within_the_same_limit() {
+fn earlier_run_is_kept_within_limit() {
     let folder = tempfile::tempdir().unwrap();
     let base = folder.path().join("journal");
     let limits = SegmentLimits { total_bytes: 300 << 10, ..SMALL };
@@ -89,13 +89,13 @@ fn an_earlier_run_is_kept_within_the_same_limit() {
 }
 
 #[test]
-fn a_torn_segment_is_readable_up_to_its_last_flush() {
+fn torn_segment_is_readable_to_last_flush() {
     let folder = tempfile::tempdir().unwrap();
     let base = folder.path().join("journal");
     let mut writer = SegmentWriter::create(&base, HEADER, SMALL).unwrap();
     let lines = text(500).concat();
     writer.write(lines.as_bytes()).unwrap();
-    // The power is cut here: the frame has no end.
+    // A power cut here leaves a frame without an end.
     let torn = fs::read(path_of(&base, 1)).unwrap();
     let mut decoder = zstd::stream::read::Decoder::new(torn.as_slice()).unwrap();
     let mut found = vec![0; lines.len()];
@@ -105,7 +105,7 @@ fn a_torn_segment_is_readable_up_to_its_last_flush() {
 }
 
 #[test]
-fn a_hole_is_refused_and_other_files_are_left_alone() {
+fn missing_segment_is_rejected_other_files_ignored() {
     let folder = tempfile::tempdir().unwrap();
     let base = folder.path().join("journal");
     write(&base, SMALL, &text(20_000));
@@ -121,7 +121,7 @@ fn a_hole_is_refused_and_other_files_are_left_alone() {
 }
 
 #[test]
-fn limits_leave_room_for_two_segments() {
+fn limits_allow_two_segments() {
     assert!(SegmentLimits::new(128 << 20, 64 << 20).is_ok());
     let refused = |total, segment| SegmentLimits::new(total, segment).unwrap_err();
     assert!(refused(100 << 20, 64 << 20).contains("must be at least two segments"));

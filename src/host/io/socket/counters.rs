@@ -1,4 +1,4 @@
-//! Counters of a link since the program's start: written by its task, read by others.
+//! Counters of a link since the program's start, written by its task and read by others.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LinkState {
-    /// Not looked at yet.
+    /// Not checked yet.
     #[default]
     Unknown,
-    /// It does not exist.
+    /// The interface does not exist.
     Missing,
-    /// It exists and is down.
+    /// The interface exists and is down.
     Down,
     /// Frames may arrive.
     Up,
@@ -24,15 +24,15 @@ pub enum LinkState {
 pub struct LinkCounts {
     /// Frames dropped by the kernel: its receive buffer was full.
     pub kernel_dropped: u64,
-    /// Frames dropped by the daemon: its queue was full.
+    /// Frames dropped by the daemon because its queue was full.
     pub queue_dropped: u64,
-    /// Reads that are no valid frame.
+    /// Reads that are not a valid frame.
     pub malformed: u64,
     /// Frames sent.
     pub sent: u64,
-    /// Frames not sent: the queue to the interface was full.
+    /// Frames not sent because the queue to the interface was full.
     pub send_queue_full: u64,
-    /// Frames not sent: the kernel rejected them, or they had waited too long.
+    /// Frames not sent because the kernel rejected them or they had waited too long.
     pub send_failed: u64,
 }
 
@@ -41,9 +41,9 @@ pub struct LinkCounts {
 pub struct LinkHealth {
     /// The interface's state.
     pub state: LinkState,
-    /// Times it came up.
+    /// How often the interface came up.
     pub ups: u64,
-    /// Frames sent and lost.
+    /// Sent and lost frames.
     pub counts: LinkCounts,
 }
 
@@ -52,12 +52,12 @@ pub struct LinkHealth {
 pub(super) struct SharedHealth(Mutex<LinkHealth>);
 
 impl SharedHealth {
-    /// Counts.
+    /// Changes the counts.
     pub(super) fn count(&self, note: impl FnOnce(&mut LinkCounts)) {
         self.change(|health| note(&mut health.counts));
     }
 
-    /// Notes the interface's state, when it has changed.
+    /// Sets the interface's state. Must be called only when it has changed.
     pub(super) fn enter(&self, state: LinkState) {
         self.change(|health| {
             health.state = state;
@@ -65,7 +65,7 @@ impl SharedHealth {
         });
     }
 
-    /// The health now.
+    /// Changes the health and returns it.
     pub(super) fn change(&self, change: impl FnOnce(&mut LinkHealth)) -> LinkHealth {
         let mut health = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         change(&mut health);

@@ -1,9 +1,9 @@
-//! One interface for as long as the daemon lives: receives, sends, and survives the interface going down, away and
-//! coming back. Every change is a [`BusEvent`]; nothing here ends the program.
+//! One interface during the daemon's whole life: receives, sends, and survives that the interface goes down, is removed and
+//! returns. Every change is a [`BusEvent`]; no failure here ends the program.
 //!
-//! A socket that went down is kept: it is still bound, so the first frame after the interface comes up is not lost.
-//! A socket whose interface was removed is dead, whatever comes back under its name: a new one is opened. One task
-//! owns the socket for both directions, because the kernel keeps our frames from us only on the socket that sent them.
+//! If the interface goes down, the socket is kept: it stays bound, so the first frame after the interface comes up is not
+//! lost. If the interface is removed, its socket is dead even if an interface of the same name returns, and a new one is opened.
+//! One task uses the socket for both directions, because the kernel hides our own frames only from the socket that sent them.
 
 use std::io;
 use std::sync::Arc;
@@ -24,13 +24,13 @@ use crate::io::clock::{MappedClock, Reading, StampMapper};
 use crate::monitor::{BusEvent, Record};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// First pause before an interface that is down or missing is looked at again.
+/// First pause before an interface that is down or missing is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest such pause: a look costs a few system calls, a missed frame is lost.
+/// Longest such pause: a check costs a few system calls; a missed frame is lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// Frames read before other tasks get their turn: 8 ms of a full 1 Mbit/s bus, under one tick.
+/// Frames read before other tasks run: 8 ms of a full 1 Mbit/s bus, less than one tick.
 const READ_BATCH: usize = 64;
-/// Frames waiting to be sent: the status, health and alarm frames of a second, many times over.
+/// Frames that wait to be sent: many times the status, health and alarm frames of a second.
 const SEND_QUEUE: usize = 256;
 
 /// Settings of a link.
@@ -44,15 +44,15 @@ pub struct LinkConfig {
     pub fd: bool,
     /// Wanted identifiers, ascending.
     pub ids: Vec<CanId>,
-    /// Further extended identifiers, as identifier and mask.
+    /// Further extended identifiers, as pairs of identifier and mask.
     pub patterns: Vec<(u32, u32)>,
-    /// Every frame is wanted.
+    /// Whether every frame is wanted.
     pub all: bool,
-    /// Receive buffer to ask for, bytes.
+    /// Receive buffer to request, bytes.
     pub receive_buffer_bytes: usize,
 }
 
-/// The sending end of a link. Dropped, it ends the link once what is queued has been sent.
+/// The sending end of a link. When it is dropped, the link ends after sending the queued frames.
 #[derive(Debug)]
 pub struct LinkOutput {
     queue: mpsc::Sender<QueuedFrame>,
@@ -67,7 +67,7 @@ struct QueuedFrame {
 }
 
 impl LinkOutput {
-    /// Queues a frame; one that finds the queue full is dropped and counted.
+    /// Queues a frame. If the queue is full, the frame is dropped and counted.
     pub fn send(&self, frame: Frame) {
         if self.queue.try_send(QueuedFrame { since: Instant::now(), frame }).is_err() {
             self.unsent.fetch_add(1, Ordering::Relaxed);
@@ -81,7 +81,7 @@ impl LinkOutput {
     }
 }
 
-/// Reason why a socket is no longer served.
+/// Why a socket is no longer used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ServiceEnd {
     /// The daemon stops.
@@ -100,27 +100,27 @@ pub struct Link {
     unsent: Arc<AtomicU64>,
     health: Arc<SharedHealth>,
     state: LinkState,
-    /// When that was noted.
+    /// When the state was noted.
     state_since: Timestamp,
-    /// Frames lost since the last report: by the kernel, and by our full inbox.
+    /// Frames lost since the last report, in the kernel or because our inbox was full.
     lost: u64,
     report: Interval,
     pause: Duration,
     last_problem: Option<String>,
 }
 
-/// An open socket and what belongs to it alone.
+/// An open socket and its state.
 struct OpenSocket {
     socket: AsyncFd<RawSocket>,
     mapper: StampMapper,
     /// Frames of one call; kept to reuse its memory.
     received: Vec<RawRead>,
     dropped_total: u32,
-    /// The next frame to send, waiting for room.
+    /// The next frame to send, waiting for room in the kernel.
     pending: Option<QueuedFrame>,
 }
 
-/// Registers a socket with the runtime. Errors too: a removed interface makes the socket neither readable nor writable.
+/// Registers a socket with the runtime, including errors: after its interface is removed, a socket is neither readable nor writable.
 #[expect(
     deprecated,
     reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"
@@ -130,11 +130,11 @@ fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
 }
 
 impl Link {
-    /// A link, not yet running, and its sending end. Must be called inside the runtime.
+    /// Creates a link that is not yet running, and its sending end. Must be called inside the runtime.
     pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
-        // How often losses are reported: a stalled bus must not fill the journal.
+        // Period of loss reports; a stalled bus must not fill the journal.
         let mut report = interval(Duration::from_millis(250));
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let health = Arc::<SharedHealth>::default();
@@ -156,7 +156,7 @@ impl Link {
         (link, output)
     }
 
-    /// Serves the interface until the sending end is dropped.
+    /// Runs the interface until the sending end is dropped.
     pub async fn run(mut self) {
         loop {
             let end = match self.open().await {
@@ -169,7 +169,7 @@ impl Link {
         }
     }
 
-    /// Opens the interface and sends its state as an event; `None` when it cannot be opened.
+    /// Opens the interface and reports its state as an event; `None` if it cannot be opened.
     async fn open(&mut self) -> Option<OpenSocket> {
         let LinkConfig { interface, fd, ids, patterns, all, receive_buffer_bytes, .. } = &self.config;
         let filters = if *all { every_frame() } else { filters(ids, patterns) };
@@ -212,7 +212,7 @@ impl Link {
                 ready = open.socket.ready(interest) => match ready {
                     Ok(mut guard) => {
                         let ready = guard.ready();
-                        // Cleared before the work: an edge during the work sets it again. The loop reads until the
+                        // Cleared before the work, so that an edge during the work sets it again. The loop reads until the
                         // socket is empty.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
@@ -224,7 +224,7 @@ impl Link {
                 _ = self.report.tick() => {
                     self.note_dropped(open);
                     if self.has_losses() {
-                        // An event's time is the least time of later frames: those that wait in the socket come first.
+                        // Later frames must not have an earlier time than an event, so frames in the socket are read first.
                         let noticed = Reading::now();
                         if !self.receive_all(open).await {
                             return ServiceEnd::Dead;
@@ -253,14 +253,14 @@ impl Link {
         }
     }
 
-    /// Reads until the socket is empty, with pauses for the other tasks; `false` = it is dead.
+    /// Reads until the socket is empty, yielding to other tasks; `false` = the socket is dead.
     async fn receive_all(&mut self, open: &mut OpenSocket) -> bool {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
                 open.received.clear();
                 match open.socket.get_ref().receive(&mut open.received) {
                     Ok(()) => {
-                        // Once for all of them: the frames of one call are read at one moment.
+                        // One reading for all frames, because one call read them at the same moment.
                         let reading = Reading::now();
                         for received in &open.received {
                             self.take(&mut open.mapper, received, reading).await;
@@ -291,7 +291,7 @@ impl Link {
     /// Forwards one frame or event.
     async fn take(&mut self, mapper: &mut StampMapper, received: &RawRead, reading: Reading) {
         let time = mapper.arrival(received.stamps, reading);
-        // Frames that were still in the socket when the interface went down do not say that it is up again.
+        // Frames that were in the socket when the interface went down do not show that it is up again.
         if self.state != LinkState::Up && time > self.state_since {
             self.enter_at(LinkState::Up, time).await;
         }
@@ -320,10 +320,10 @@ impl Link {
         self.health.count(|counts| counts.kernel_dropped += dropped);
     }
 
-    /// Sends what waits, if there is room; `false` = the socket is dead.
+    /// Sends the waiting frame if there is room; `false` = the socket is dead.
     async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
         let Some(outgoing) = open.pending.take() else { return true };
-        // A frame not sent after this long is out of date and is dropped.
+        // A frame that has waited this long is outdated and is dropped.
         let useless = self.state != LinkState::Up || outgoing.since.elapsed() > Duration::from_millis(500);
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
@@ -337,12 +337,12 @@ impl Link {
         true
     }
 
-    /// Handles an error of the socket: notes the interface's state; `false` = the socket is dead.
+    /// Handles a socket error and notes the interface's state; `false` = the socket is dead.
     async fn survives(&mut self, error: Errno) -> bool {
         let (state, is_known, is_alive) = match error {
             Errno::ENETDOWN => (Some(LinkState::Down), true, true),
             Errno::ENODEV | Errno::ENXIO => (Some(LinkState::Missing), true, false),
-            // A frame this interface cannot carry; counted by the caller.
+            // The interface cannot carry this frame; the caller counts it.
             Errno::EINVAL | Errno::EMSGSIZE => (None, false, true),
             _ => (Some(LinkState::Down), false, false),
         };
@@ -355,7 +355,7 @@ impl Link {
         is_alive
     }
 
-    /// Checks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
+    /// Checks whether an interface that was down is up again; `false` = the socket is bound to a removed interface.
     async fn look(&mut self, open: &OpenSocket) -> bool {
         if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
             return false;
@@ -366,7 +366,7 @@ impl Link {
         true
     }
 
-    /// Without a socket: waits, and drops the frames to send.
+    /// Waits while there is no socket, and drops the frames to send.
     async fn wait(&mut self) -> ServiceEnd {
         let until = Instant::now() + self.lengthen_pause();
         loop {
@@ -392,12 +392,12 @@ impl Link {
         pause
     }
 
-    /// Notes the interface's state; sends an event when it is new.
+    /// Notes the interface's state; reports an event if it is new.
     async fn enter(&mut self, state: LinkState) {
         self.enter_at(state, self.clock.now()).await;
     }
 
-    /// As [`enter`](Self::enter), at the time of the frame or event that shows the state.
+    /// Like [`enter`](Self::enter), at the time of the frame or event that shows the state.
     async fn enter_at(&mut self, state: LinkState, time: Timestamp) {
         if self.state == state {
             return;
@@ -420,7 +420,7 @@ impl Link {
         self.lost > 0 || self.unsent.load(Ordering::Relaxed) > 0
     }
 
-    /// Sends the frames lost since the last report as events.
+    /// Reports the frames lost since the last report as events.
     async fn report_losses(&mut self, time: Timestamp) {
         let frames = std::mem::take(&mut self.lost);
         if frames > 0 {
@@ -432,13 +432,13 @@ impl Link {
         }
     }
 
-    /// Sends an event. Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
+    /// Reports an event. Events are never dropped: a full inbox is waited for, while the kernel queues, drops and counts frames.
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
         let _ = self.inbox.send(Record::bus(time, self.config.bus, event)).await;
     }
 
-    /// Logs a problem once, until it is another one.
+    /// Logs a problem once, until a different one occurs.
     fn problem(&mut self, error: &io::Error) {
         let text = error.to_string();
         if self.last_problem.as_ref() != Some(&text) {

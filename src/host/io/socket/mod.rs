@@ -1,11 +1,11 @@
 //! SocketCAN interfaces.
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
-//!   `CanSender::open("vcan0", fd)?` then `sender.send(&frame)?`; a full transmit queue is waited for, within a limit.
+//!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`, which waits for a full transmit queue up to a limit.
 //! * `PassiveSocket`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
-//! * `Link`: the daemon's task per interface: receives, sends, and survives every state of the interface.
+//! * `Link`: the daemon's task for one interface: receives, sends, and survives every state of the interface.
 //!
-//! Underneath: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
+//! Layers below: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
 
 mod counters;
 mod link;

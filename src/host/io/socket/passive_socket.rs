@@ -1,4 +1,4 @@
-//! Receives on an interface without a wait: frames, also those of this computer, error frames, and the number of dropped frames.
+//! Receives from an interface without blocking: frames (including this computer's own), error frames, the number of dropped frames.
 
 use std::io;
 
@@ -20,12 +20,12 @@ pub struct PassiveSocket {
     /// Frames of one call; kept to reuse its memory.
     received: Vec<RawRead>,
     dropped_total: u32,
-    /// The clocks as last read: before what is read next.
+    /// The clocks before the next read.
     before: Reading,
 }
 
 impl PassiveSocket {
-    /// Opens the interface for everything: all identifiers, classic and FD. Second: whether it is up.
+    /// Opens the interface for all identifiers, classic and FD. Also returns whether the interface is up.
     ///
     /// # Errors
     /// When the interface does not exist, or this kernel has no SocketCAN.
@@ -35,8 +35,8 @@ impl PassiveSocket {
         Ok((Self::new(socket, clock), is_up))
     }
 
-    /// Opens the interface for these identifiers, ascending, and for extended ones by identifier and mask; `fd` = FD
-    /// frames too.
+    /// Opens the interface for these identifiers (ascending) and for extended identifiers that match an identifier and mask;
+    /// `fd` = also FD frames.
     ///
     /// # Errors
     /// When the interface does not exist, is down, or this kernel has no SocketCAN.
@@ -51,10 +51,10 @@ impl PassiveSocket {
         Self { socket, mapper, received, dropped_total: 0, before }
     }
 
-    /// Appends the frames and events received so far, as of interface `bus`; `false` = there are no more now.
+    /// Appends the frames and events received so far, as of interface `bus`; `false` = no more at the moment.
     ///
     /// # Errors
-    /// When the interface went down (`ENETDOWN`: the tap stays good) or away.
+    /// When the interface went down (`ENETDOWN`; the socket remains usable) or was removed.
     pub fn next(&mut self, bus: BusIndex, into: &mut Vec<Record>) -> io::Result<bool> {
         self.received.clear();
         match self.socket.receive(&mut self.received) {

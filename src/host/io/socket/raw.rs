@@ -1,8 +1,8 @@
-//! One SocketCAN raw socket: opened so that nothing but the wanted identifiers ever reaches it, read several frames in
-//! one system call with their stamps, written without blocking.
+//! One SocketCAN raw socket. Its filters are set before it is bound, so it receives only wanted identifiers. It reads several
+//! frames with their stamps in one system call, and writes without blocking.
 //!
-//! The kernel's drop counter is read separately, not with each frame: a frame's control message carries it only once a later
-//! frame was received, and changes its size when the first is dropped (see [`Slots`]).
+//! The kernel's drop counter is read separately. A frame's control message contains it only after a later frame was received,
+//! and the control message's size changes with the first drop (see [`Slots`]).
 
 use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
@@ -22,27 +22,27 @@ use super::wire::{self, FD_BYTES, Wire};
 use crate::can::{CanId, Frame};
 use crate::io::clock::{KernelStamps, nanos};
 
-/// Receive buffer asked for, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its
-/// bookkeeping), a third of a second of a full 1 Mbit/s bus. The kernel caps it at net.core.rmem_max.
+/// Receive buffer to request, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its bookkeeping), a third
+/// of a second of a full 1 Mbit/s bus. The kernel limits it to net.core.rmem_max.
 pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
-/// Most frames read in one system call: with 16 the call itself no longer dominates the cost of a frame, and preparing their
-/// buffers costs little when only one arrives.
+/// Most frames read in one system call. With 16, the call itself no longer dominates the cost of a frame, and preparing
+/// the buffers is cheap even if only one frame arrives.
 pub(super) const CALL_BATCH: usize = 16;
 
-/// Most filters the kernel takes (CAN_RAW_FILTER_MAX).
+/// Most filters that the kernel accepts (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
 
-/// A read and its stamps.
+/// A frame read from the socket, and its stamps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RawRead {
     pub(super) what: Wire,
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call. They are reused, and the kernel writes into each header how much of the room for control messages it
-/// used, which is all the room of the next frame there: enough as long as each frame carries its stamp. After one without, the
-/// headers are built again.
+/// Buffers of one call, reused. The kernel writes into each header how much of the room for control messages it used, and that
+/// is the room for the next frame in this slot. The room is sufficient as long as every frame carries a stamp; after a frame
+/// without one, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],
@@ -65,7 +65,7 @@ impl Slots {
             let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
             for (message, length) in messages.zip(&mut lengths) {
                 *length = message.bytes.min(FD_BYTES);
-                // An error says that a control message was cut off: as good as none.
+                // An error means that a control message was cut off; treated like a missing stamp.
                 let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
                 into.push(RawRead { what: Wire::Malformed, stamps });
             }
@@ -81,7 +81,7 @@ impl Slots {
 }
 
 thread_local! {
-    /// Shared by all sockets of a thread: headers hold pointers, so they cannot move between threads as a socket may.
+    /// Shared by all sockets of a thread. Headers contain pointers, so unlike sockets they cannot move between threads.
     static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
 }
 
@@ -89,16 +89,16 @@ thread_local! {
 #[derive(Debug)]
 pub(super) struct RawSocket {
     socket: CanFdSocket,
-    /// The kernel's number of the interface it is bound to.
+    /// The kernel's index of the interface.
     pub(super) index: u32,
 }
 
 impl RawSocket {
-    /// Opens and binds; `fd` = FD frames too. Filters are set before the bind, so that not one unwanted frame is queued.
+    /// Opens and binds; `fd` = also FD frames. Filters are set before the bind, so that no unwanted frame is queued.
     ///
     /// # Errors
-    /// `ENODEV` when there is no such interface; an interface that is down opens, and says so in
-    /// [`RawSocket::take_error`].
+    /// `ENODEV` if the interface does not exist. An interface that is down opens successfully; [`RawSocket::take_error`]
+    /// then returns the error.
     pub(super) fn open(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
         let descriptor = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
@@ -118,7 +118,7 @@ impl RawSocket {
         Ok(Self { socket, index })
     }
 
-    /// As [`RawSocket::open`], on an interface that is up; errors name it.
+    /// Like [`RawSocket::open`], but requires the interface to be up; errors contain its name.
     ///
     /// # Errors
     /// Those of [`RawSocket::open`], and when the interface is down.
@@ -133,35 +133,35 @@ impl RawSocket {
         self.socket.as_raw_socket().take_error()
     }
 
-    /// The receive buffer the kernel granted, bytes (it doubles what it was asked for).
+    /// The receive buffer granted by the kernel, bytes (twice the requested size).
     pub(super) fn receive_buffer_bytes(&self) -> io::Result<usize> {
         self.socket.as_raw_socket().recv_buffer_size()
     }
 
-    /// Reads up to [`CALL_BATCH`] frames from the socket and appends them; fewer mean that it is empty.
+    /// Reads up to [`CALL_BATCH`] frames and appends them; fewer mean that the socket is empty.
     ///
     /// # Errors
-    /// `EAGAIN` when there is none; `ENETDOWN`, `ENODEV` once when the interface went down or away.
+    /// `EAGAIN` if the socket is empty; `ENETDOWN` or `ENODEV` once when the interface went down or was removed.
     pub(super) fn receive(&self, into: &mut Vec<RawRead>) -> Result<(), Errno> {
         SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
     }
 
-    /// Frames this socket has lost since it was opened because its receive buffer was full, modulo 2^32; 0 where the kernel cannot
-    /// say.
+    /// Frames lost since the socket was opened because its receive buffer was full, modulo 2^32; 0 if the kernel does not
+    /// support this.
     pub(super) fn dropped_total(&self) -> u32 {
-        // Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
+        // SO_MEMINFO returns nine numbers; the last one counts drops (linux/sock_diag.h; since Linux 4.12).
         let mut bytes = [0; 9 * size_of::<u32>()];
         let result = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
         let (numbers, _) = bytes.as_chunks();
-        // A shorter answer leaves it zero.
+        // If the kernel returns fewer numbers, this one stays zero.
         result.map_or(0, |_| u32::from_ne_bytes(numbers[8]))
     }
 
-    /// Hands one frame to the kernel.
+    /// Passes one frame to the kernel.
     ///
     /// # Errors
-    /// `EAGAIN` and `ENOBUFS` when there is no room, `ENETDOWN`, `ENODEV`, `ENXIO` when the interface is down or
-    /// gone, `EINVAL` for an FD frame on a classic interface.
+    /// `EAGAIN` and `ENOBUFS` if there is no room; `ENETDOWN`, `ENODEV`, `ENXIO` if the interface is down or was removed;
+    /// `EINVAL` for an FD frame on a classic interface.
     pub(super) fn send(&self, frame: &Frame) -> Result<(), Errno> {
         let mut buffer = [0; FD_BYTES];
         send(self.socket.as_raw_fd(), wire::encode(frame, &mut buffer), MsgFlags::MSG_DONTWAIT).map(drop)
@@ -180,15 +180,15 @@ impl AsFd for RawSocket {
     }
 }
 
-/// The kernel's number of an interface.
+/// The kernel's index of an interface.
 ///
 /// # Errors
-/// `ENODEV` when there is none of this name.
+/// `ENODEV` if there is no interface of this name.
 pub(super) fn index_of(interface: &str) -> io::Result<u32> {
     Ok(nix::net::if_::if_nametoindex(interface)?)
 }
 
-/// Hardware and software stamps, or where the kernel cannot say which, its plain ones.
+/// Requests hardware and software stamps; if the kernel cannot distinguish them, plain software stamps.
 fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
     let flags = TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE
         | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE
@@ -200,8 +200,8 @@ fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
     Ok(())
 }
 
-/// Filters for exactly these identifiers, data frames only. With more than the kernel accepts, the filter is
-/// open and the reader ignores unknown identifiers.
+/// Filters for exactly these identifiers, data frames only. If the kernel does not accept that many filters, all frames pass
+/// and the reader ignores unknown identifiers.
 pub(super) fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
     if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
         return every_frame();
@@ -212,7 +212,7 @@ pub(super) fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> 
     exact.chain(patterns).collect()
 }
 
-/// The filter that lets every frame through.
+/// A filter that accepts every frame.
 pub(super) fn every_frame() -> Vec<CanFilter> {
     vec![CanFilter::new(0, 0)]
 }
@@ -252,28 +252,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_filter_separates_standard_from_extended_and_keeps_remote_requests_out() {
+    fn filter_separates_standard_extended_and_remote() {
         assert_eq!(filter_mask(CanId::Standard(0x123)), 0xC000_07FF);
         assert_eq!(filter_mask(CanId::Extended(0x123)), 0xDFFF_FFFF);
         assert_eq!(wire::id_word(CanId::Extended(0x123)), 0x8000_0123);
     }
 
     #[test]
-    fn more_identifiers_than_the_kernel_takes_open_the_filter() {
+    fn too_many_identifiers_open_the_filter() {
         let ids: Vec<CanId> = (0..=MAX_KERNEL_FILTERS as u16).map(CanId::Standard).collect();
         assert_eq!(filters(&ids, &[]).len(), 1);
         assert_eq!(filters(&ids[1..], &[]).len(), MAX_KERNEL_FILTERS);
     }
 
     #[test]
-    fn a_zero_stamp_is_none() {
+    fn zero_stamp_means_none() {
         assert_eq!(stamp(TimeSpec::new(0, 0)), None);
         assert_eq!(stamp(TimeSpec::new(1, 5)), Some(1_000_000_005));
     }
 
     #[test]
-    fn one_call_takes_what_waits_in_order_and_frames_without_stamps_spoil_no_later_ones() {
-        // Any datagrams do: the kernel's headers are the same.
+    fn frames_without_stamps_spoil_no_later_stamps() {
+        // Any datagram socket will do: the kernel's headers are the same.
         let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         tx.connect(rx.local_addr().unwrap()).unwrap();
         let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());

@@ -1,4 +1,4 @@
-//! A blocking sender: plays frames onto an interface for `replay --to` and `simulate --to`.
+//! A blocking sender that plays frames onto an interface, for `replay --to` and `simulate --to`.
 
 use std::io;
 use std::os::fd::AsFd;
@@ -10,10 +10,10 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use super::raw::RawSocket;
 use crate::can::Frame;
 
-/// Pause before a full transmit queue is tried again: about four frames of a 500 kbit/s bus.
+/// Pause before the next attempt if the transmit queue is full: about four frames on a 500 kbit/s bus.
 const RETRY_PAUSE: Duration = Duration::from_millis(1);
 
-/// Tries before a queue that does not empty is an error: 2 s, in which any live bus sends hundreds of frames.
+/// Most attempts before a full queue is an error: 2 s, in which a working bus sends hundreds of frames.
 const MAX_TRIES: u32 = 2_000;
 
 /// Sends frames one after the other on one interface; receives nothing.
@@ -36,7 +36,7 @@ impl CanSender {
     /// Sends one frame; waits while the transmit queue is full, at most about 2 s.
     ///
     /// # Errors
-    /// When the queue does not empty, the interface goes down or away, or it cannot carry this frame (FD on classic).
+    /// When the queue does not empty, the interface goes down or is removed, or it cannot carry this frame (FD on classic).
     pub fn send(&self, frame: &Frame) -> io::Result<()> {
         for _ in 0..MAX_TRIES {
             match self.socket.send(frame) {

@@ -1,4 +1,4 @@
-//! `struct can_frame` and `struct canfd_frame` of linux/can.h as bytes, both ways.
+//! `struct can_frame` and `struct canfd_frame` of linux/can.h: decoded from and encoded to bytes.
 
 use crate::can::{CanId, Frame, FrameKind};
 
@@ -36,7 +36,7 @@ pub(super) enum Wire {
     Malformed,
 }
 
-/// Reads what `recvmsg` returned.
+/// Decodes the bytes that `recvmsg` returned.
 pub(super) fn decode(bytes: &[u8]) -> Wire {
     if bytes.len() != CLASSIC_BYTES && bytes.len() != FD_BYTES {
         return Wire::Malformed;
@@ -60,7 +60,7 @@ pub(super) fn decode(bytes: &[u8]) -> Wire {
     frame.map_or(Wire::Malformed, Wire::Frame)
 }
 
-/// Lays out a frame for the kernel; the bytes used of `buffer`.
+/// Encodes a frame for the kernel; returns the used part of `buffer`.
 pub(super) fn encode<'a>(frame: &Frame, buffer: &'a mut [u8; FD_BYTES]) -> &'a [u8] {
     buffer.fill(0);
     let mut word = id_word(frame.id());
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_of_frame_survives_the_kernels_layout() {
+    fn every_frame_kind_round_trips() {
         let (standard, extended) = (CanId::Standard(0x7FF), CanId::Extended(0x123));
         round_trip(Frame::classic(standard, &[1, 2, 3]).unwrap());
         round_trip(Frame::classic(extended, &[]).unwrap());
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_frame_is_its_class() {
+    fn error_frame_decodes_to_class() {
         let mut bytes = [0; CLASSIC_BYTES];
         bytes[..4].copy_from_slice(&(ERROR_FLAG | 0x44).to_ne_bytes());
         assert_eq!(decode(&bytes), Wire::Error(0x44));

@@ -143,7 +143,7 @@ fn a_second_daemon_does_not_take_the_sockets() {
     let folder = tempfile::tempdir().unwrap();
     let (_server, path) = serve(&folder, PATIENT);
     let error = StatusServer::start(&PlaceSetting::At(path)).unwrap_err();
-    assert!(error.contains("listens there already") && error.contains("--status"), "{error}");
+    assert!(error.contains("already in use by") && error.contains("--status"), "{error}");
 }
 
 #[test]

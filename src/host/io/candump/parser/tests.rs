@@ -4,11 +4,11 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// What follows in the log.
+/// Text that follows the line in the log.
 const MORE: &str = "\n(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
-/// The line as a parser reads it that has read it before and knows its interface, with text after it; it must be what a new
-/// parser reads of the line alone, which has none of the short ways.
+/// The line as read by a parser that has read it before, knows its interface and sees more text after it. The result must
+/// equal that of a new parser, which reads the line alone and takes none of the fast paths.
 fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
     let plain = crate::io::candump::parse_line(line);
     let name = match plain {
@@ -29,7 +29,7 @@ fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
             }
             let is_short = name.as_bytes() == interface && (1..8).contains(&name.len());
             let number = BusIndex(u8::from(name != "none"));
-            // After more than one space it is found by its name.
+            // After more than one space the interface is looked up by name.
             let has_more = line.windows(2).any(|two| two == b"  ");
             let is_right = head.bus.map_or(!is_short || has_more, |bus| is_short && bus == number);
             assert!(is_right, "{:?}", String::from_utf8_lossy(line));
@@ -42,7 +42,7 @@ fn digit() -> impl Strategy<Value = u8> {
     prop::sample::select(b"0123456789ABCDEFabcdef".to_vec())
 }
 
-/// Usual lines; the parts that vary, in all their lengths.
+/// Usual lines, in which the variable parts have all their lengths.
 fn usual_line() -> impl Strategy<Value = Vec<u8>> {
     let stamp = (0..9_223_371_999u64, prop_oneof!["[0-9]{6}", "[0-9]{9}"]);
     let id = prop_oneof!["[0-7][0-9A-Fa-f]{2}", "[01][0-9A-Fa-f]{7}"];
@@ -61,7 +61,7 @@ proptest! {
     }
 
     #[test]
-    fn lines_with_wrong_bytes_are_read_alike(
+    fn fast_paths_agree_on_damaged_lines(
         line in usual_line(),
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4),
         cut in prop::option::of(any::<prop::sample::Index>()),
@@ -82,7 +82,7 @@ proptest! {
 }
 
 #[test]
-fn every_byte_at_every_place_of_a_line_is_judged_alike() {
+fn fast_paths_agree_for_any_byte_at_any_place() {
     for line in [
         &b"(1700000000.123456) can0 7FF#00112233445566fF"[..],
         b"(9223371999.999999999) vcan10 1FFFFFFf#aB\r",
@@ -113,7 +113,7 @@ fn only_names_of_up_to_seven_bytes_are_known() {
 }
 
 #[test]
-fn a_line_ends_at_its_line_feed_wherever_that_is() {
+fn line_ends_at_first_line_feed() {
     let mut parser = LineParser::new(&["can0".to_owned()]);
     let whole = b"(1700000000.123456) can0 123#1122334455667788\n";
     assert!(parser.parse(whole).is_ok());
