@@ -429,7 +429,7 @@ fn malformed_journal_lines_are_counted() {
         read(&[newer], false, |_| {})
             .expect_err("a newer version is rejected")
             .to_string()
-            .contains("this program reads")
+            .contains("must be")
     );
 }
 

@@ -181,7 +181,7 @@ mod tests {
 
     #[test]
     fn a_message_with_other_text_has_no_id() {
-        let entry = entry_of(|| tracing::info!("alarm raised earlier, its value is not known now"));
+        let entry = entry_of(|| tracing::info!("alarm still raised, value unknown"));
         assert!(!entry.contains("MESSAGE_ID") && entry.contains("PRIORITY=6"), "{entry}");
     }
 
