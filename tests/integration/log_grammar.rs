@@ -425,12 +425,7 @@ fn malformed_journal_lines_are_counted() {
     let (records, counts) = read(&[file(folder.path(), "j", text)], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines, counts.ignored_lines), (1, 3, 2));
     let newer = file(folder.path(), "n", b"PACKWATCH-JOURNAL 2\n");
-    assert!(
-        read(&[newer], false, |_| {})
-            .expect_err("a newer version is rejected")
-            .to_string()
-            .contains("must be")
-    );
+    assert!(read(&[newer], false, |_| {}).expect_err("a newer version is rejected").to_string().contains("must be"));
 }
 
 #[test]
