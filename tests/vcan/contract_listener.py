@@ -1,7 +1,7 @@
-"""A listening ECU, written from the DBC and the page docs/src/ecu/contract.md alone: the table of raised alarms.
+"""A listening ECU, written only from the DBC and the page docs/src/ecu/contract.md: the table of raised alarms.
 
     listener = ContractListener("out.dbc", loss=0.1, seed=1)
-    listener.handle(time_s, frame_id, data)     each frame of the bus; a part is lost at random
+    listener.handle(time_s, frame_id, data)     each frame of the bus; drops a random part
     listener.table(now_s)                       {(rule, severity, cell): (state, acknowledged)}
     listener.is_confirmed(now_s)                the digest agrees with the table
 """
@@ -18,7 +18,7 @@ WHOLE_PACK = 2047
 
 
 def checksum(table):
-    """The sum of a CRC-16 for each entry."""
+    """The sum of the CRC-16 of all entries."""
     total = 0
     for (rule, severity, cell), (state, acknowledged) in table.items():
         entry = bytes([rule, severity, cell & 0xFF, cell >> 8, state + 8 * acknowledged])

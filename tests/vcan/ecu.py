@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""A controller that answers diagnostic requests, by PyPI `can-isotp`: an implementation of its own.
+"""A controller that answers diagnostic requests, using PyPI `can-isotp` as an independent implementation.
 
     ecu.py INTERFACE [--answers DID=HEX ...]     requests on 7E4, answers on 7EC, until SIGTERM
 
-A request for an identifier that it does not know is refused with 0x31. Prints "ready", then each request.
+A request for an unknown identifier is rejected with 0x31. Prints "ready", then each request.
 """
 
 import argparse

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""What tests of faults share: a player that nothing stops, floods, and comparisons of what was announced, stored and true.
+"""Shared tools of the fault tests: a robust player, floods, and comparisons of announced, stored and true values.
 
-    fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
-                                                           dropped and time passes, as for a pack. SIGTERM parks it
-    fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers that are not configured
-    fault_tools.py clients SOCKET [--count N] [--seconds S]  clients of the status socket that never read; are others answered?
-    fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is no reported event missing?
-    fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
-    fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
-    fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    status frames of two daemons: are they within so many points of SOC?
-    fault_tools.py covers FOLDER DUMP [--after SAMPLE]     estimates on the bus against the truth, both from fast_pack's FOLDER
+    fault_tools.py play LOG INTERFACE [--from SAMPLE]      plays a candump log in real time. While the interface is down or missing, frames
+                                                           are dropped and time passes, as for a real pack. SIGTERM parks the pack
+    fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   sends frames with unconfigured identifiers
+    fault_tools.py clients SOCKET [--count N] [--seconds S]  opens status clients that never read; are other clients answered?
+    fault_tools.py learned STATE [EVENTS...] [--exactly]   prints the store's capacities, half-cycles and alarms; is no reported event missing?
+    fault_tools.py alarm DUMP RULE                         prints the state of the rule's last alarm frame
+    fault_tools.py same BEFORE AFTER                       compares two snapshots: are the learned values the same?
+    fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    compares the status frames of two daemons: do they differ by at most POINTS of SOC?
+    fault_tools.py covers FOLDER DUMP [--after SAMPLE]     compares estimates on the bus with the truth, both from fast_pack's FOLDER
 """
 
 import argparse
@@ -29,7 +29,7 @@ AWAY = {errno.ENETDOWN, errno.ENXIO, errno.ENODEV, errno.ENOBUFS}
 
 
 def frames(lines, interface="vcan0"):
-    """Identifier and payload of candump's lines of an interface."""
+    """Identifier and payload of candump's lines for an interface."""
     for line in lines:
         words = line.split()
         if len(words) == 3 and words[0].startswith("(") and words[1] == interface and words[2].count("#") == 1:
@@ -43,10 +43,10 @@ def frames(lines, interface="vcan0"):
 STATUS, HEALTH, ALARM, SAMPLE, PLAYED = 0x6B0, 0x6B1, 0x6B2, 0x7F0, 0x7F1
 VALID, ACTIVE, CLEARED = 1, 1, 2
 MOVING = (1, 3)  # charge, discharge
-# Of fast_pack.
+# Properties of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/integration/restart.rs
+LOST = 0.75  # part of the estimates within two deviations; fewer mean that a fault made them wrong. tests/integration/restart.rs judges the calibration
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 
@@ -86,18 +86,18 @@ class Truth:
                 self.samples[-1].append(float(words[column]))
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
-        """Error and stated deviation of the estimates on the bus, once the sample `after` was on it. What the pack moved while the
-        player itself was late (a busy machine) is no error."""
+        """Error and stated deviation of the estimates on the bus, from sample `after` on. Excludes what the pack moved while
+        the player itself was late (a busy machine)."""
         sample, found = -1, []
         self.latest_s = 0.0
-        late_s = collections.deque(maxlen=MEMORY)  # of each sample against its own time, of the last seconds
+        late_s = collections.deque(maxlen=MEMORY)  # delay of each sample in the last seconds
         for line in lines:
             for name, data in frames([line]):
                 if name == SAMPLE:
                     sample = int.from_bytes(data, "big")
                     late_s.append(float(line[1 : line.index(")")]) - sample * PERIOD_S)
                     if len(late_s) > 1 and abs(late_s[-1] - late_s[-2]) > STEP_S:
-                        late_s.clear()  # it is the clock that was stepped
+                        late_s.clear()  # the clock was stepped
                     else:
                         self.latest_s = max(self.latest_s, late_s[-1] - min(late_s))
                 elif name == PLAYED:
@@ -112,7 +112,7 @@ class Truth:
 
 
 def within(errors: list[tuple[float, float]]) -> float:
-    """Part of them within two deviations and a point."""
+    """Part of the errors within two deviations plus a point."""
     return sum(error <= 2 * std + 0.01 for error, std in errors) / max(1, len(errors))
 
 
@@ -124,7 +124,7 @@ def covers(args) -> None:
     if within(errors) <= LOST and truth.latest_s < TOO_LATE_S:
         sys.exit("the estimates do not cover the truth")
     if truth.latest_s >= TOO_LATE_S:
-        print(f"    not judged: this machine is so busy that frames came {truth.latest_s:.2f} s late, minutes of the pack's life")
+        print(f"    not judged: frames came {truth.latest_s:.2f} s late, minutes of the pack's life")
 
 
 def last_alarm(args) -> None:
@@ -141,11 +141,11 @@ RULES = (
     "connection_resistance channel_faulty"
 ).split()
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
-UNTOLD = ("suppressed", "resumed")  # changes that say nothing new of an alarm: no rows
+UNTOLD = ("suppressed", "resumed")  # changes without a row in the store
 
 
 class Store:
-    """The rows of a state folder's database, read beside the daemon or after it."""
+    """The rows of a state folder's database, read while the daemon runs or afterwards."""
 
     def __init__(self, folder: Path):
         database = sqlite3.connect(f"file:{folder / 'packwatch.db'}?mode=ro", uri=True, timeout=10)
@@ -161,19 +161,19 @@ class Store:
         return len(self.capacities), len(self.half_cycles), len(self.alarms)
 
     def begins_with(self, earlier: "Store") -> bool:
-        """Is all of an earlier state still there, unchanged?"""
+        """Whether all rows of an earlier state still exist unchanged."""
         pairs = [(self.half_cycles, earlier.half_cycles), (self.capacities, earlier.capacities), (self.alarms, earlier.alarms)]
         return all(now[: len(before)] == before for now, before in pairs)
 
 
 def reported_by(files: list[Path]) -> tuple[int, int, int]:
-    """Capacities something was learned about, half-cycles and changes of alarms in files of events."""
+    """Number of learned capacities, half-cycles and alarm changes in files of events."""
     counts = [0, 0, 0]
     for line in (line for file in files for line in open(file)):
         try:
             event = json.loads(line)
         except ValueError:
-            continue  # the last line of a daemon that was killed
+            continue  # the last line of a killed daemon
         counts[0] += event["event"] == "capacity" and event["measured_ah"] is not None
         counts[1] += event["event"] == "half_cycle"
         counts[2] += event["event"] == "alarm" and event["change"] not in UNTOLD
@@ -181,7 +181,7 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Reads the reports first: what is reported while the store is read may be stored already."""
+    """Reads the reports first, because values reported while the store is read may already be stored."""
     reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
     if any(of_store < of_events for of_store, of_events in zip(stored, reported)):
@@ -194,11 +194,11 @@ def learned(args) -> None:
 
 
 OF_NOW = ("input_missing", "input_implausible", "bus_fault", "store_failed")
-RAISED = ("active", "latched", "suppressed")  # the last without its input
+RAISED = ("active", "latched", "suppressed")  # suppressed: without its input
 
 
 def learned_of(snapshot: dict) -> tuple[list, list]:
-    """Capacities and raised alarms: what must come back after a restart."""
+    """Capacities and raised alarms, which must be restored after a restart."""
     capacities = [round(cell["mean"], 9) for cell in snapshot["learning"]["learner"]["capacity"]]
     alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarming"]["alarms"]["alarms"]
               if a["machine"]["state"] in RAISED and a["rule"] not in OF_NOW]
@@ -206,7 +206,7 @@ def learned_of(snapshot: dict) -> tuple[list, list]:
 
 
 def comes_back(before: dict, after: dict) -> bool:
-    """Has a later state all of it? Other alarms may have been raised since (it had no input)."""
+    """Whether a later state contains all of it. Other alarms may have been raised since, without input."""
     (capacities, alarms), (later_capacities, later_alarms) = learned_of(before), learned_of(after)
     near = all(abs(now - then) < 1e-6 for then, now in zip(capacities, later_capacities, strict=True))
     return near and all(alarm in later_alarms for alarm in alarms)
@@ -215,7 +215,7 @@ def comes_back(before: dict, after: dict) -> bool:
 def same(args) -> None:
     before, after = (json.loads(path.read_text()) for path in (args.before, args.after))
     if not comes_back(before, after):
-        sys.exit(f"not what was learned:\n{learned_of(before)}\n{learned_of(after)}")
+        sys.exit(f"other learned values:\n{learned_of(before)}\n{learned_of(after)}")
     packs = [state["learning"]["pack"] for state in (before, after)]
     socs = [f"{100 * pack['soc']:.1f} +/- {100 * pack['soc_std']:.1f} %" if pack else "unknown" for pack in packs]
     print(f"{len(learned_of(after)[0])} capacities and {len(learned_of(after)[1])} alarms as before, SOC {socs[0]} before, {socs[1]} after")
@@ -238,11 +238,12 @@ def apart(args) -> None:
     sys.exit(0 if pairs > 100 and 100 * worst <= args.points else "too far apart")
 
 
-# ---- onto the bus ------------------------------------------------------------------------------------------------------------------
+# ---- sending
+# -------------------------------------------------------------------------------------------------------------------
 
 
 class Bus:
-    """A raw socket on an interface that may come and go."""
+    """A raw socket on an interface that may disappear and return."""
 
     def __init__(self, interface: str):
         self.interface, self.socket, self.dropped = interface, None, 0
@@ -265,7 +266,7 @@ class Bus:
 
 
 def park(bus: Bus, rests: list) -> None:
-    """Half a second without current: what is under way comes to its end and is learned."""
+    """Half a second without current, so that running half-cycles end and are learned."""
     for _ in range(50 if rests else 0):
         bus.send(0x100, bytes(4) + rests[-1][4:])
         time.sleep(0.01)
@@ -299,7 +300,7 @@ def play(args) -> None:
 
 
 def flood(args) -> None:
-    """In bursts of 10 ms: a shorter sleep is none in the user-mode kernel."""
+    """Sends bursts every 10 ms, because the user-mode kernel does not support shorter sleeps."""
     bus, rng = Bus(args.interface), random.Random(1)
     ids = [0x200 + n for n in range(min(args.ids, 0x480))] + [0x18000000 + 977 * n for n in range(args.ids - 0x480)]
     data = [rng.randbytes(8) for _ in range(64)]
@@ -309,11 +310,11 @@ def flood(args) -> None:
             bus.send(ids[sent % len(ids)], data[sent % 64])
             sent += 1
         time.sleep(0.01)
-    print(f"{sent} frames of {len(ids)} identifiers in {past:.1f} s, {bus.dropped} not taken")
+    print(f"{sent} frames of {len(ids)} identifiers in {past:.1f} s, {bus.dropped} not accepted")
 
 
 def clients(args) -> None:
-    """Many at once, of whom none reads; a few come and go meanwhile and are answered, which shows that the others block no client."""
+    """Many idle clients that never read, and a few normal ones that must still be answered."""
     def connected(path):
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         client.settimeout(10)
@@ -335,9 +336,9 @@ def clients(args) -> None:
         except OSError:
             refused += 1
         time.sleep(0.2)
-    print(f"{len(idle)} clients that do not read, {answered} answers to others meanwhile, {refused} turned away")
+    print(f"{len(idle)} clients that do not read, {answered} answers to others, {refused} rejected")
     if not answered:
-        sys.exit("no other client was answered next to those that do not read")
+        sys.exit("no other client was answered while idle clients were connected")
 
 
 def main() -> None:

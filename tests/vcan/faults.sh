@@ -1,18 +1,19 @@
 # shellcheck shell=bash
 # Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
-# A daemon with its state on disk learns from fast_pack's pack while something happens to it. Each test prints a line per fault:
-# what happened and what was learned. In the end it compares the store with the reports.
+# A daemon with its state on disk learns from fast_pack while faults occur. Each test prints one line per fault: the fault and
+# the learned values. At the end it compares the store with the reports.
 
-# Where `main` keeps its state; a test on a disk of its own says another.
+# Folder of `main`'s state; a test with its own disk overrides it.
 state=$tmp/state
 here=$(dirname "${BASH_SOURCE[0]}")
 fast=$tmp/fast
 tools() { python3 "$here/fault_tools.py" "$@"; }
 
-# pack SECONDS: fast_pack's files in $fast; $fast/fast.toml is the daemon's.
+# pack SECONDS: writes fast_pack's files to $fast; the daemon uses $fast/fast.toml.
 pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
 
-# feed: the pack on vcan0 from where it was, whatever becomes of the interface. dump.log has its samples and our frames, of all feeds.
+# feed: continues the pack on vcan0, regardless of the interface's state. dump.log contains its samples and our frames, of all
+# feeds.
 feed() {
     if [[ -z ${pids[dump]-} ]]; then
         start dump candump -L any,6B0:7F0,7F0:7FE
@@ -21,7 +22,7 @@ feed() {
     start feed python3 "$here/fault_tools.py" play "$fast/pack.log" vcan0 --from "$(sample)"
 }
 unfed() { stop feed; }
-# The number of the sample that was last on the bus.
+# Number of the last sample on the bus.
 sample() {
     local last
     last=$(grep -oE ' 7F0#[0-9A-F]{8}$' "$tmp/dump.log" | tail -n 1) || true
@@ -29,7 +30,7 @@ sample() {
     echo $((16#${last:-0}))
 }
 
-# again WHAT...: the daemon `main` once more, after `stop main` or the like; its earlier reports still count.
+# again WHAT...: starts the daemon `main` again after `stop main` or similar; its earlier reports still count.
 runs=0
 again() {
     local file
@@ -40,21 +41,22 @@ again() {
 
 # ---- what was learned ----------------------------------------------------------------------------------------------------------------
 
-# reported EVENT: how many the daemon `main` has reported, in all its runs.
+# reported EVENT: number of such events reported by the daemon `main`, in all its runs.
 reported() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
-# Capacities, half-cycles, alarms raised or cleared, as reported.
+# Number of reported capacities, half-cycles, and alarms raised or cleared.
 reported_all() { echo "$(reported capacity) $(reported half_cycle) $(reported alarm)"; }
-# reported_more EVENT COUNT: COUNT or more?
+# reported_more EVENT COUNT: whether at least COUNT were reported.
 reported_more() { (($(reported "$1") >= $2)); }
 learned_more() { reported_more half_cycle "$1"; }
 
-# fault NAME: from here on it happens.
+# fault NAME: marks the start of a fault.
 fault() {
     fault_name=$1 fault_before=$(reported_all)
     running main || fail "$fault_name: the daemon is not running before"
 }
 
-# survived WHAT...: it is over; the daemon must be the same one, keep learning, and have stored all its reports.
+# survived WHAT...: marks the end of the fault. The daemon must still be the same process, keep learning, and have stored all
+# its reports.
 survived() {
     local stored after
     running main || fail "$fault_name: the daemon ended"
@@ -64,10 +66,10 @@ survived() {
     echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $after, stored $stored"
 }
 
-# all_stored: at the end, with the daemon stopped: the store has exactly what was reported, and its chain holds.
+# all_stored: at the end, with the daemon stopped, the store must contain exactly the reported values and a valid chain.
 all_stored() {
     local stored
-    stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "in the end: $(cat "$tmp/learned.err")"
+    stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "at the end: $(cat "$tmp/learned.err")"
     "$packwatch" history verify --state "$state" >"$tmp/verify.log" 2>&1 || fail "history verify: $(cat "$tmp/verify.log")"
-    echo "in the end: reported (capacities, half-cycles, alarms) $(reported_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
+    echo "at the end: reported (capacities, half-cycles, alarms) $(reported_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
 }

@@ -1,7 +1,7 @@
 # shellcheck shell=bash
 # Helpers for vcan tests in bash:   . "$(dirname "$0")/lib.sh"
-# A failed assertion, a failed command or a passed deadline ends the test with status 1 and shows the logs of what was
-# started. Everything started is killed at the end. $tmp is a folder of the test's own.
+# A failed assertion, a failed command or a missed deadline ends the test with status 1 and shows the logs of all started
+# programs. These programs are killed at the end. $tmp is the test's own folder.
 set -euo pipefail
 
 tmp=$(mktemp -d)
@@ -11,7 +11,7 @@ exit_status='' # of the process that `stop` or `wait_exit` ended
 
 at_exit() {
     local status=$? name
-    # wait: so that bash does not announce each of them as killed.
+    # wait: prevents bash from announcing each killed process.
     for name in "${!pids[@]}"; do { kill -KILL "${pids[$name]}" && wait "${pids[$name]}"; } 2>/dev/null || true; done
     if [[ $status != 0 && $status != 77 ]]; then
         for name in "$tmp"/*.log; do
@@ -28,7 +28,7 @@ fail() {
     exit 1
 }
 
-# skip MESSAGE...: this machine lacks something the test needs; shown and counted as skipped.
+# skip MESSAGE...: this machine lacks something that the test needs. Shown and counted as skipped.
 skip() {
     echo "SKIP $*" >&2
     exit 77
@@ -39,24 +39,24 @@ assert_eq() {
     [[ $1 == "$2" ]] || fail "$3:"$'\n'"wanted: $1"$'\n'"found:  $2"
 }
 
-# Milliseconds of a clock that never steps (a step of the wall clock may be the very thing under test).
+# Milliseconds of a clock that never steps (the test may step the wall clock).
 now_ms() {
     local uptime _
     read -r uptime _ </proc/uptime
     echo $((10#${uptime/./} * 10))
 }
 
-# wait_for SECONDS WHAT COMMAND...: until COMMAND succeeds. COMMAND's output is not hidden.
+# wait_for SECONDS WHAT COMMAND...: repeats COMMAND until it succeeds. Does not hide COMMAND's output.
 wait_for() {
     local deadline=$(($(now_ms) + $1 * 1000)) seconds=$1 what=$2
     shift 2
     until "$@"; do
-        (($(now_ms) < deadline)) || fail "after $seconds s still no $what ($*)"
+        (($(now_ms) < deadline)) || fail "no $what after $seconds s ($*)"
         sleep 0.05
     done
 }
 
-# start NAME COMMAND...: in the background, output to $tmp/NAME.log. Its process id is ${pids[NAME]}.
+# start NAME COMMAND...: runs in the background with output to $tmp/NAME.log. The process id is ${pids[NAME]}.
 start() {
     local name=$1
     shift
@@ -68,7 +68,7 @@ start() {
 running() { kill -0 "${pids[$1]}" 2>/dev/null; }
 ended() { ! running "$1"; }
 
-# wait_exit NAME SECONDS: until it has ended by itself; then $exit_status is its status.
+# wait_exit NAME SECONDS: waits until it ends by itself. Sets $exit_status.
 wait_exit() {
     wait_for "$2" "end of $1" ended "$1"
     # shellcheck disable=SC2034
@@ -78,15 +78,15 @@ wait_exit() {
     unset "pids[$1]"
 }
 
-# stop NAME [SIGNAL]: sends it (TERM), waits up to 10 s; then $exit_status is its status (143 when TERM killed it).
+# stop NAME [SIGNAL]: sends the signal (TERM) and waits up to 10 s. Sets $exit_status (143 if TERM killed it).
 stop() {
     kill -"${2-TERM}" "${pids[$1]}" 2>/dev/null || fail "stop $1: it had already ended"
     wait_exit "$1" 10
 }
 
-# Has the log of NAME a line with the (extended) regular expression?   wait_for 5 "start" logged daemon 'ready'
+# Whether NAME's log has a line that matches the (extended) regular expression:   wait_for 5 "start" logged daemon 'ready'
 logged() { grep -qE -- "$2" "$tmp/$1.log"; }
-# caught_up NAME: has the candump NAME of vcan0 all that was sent before? By a frame that no other node sends.
+# caught_up NAME: whether candump NAME on vcan0 has received all earlier frames. Sends a frame that no other node uses.
 caught_up() { cansend vcan0 7FF#0123 && logged "$1" '7FF#0123'; }
 
 iface_add() { ip link add dev "$1" mtu 72 type vcan && ip link set dev "$1" up; }
@@ -94,8 +94,9 @@ iface_delete() { ip link delete dev "$1"; }
 iface_up() { ip link set dev "$1" up; }
 iface_down() { ip link set dev "$1" down; }
 
-# receiving IFACE COUNT: does the kernel list COUNT or more filters of open sockets on IFACE ("any": sockets bound to none)?
-# A frame sent before its receiver is listed is lost, and candump prints nothing when it is ready:
+# receiving IFACE COUNT: whether the kernel lists at least COUNT filters of open sockets on IFACE ("any": sockets not bound to
+# one).
+# A frame sent before its receiver is listed is lost, and candump does not print anything when it is ready:
 #   start dump candump -L vcan0; wait_for 5 "receiver on vcan0" receiving vcan0 1
 receiving() {
     awk -v iface="$1" -v wanted="$2" '$1 == iface && NF == 7 { n++ } END { exit n < wanted }' /proc/net/can/rcvlist_*

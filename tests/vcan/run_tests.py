@@ -3,19 +3,19 @@
 
     tests/vcan/run_tests.py [--jobs N] [--smoke] [TEST...]       default: all of tests/vcan/*.test
 
-A test's head says what it needs:
+The first lines of a test state its needs:
 
     # with-vcan: --timeout 60 --modules slcan      options of with-vcan
-    # run-tests: 45 s                              about how long it takes; the longest start first
-    # run-tests: 45 s, own boot: sets the clock    a kernel of its own, and why
+    # run-tests: 45 s                              approximate duration; the longest start first
+    # run-tests: 45 s, own boot: sets the clock    needs a separate kernel, with the reason
     # run-tests: 12 s, smoke                       `--smoke` (and `tests/all --quick`) runs only these
 
-Tests with --disk and those that boot by themselves ("with-vcan: on the host") have kernels of their own, too. The others share boots:
-each boot takes the next test from one queue until none is left (in-boot). Every test has its own network, processes, mounts and
-root there. A kernel that dies fails the test it was running; the next boot continues with the rest. Where the host's kernel has
-vcan, there is nothing to boot, and each test runs in namespaces of its own.
+Tests with --disk and tests that boot by themselves ("with-vcan: on the host") also have separate kernels. The others share
+boots: each boot takes the next test from a common queue until it is empty (in-boot). Every test has its own network,
+processes, mounts and root. If a kernel dies, its current test fails and the next boot continues with the rest. If the host's
+kernel has vcan, each test runs in its own namespaces without a boot.
 
-A test's output is printed in one piece when the test ends. Exit status: 0, or 1 when a test failed.
+A test's output is printed in one piece when the test ends. Exit status: 0, or 1 if a test failed.
 """
 
 import argparse
@@ -33,11 +33,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# Most of a test is waiting: three boots keep two cores busy about half the time.
+# Tests mostly wait: three boots use two cores about half of the time.
 JOBS = 3
-# with-vcan's limit where a test names none, s.
+# with-vcan's limit for a test without one, s.
 DEFAULT_LIMIT_S = 120
-# A busy machine boots in up to so many seconds.
+# Maximum boot time on a busy machine, s.
 BOOT_S = 60
 SKIPPED = 77
 TIMED_OUT = 124
@@ -46,7 +46,7 @@ POLL_S = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class VcanTest:
-    """A test and what its head asks for."""
+    """A test and its stated needs."""
 
     path: Path
     options: tuple[str, ...]
@@ -72,7 +72,7 @@ class VcanTest:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a test ended. `status` 77 means skipped."""
+    """Outcome of a test. `status` 77 means skipped."""
 
     name: str
     status: int
@@ -85,8 +85,9 @@ CHILDREN: set[subprocess.Popen] = set()
 
 
 def environment() -> dict[str, str]:
-    """A copy of the environment for a child. Without one the child reads this process's own, which another thread of tests/all may be
-    replacing at that moment: its start then fails with "Bad address"."""
+    """A copy of the environment for a child. Otherwise the child would read this process's environment, which another thread
+    of
+    tests/all may be replacing; its start then fails with "Bad address"."""
     return dict(os.environ)
 
 
@@ -103,7 +104,8 @@ def read_head(path: Path) -> VcanTest:
 
 
 def in_user_mode_kernel(modules: set[str]) -> bool:
-    """Whether with-vcan boots a kernel here; False where the host's own has vcan. Raises when there is no SocketCAN."""
+    """Whether with-vcan boots a kernel on this machine; False if the host's kernel has vcan. Raises if there is no
+    SocketCAN."""
     probe = [HERE / "with-vcan", "--timeout", str(BOOT_S), "--modules", ",".join(sorted(modules)), "--",
              "grep", "-q", "User Mode Linux", "/proc/cpuinfo"]
     ended = subprocess.run(probe, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -114,7 +116,7 @@ def in_user_mode_kernel(modules: set[str]) -> bool:
 
 
 class Run:
-    """All tests of one call, shared by as many threads as there are jobs."""
+    """All tests of one call, shared by all job threads."""
 
     def __init__(self, tests: Iterable[VcanTest], queue: Path, report: Report, uses_user_mode_kernel: bool):
         tests = sorted(tests, key=lambda test: -test.expected_s)
@@ -146,7 +148,7 @@ class Run:
         return [test for name, test in self.shared.items() if not (self.queue / name).exists()]
 
     def run_shared(self) -> None:
-        """Boots until no test is left to be claimed: once, unless a kernel dies."""
+        """Boots until every test is claimed: once, unless a kernel dies."""
         while rest := self.unclaimed():
             with self.lock:
                 self.boots += 1
@@ -177,7 +179,7 @@ class Run:
             self.report(Outcome(name, status, float((folder / "seconds").read_text()), output))
 
     def report_lost(self, boot: str, output: str) -> None:
-        """Fails the test that a boot was running when its kernel died."""
+        """Fails the test that was running when the kernel of a boot died."""
         for name in self.shared:
             folder = self.queue / name
             if name not in self.reported and (folder / boot).exists():
@@ -193,7 +195,7 @@ class Run:
 
 
 def call(command: list, while_waiting: Callable[[], None] = lambda: None) -> tuple[int, str]:
-    """Exit status and output of a command."""
+    """Runs a command. Returns its exit status and output."""
     with tempfile.TemporaryFile("w+", errors="replace") as output:
         child = subprocess.Popen(list(map(str, command)), env=environment(), stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
         CHILDREN.add(child)
@@ -214,7 +216,7 @@ def stop_all() -> None:
 
 
 def run(tests: list[VcanTest], report: Report, jobs: int = JOBS) -> None:
-    """Runs `tests` and calls `report`, from several threads, for each as it ends."""
+    """Runs `tests`. Calls `report` from several threads as each test ends."""
     modules = set().union(*(test.modules for test in tests)) if tests else set()
     with tempfile.TemporaryDirectory(prefix="vcan-tests.") as folder:
         queue = Path(folder).resolve()
@@ -227,7 +229,7 @@ def run(tests: list[VcanTest], report: Report, jobs: int = JOBS) -> None:
 
 
 def set_environment() -> None:
-    """By hand: the built program, the measured data and the Python packages, where tests/all would find them."""
+    """For use by hand: finds the program, the measured data and the Python packages where tests/all puts them."""
     repository = HERE.parent.parent
     target = Path(os.environ.get("CARGO_TARGET_DIR", repository / "target"))
     data, venv = repository / "../shared/data", repository / "target/test-venv"
@@ -241,7 +243,7 @@ def set_environment() -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tests", nargs="*", type=Path, metavar="TEST", help="files; default: all")
-    parser.add_argument("--jobs", type=int, default=JOBS, help="kernels at a time [%(default)s]")
+    parser.add_argument("--jobs", type=int, default=JOBS, help="number of kernels at a time [%(default)s]")
     parser.add_argument("--smoke", action="store_true", help="only the tests marked as smoke tests")
     options = parser.parse_args()
     paths = [path.resolve() for path in options.tests] or sorted(HERE.glob("*.test"))

@@ -1,23 +1,23 @@
 # shellcheck shell=bash
 # A real systemd as process 1, for tests of the shipped units:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/systemd.sh"
-# It runs in process and mount namespaces of its own, with journald, and with udev when asked for. A test says
+# It runs in its own process and mount namespaces, with journald, and with udev on request. Use in a test:
 #
 #   systemd_prepare paper.toml            # program, units and configuration where the package puts them
 #   drop_in packwatch.service test '[Service]' 'WatchdogSec=3s'
 #   systemd_boot                          # and starts packwatch.service; `systemd_boot UNIT...`: others; `''`: none
 #   wait_for 20 "active unit" has ActiveState active
 #
-# State lies in /var/lib, as on a vehicle: mount a disk there before `systemd_boot` where it must outlive the kernel.
+# The state is in /var/lib, as on a vehicle. If it must outlive the kernel, mount a disk there before `systemd_boot`.
 
 [[ -x /usr/lib/systemd/systemd ]] || skip "no systemd on this machine"
-# It writes to /etc, /usr and /var: only where that is forgotten.
+# systemd_prepare writes to /etc, /usr and /var, so run only where these changes are discarded.
 grep -q 'User Mode Linux' /proc/cpuinfo || skip "only in the user-mode kernel (PACKWATCH_VCAN=uml): it changes /etc and /usr"
 
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 units=$tmp/units # becomes /run/systemd/system: the boot mounts a new /run
 mkdir -p "$units"
 
-# systemd_prepare CONFIG: config/CONFIG becomes packwatch.toml. The units get no dependencies on a whole system.
+# systemd_prepare CONFIG: installs config/CONFIG as packwatch.toml. Removes the units' dependencies on a complete system.
 systemd_prepare() {
     install -D "${PACKWATCH_BIN:?names the program under test}" /usr/bin/packwatch
     [[ ! -x ${PACKWATCH_BIN%/*}/packwatch-uplink ]] || install -D "${PACKWATCH_BIN%/*}/packwatch-uplink" /usr/bin/packwatch-uplink
@@ -31,11 +31,11 @@ systemd_prepare() {
     done
 }
 
-# drop_in UNIT NAME LINE...: before the boot; afterwards the same with `in_system systemctl daemon-reload`.
+# drop_in UNIT NAME LINE...: adds a drop-in before the boot; after the boot also run `in_system systemctl daemon-reload`.
 drop_in() {
     local folder=$units/$1.d name=$2
     shift 2
-    # Once booted, the folder is another one in there.
+    # After the boot the folder has another path inside the namespace.
     if [[ -n ${pids[systemd]-} ]]; then
         in_system mkdir -p "/run/systemd/system/${folder##*/}"
         printf '%s\n' "$@" | in_system tee "/run/systemd/system/${folder##*/}/$name.conf" >/dev/null
@@ -46,7 +46,7 @@ drop_in() {
     fi
 }
 
-# with_udev: before the boot. Network devices are units then, as on a real system.
+# with_udev: call before the boot. Network devices then become units, as on a real system.
 with_udev() {
     [[ -x /usr/lib/systemd/systemd-udevd ]] || skip "no udev on this machine"
     printf '%s\n' '[Unit]' DefaultDependencies=no Before=test.target '[Service]' Type=notify \
@@ -55,7 +55,7 @@ with_udev() {
     printf 'Wants=test-udev.service\nAfter=test-udev.service\n' >>"$units/test.wants"
 }
 
-# systemd_boot [UNIT...]: a system of nothing but those units and the journal.
+# systemd_boot [UNIT...]: boots a system that contains only those units and the journal.
 systemd_boot() {
     local wanted="${*-packwatch.service}" deadline
     {
@@ -64,7 +64,7 @@ systemd_boot() {
     } >"$units/test.target"
     printf '[Journal]\nStorage=volatile\nRuntimeMaxUse=32M\nForwardToConsole=no\nRateLimitIntervalSec=0\n' >/etc/systemd/journald.conf
     start systemd unshare --mount --pid --fork --kill-child --mount-proc bash -c "$(declare -f systemd_init); systemd_init '$units'"
-    # bash becomes systemd in there: its process is there at once, the manager's socket is not.
+    # bash becomes systemd there: the process exists at once, the manager's socket later.
     wait_for 20 "systemd" booted
 }
 
@@ -73,7 +73,7 @@ system_process() { pgrep -P "${pids[systemd]}" || true; }
 
 # Process 1 of the namespaces.
 systemd_init() {
-    # Fresh: the /sys of the kernel's first network namespace does not show these interfaces.
+    # Mount a new /sys, because that of the kernel's first network namespace does not show these interfaces.
     mount -t sysfs sysfs /sys && mount -t tmpfs tmpfs /run && mount -t cgroup2 cgroup2 /sys/fs/cgroup
     mkdir -p /run/systemd && cp -r "$1" /run/systemd/system && rm -f /run/systemd/system/test.wants
     exec env -i container=test PATH="$PATH" /usr/lib/systemd/systemd --system --unit=test.target \
@@ -85,13 +85,13 @@ in_system() { nsenter --target "$(system_process)" --mount --pid "$@"; }
 property() { in_system systemctl show "${2-packwatch.service}" --property "$1" --value 2>/dev/null; }
 # has NAME VALUE [UNIT]
 has() { [[ $(property "$1" "${3-packwatch.service}") == "$2" ]]; }
-# status_has REGEX: the status line that the daemon sent to systemd.
+# status_has REGEX: matches the status line that the daemon sent to systemd.
 status_has() { [[ $(property StatusText) =~ $1 ]]; }
-# journal [ARGS...]: what the journal has of packwatch, the message alone.
+# journal [ARGS...]: packwatch's journal entries, message only.
 journal() { in_system journalctl --quiet --no-pager --unit packwatch.service --output cat "$@"; }
-# Not grep -q: it ends at the first match, and journalctl, which writes on into nothing, would fail the pipeline.
+# Not grep -q: it ends at the first match, and journalctl would then fail the pipeline with SIGPIPE.
 journal_has() { journal | grep -E -- "$1" >/dev/null; }
 
-# Shown when a test fails (lib.sh shows $tmp/*.log).
+# Shown if a test fails (lib.sh shows $tmp/*.log).
 keep_journal() { [[ -z ${pids[systemd]-} ]] || journal >"$tmp/journal.log" 2>&1 || true; }
 trap 'status=$?; set +e; keep_journal; (exit $status); at_exit' EXIT
