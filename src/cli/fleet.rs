@@ -135,7 +135,7 @@ fn plan(args: &PlanArgs) -> Result<(), Failure> {
 fn replay(args: &RunArgs) -> Result<(), Failure> {
     let all = vehicles::read_manifest(&args.manifest).map_err(failure)?;
     if args.input.start_times.is_some() && all.len() > 1 {
-        let text = "--start-times: the manifest has several vehicles, must have 1; for several, place NAME_cycles.csv next to each log";
+        let text = "--start-times dates one vehicle, but the manifest has several; place NAME_cycles.csv next to each log instead";
         return Err(Failure::new(text));
     }
     let chosen = args.shard.choose(&all);

@@ -154,9 +154,7 @@ fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     args.changes.apply(&mut settings)?;
     if settings.pack.cells > series {
         let (found, file) = (settings.pack.cells, args.config.display());
-        return Err(Failure::new(format!(
-            "--cells {found}, must be at most {series}, because {file} has signals for {series} cells"
-        )));
+        return Err(Failure::new(format!("--cells {found}, must be at most {series}, the number of cells in {file}")));
     }
     Ok(settings)
 }

@@ -54,20 +54,20 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// Description of a branch below the configured one.
 fn description(branch: &str) -> &'static str {
     match branch {
-        "Alarms" => "Alarms.",
-        "Capacity" => "Capacity of the cell with the least.",
+        "Alarms" => "Raised alarms and configured thresholds.",
+        "Capacity" => "Capacity of the weakest cell.",
         "Cells" => {
-            "Values of each cell. An array has a value only when that of every cell is known; cells are identified by relative \
+            "Values of each cell. An array has a value only if every cell has one; cells are identified by relative \
                     position in array."
         }
-        "CurrentSensor" => "The sensor of the current.",
-        "Loss" => "What the cell with the least capacity has lost.",
-        "Model" => "The model of the cells.",
-        "RechargePeriod" => "Time of a recharge.",
-        "RemainingLife" => "Remaining life of the cell whose life ends first.",
-        "StateOfCharge" => "More about the state of charge.",
-        "StateOfHealth" => "More about the state of health.",
-        _ => "Battery health as packwatch estimates it.",
+        "CurrentSensor" => "The current sensor.",
+        "Loss" => "Losses of the weakest cell.",
+        "Model" => "The cell model.",
+        "RechargePeriod" => "Recharge period.",
+        "RemainingLife" => "Remaining life of the cell that ends first.",
+        "StateOfCharge" => "Additional signals of the state of charge.",
+        "StateOfHealth" => "Additional signals of the state of health.",
+        _ => "Battery health estimated by packwatch.",
     }
 }
 
@@ -144,11 +144,12 @@ fn node<'a>(root: &'a mut Map<String, Value>, path: &str) -> &'a mut Value {
 
 /// The manual page: a table of VSS signals and one of overlay signals.
 fn reference() -> String {
-    let mut page = "# VSS signals\n\nA page of `packwatch vss --reference`: the signals beside those of the [quantities](quantities.md). A signal has no value while the daemon is silent, while one of its fields \
-                    in the [status document](status.md) is unknown, or where a column says so. Cells count from 0; an array has a value only \
-                    when that of every cell is known, because VSS has no unknown number.\n"
+    let mut page = "# VSS signals\n\nWritten by `packwatch vss --reference`: the signals that are not in the table of [quantities](quantities.md). A signal \
+                    has no value while the daemon is silent, while one of its fields in the [status document](status.md) is unknown, or \
+                    where a column says so. Cells count from 0. An array has a value only if every cell has one, because VSS has no unknown \
+                    number.\n"
         .to_owned();
-    for (title, origin) in [("Of VSS itself", Origin::Standard), ("Of the overlay", Origin::Overlay)] {
+    for (title, origin) in [("Standard signals", Origin::Standard), ("Overlay signals", Origin::Overlay)] {
         let branch =
             if origin == Origin::Standard { STANDARD_BRANCH.to_owned() } else { KuksaSettings::default().branch };
         let _ = write!(page, "\n## {title}\n\nBelow `{branch}`.\n\n");

@@ -133,7 +133,7 @@ fn out_of_range_settings_name_allowed_range() {
         (vec!["--initial-soc", "2"], 2, "must be 0 to 1"),
         (vec!["--noise-voltage", "nan"], 2, "must be 0 or more"),
         (vec!["--duration", "0"], 2, "must be above 0"),
-        (vec!["--cells", "97"], 1, "has signals for 96"),
+        (vec!["--cells", "97"], 1, "must be at most 96"),
         (vec!["--cell-period", "15"], 1, "must be a multiple"),
     ] {
         let mut all = vec!["simulate", "ev-day", "-c", &example, "-o", "/dev/null"];

@@ -33,7 +33,7 @@ impl LogArgs {
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
             return Err(Failure::new(format!(
-                "--start-times: {found} logs given, must be 1; for several logs, place NAME_cycles.csv next to each"
+                "--start-times dates one log, but {found} are given; place NAME_cycles.csv next to each log instead"
             )));
         }
         if self.logs.len() > 1 && self.is_stdin() {

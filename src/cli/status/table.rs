@@ -104,7 +104,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
 /// Losses of the weakest cell.
 fn losses(values: &PackValues) -> String {
     if values.get(Quantity::LithiumLoss).is_none() {
-        return "not known".to_owned();
+        return "unknown".to_owned();
     }
     format!(
         "lithium {}, negative electrode {}, positive electrode {}",
@@ -118,7 +118,7 @@ fn losses(values: &PackValues) -> String {
 fn remaining(pack: &PackView) -> String {
     let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
     let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {
-        return "not known".to_owned();
+        return "unknown".to_owned();
     };
     let (cell, days) = (in_brackets(pack.shortest_lived_cell), mean(&pack.values, Quantity::RemainingDays, 0));
     format!("{cycles:.0} equivalent full cycles (90 %: {low:.0} to {high:.0}){cell}, {days} at the recent use")
@@ -130,7 +130,7 @@ fn interfaces(text: &mut String, document: &StatusDocument) {
         let unsent = it.link.send_queue_full + it.link.send_failed;
         let _ = writeln!(
             text,
-            "interface  {} {}: {} frames in, {lost} lost, {} out, {unsent} not sent, {} errors, {} bus-off, back {} times",
+            "interface  {} {}: {} frames in, {lost} lost, {} out, {unsent} not sent, {} errors, {} bus-off, {} reconnects",
             it.name,
             word(it.state),
             it.received.frames,
@@ -149,7 +149,7 @@ fn interfaces(text: &mut String, document: &StatusDocument) {
     };
     let _ = writeln!(
         text,
-        "counted    {} readings used, {rejected} not; {} late ticks; 99 % of estimates within {slowest}",
+        "counted    {} readings used, {rejected} rejected; {} late ticks; 99 % of estimates within {slowest}",
         readings.accepted, service.missed_deadlines,
     );
     let _ = writeln!(text, "store      {}", store(document));

@@ -16,9 +16,9 @@ offset     current sensor -0.034 ± 0.011 A (reading less true current)
 model      learning
 losses     lithium 6.1 ± 1.2 %, negative electrode 2.2 ± 2.3 %, positive electrode 2.1 ± 2.4 %
 life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the recent use
-interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
-interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
-counted    123456 readings used, 7 not; 3 late ticks; 99 % of estimates within 5.00 ms
+interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
+interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
+counted    123456 readings used, 7 rejected; 3 late ticks; 99 % of estimates within 5.00 ms
 store      works, 21 commits, 0.1 MB
 commands   can0 6B3: unauthenticated
 requests   silent: another tester is active; 1 refused for good

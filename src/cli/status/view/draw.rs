@@ -51,10 +51,10 @@ fn lost(frame: &mut Frame<'_>, app: &App, area: Rect) {
         Some((since, why)) => {
             let since = since.map_or_else(|| "no daemon".to_owned(), |at| format!("no daemon since {}", clock(at)));
             let bold = Style::new().add_modifier(Modifier::BOLD);
-            vec![Line::styled(since, bold), Line::from(""), Line::from(why.clone()), Line::from("looking for it ...")]
+            vec![Line::styled(since, bold), Line::from(""), Line::from(why.clone()), Line::from("reconnecting ...")]
         }
     };
-    let block = Block::bordered().title(" packwatch ").title_bottom(" q leave ");
+    let block = Block::bordered().title(" packwatch ").title_bottom(" q quit ");
     let paragraph = Paragraph::new(text).block(block).wrap(ratatui::widgets::Wrap { trim: false });
     frame.render_widget(paragraph, area);
 }
@@ -83,7 +83,7 @@ fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Re
     let block = Block::bordered().title(title).title_bottom(stored);
     let inner = block.inner(area);
     frame.render_widget(block, area);
-    let band = soc_band(pack).map_or_else(|| " not known".to_owned(), |band| format!(" {band}"));
+    let band = soc_band(pack).map_or_else(|| " unknown".to_owned(), |band| format!(" {band}"));
     let label = format!("SOC {:>7} ", mean(&pack.values, Quantity::Soc, 1));
     let taken = label.chars().count() + band.chars().count();
     let width = usize::from(inner.width).saturating_sub(taken);
@@ -144,8 +144,8 @@ fn tabs(document: &StatusDocument, chosen: Page) -> Line<'static> {
 
 fn keys(page: Page) -> Line<'static> {
     let text = match page {
-        Page::Cells => "q leave  tab page  arrows choose a cell  v SOC or voltage",
-        Page::Alarms | Page::Interfaces | Page::Counts | Page::Events => "q leave  tab page  arrows scroll",
+        Page::Cells => "q quit  tab page  arrows choose a cell  v SOC or voltage",
+        Page::Alarms | Page::Interfaces | Page::Counts | Page::Events => "q quit  tab page  arrows scroll",
     };
     Line::styled(text, Style::new().add_modifier(Modifier::DIM))
 }

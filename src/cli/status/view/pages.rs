@@ -89,7 +89,7 @@ fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: u
     let (quantity, name) = MAPPED[app.mapped];
     let known = ValueRange::of(cells.iter().filter_map(|cell| cell.values.mean(quantity)));
     let (title, scale) = match (quantity, known) {
-        (_, None) => (format!("{name} not known"), None),
+        (_, None) => (format!("{name} unknown"), None),
         (Quantity::Soc, Some(known)) => {
             let bars = known.at_least(LEAST_SOC_RANGE);
             let [least, greatest, from, to] =
@@ -210,13 +210,13 @@ fn interfaces(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
             ("frames in", it.received.frames),
             ("lost by the kernel", it.link.kernel_dropped),
             ("lost by our queue", it.link.queue_dropped),
-            ("no frames", it.link.malformed),
+            ("malformed", it.link.malformed),
             ("frames out", it.link.sent),
             ("not sent, queue full", it.link.send_queue_full),
             ("not sent, kernel", it.link.send_failed),
             ("error frames", it.received.error_frames),
             ("bus-off", it.received.bus_offs),
-            ("came back", it.reconnects),
+            ("reconnects", it.reconnects),
         ];
         text.extend(rows.map(|(name, count)| count_line(name, count)));
     }

@@ -119,7 +119,7 @@ fn unknown_soc_is_drawn_as_unknown() {
     let mut app = app();
     app.handle_update(FeedUpdate::StatusDocument(Box::new(document)));
     let screen = drawn(&mut app, SMALL).to_string();
-    assert!(screen.contains("SOC       - ····") && screen.contains("not known"), "{screen}");
+    assert!(screen.contains("SOC       - ····") && screen.contains("unknown"), "{screen}");
 }
 
 #[test]

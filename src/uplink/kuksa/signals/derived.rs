@@ -104,7 +104,7 @@ const STANDARD: [Row; 9] = [
         Some("percent"),
         "pack.soh",
         |status| float(status.pack.values.mean(Quantity::Soh).map(|soh| 100.0 * soh)),
-        "Learned capacity over rated capacity. VSS allows 0 to 100: a cell with more than its rated capacity gives no value here",
+        "Learned capacity over rated capacity. VSS allows 0 to 100; with more than its rated capacity, a cell has no value here",
     ),
     (
         "ErrorCodes",
@@ -112,7 +112,7 @@ const STANDARD: [Row; 9] = [
         None,
         "alarms",
         alarm_codes,
-        "Raised alarms, `RULE:SEVERITY` or `RULE:SEVERITY:cell3`. Empty only when every threshold was judged",
+        "Raised alarms, `RULE:SEVERITY` or `RULE:SEVERITY:cell3`. Empty only if every threshold was evaluated",
     ),
 ];
 
@@ -131,7 +131,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "pack.mode",
         |status| word(Some(status.pack.mode).filter(|mode| *mode != Mode::Unknown)),
-        "What the pack does, by its current: charge, rest or discharge. Braking into the battery is charge too.",
+        "Charge, rest or discharge, by the direction of the current. Regenerative braking counts as charge.",
     ),
     (
         "LimitingCell",
@@ -139,7 +139,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "pack.limiting_cell",
         |status| cell(status.pack.limiting_cell),
-        "Cell that ends a discharge, counted from 0.",
+        "Cell that limits a discharge, counted from 0.",
     ),
     (
         "WeakestCell",
@@ -171,7 +171,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "current_frozen",
         |status| status.pack.values.get(Quantity::Current).map(|_| Value::Flag(status.current_frozen)),
-        "True when the reading stays at one value while the voltages show another load.",
+        "True if the reading does not change although the voltages show a changing load.",
     ),
     (
         "Model.State",
@@ -179,7 +179,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "pack.model_state",
         |status| word(status.pack.model_state),
-        "How well the cells' model is known: prior, learning, learned, unfit (another chemistry explains the voltages better) or given.",
+        "State of the cell model: prior, learning, learned, unfit (another chemistry explains the voltages better) or given (configured).",
     ),
     (
         "Model.BetterChemistry",
@@ -187,7 +187,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "pack.model_fits_better",
         |status| word(status.pack.model_fits_better),
-        "Chemistry that explains the voltages better than the configured one; no value = none does.",
+        "Chemistry that explains the voltages better than the configured one; no value if there is none.",
     ),
     (
         "Alarms.Thresholds",
@@ -195,7 +195,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "alarms.thresholds",
         |status| count(status.alarms.thresholds),
-        "Thresholds configured.",
+        "Number of configured thresholds.",
     ),
     (
         "Alarms.Raised",
@@ -203,7 +203,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "alarms.raised",
         |status| count(status.alarms.raised),
-        "Alarms raised now.",
+        "Number of raised alarms.",
     ),
     (
         "Alarms.Unknown",
@@ -211,7 +211,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "alarms.unknown",
         |status| count(status.alarms.unknown.len()),
-        "Thresholds that cannot be judged, because their value is not known.",
+        "Number of thresholds that cannot be evaluated, because their value is unknown.",
     ),
     (
         "Alarms.HighestSeverity",
@@ -219,7 +219,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "alarms.highest_severity",
         |status| status.alarms.level().map(|word| Value::Text(word.to_owned())),
-        "Of the raised alarms: info, warning or severe; none only when every threshold was judged.",
+        "Highest severity of the raised alarms: info, warning or severe; none only if every threshold was evaluated.",
     ),
     (
         "Findings",
@@ -227,7 +227,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "findings",
         findings,
-        "What is found of single cells and of the sensors, KIND, KIND:cell3 or KIND:cell3:cell7 (first and last cell, or the two of a pair). Empty = nothing reported.",
+        "Faults found in single cells and sensors: KIND, KIND:cell3 or KIND:cell3:cell7 (first and last cell, or the cells of a pair). Empty if nothing is reported.",
     ),
     (
         "Cells.IsTrusted",
@@ -235,7 +235,7 @@ const OVERLAY: [Row; 15] = [
         None,
         "cells.trusted",
         |status| of_cells(status, |cell| cell.trusted).map(Value::Flags),
-        "Whether the filter of the cell is consistent, each cell.",
+        "Whether the filter of each cell is consistent.",
     ),
 ];
 
