@@ -480,7 +480,6 @@ impl AlarmEngine {
         }
     }
 
-    /// Updates the lists and counts after a machine changed.
     fn update_index(&mut self, index: usize, slot: usize, before: IndexEntry) {
         let now = self.machines[slot].index_entry();
         if now == before {

@@ -85,7 +85,6 @@ impl Observation {
     }
 }
 
-/// A value compared with the limits of a rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LimitCheck {
     /// On the bad side of the threshold.

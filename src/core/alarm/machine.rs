@@ -211,7 +211,6 @@ impl Machine {
         self.judge(now, rule)
     }
 
-    /// Acknowledges the alarm.
     pub(super) fn acknowledge(&mut self) -> Result<Change, Refusal> {
         if self.occurrences == 0 || self.is_acknowledged {
             return Err(Refusal::Nothing);
@@ -266,12 +265,11 @@ impl Machine {
         self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// The machine as it is restored: its value is unknown until the next observation.
+    /// Resets the value before a restore; it is unknown until the next observation.
     pub(super) fn without_value(self) -> Self {
         Self { is_known: false, observation: Observation::default(), probability: None, ..self }
     }
 
-    /// Moves the stamps onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.first_raised = self.first_raised.plus_nanos(by_nanos);
         self.last_raised = self.last_raised.plus_nanos(by_nanos);

@@ -21,7 +21,7 @@ pub use crate::quantity::{Channel, Reading, SensorIndex};
 pub struct MuxTest {
     /// The selector.
     pub plan: SignalPlan,
-    /// Codes for which the signal is present.
+    /// Codes with which the signal is present.
     pub ranges: Vec<(u64, u64)>,
 }
 

@@ -176,7 +176,7 @@ impl FloodGate {
         }
     }
 
-    /// Restores stored counts, except those of messages that are no longer configured.
+    /// Restores stored counts of messages that are still configured.
     pub fn restore(&mut self, counts: &[FloodCount]) {
         for bucket in &mut self.buckets {
             let stored = counts.iter().find(|count| (count.bus, count.id) == (bucket.bus, bucket.id));

@@ -65,7 +65,7 @@ pub(crate) const fn is_frame_length(len: usize) -> bool {
 pub enum FrameKind {
     /// Classic data frame, at most 8 bytes.
     Classic,
-    /// Classic remote request: no data; the length is that of the requested frame.
+    /// Classic remote request: no data; the length is the requested one.
     Remote,
     /// CAN FD data frame, at most 64 bytes.
     Fd {
@@ -164,7 +164,6 @@ impl Frame {
         &self.data.0
     }
 
-    /// The payload, mutable.
     pub(crate) fn data_mut(&mut self) -> &mut [u8] {
         match self.kind {
             FrameKind::Remote => &mut [],

@@ -6,7 +6,6 @@
 use crate::can::CanId;
 use crate::quantity::BusIndex;
 
-/// Number of standard identifiers.
 const STANDARD_IDS: usize = 0x800;
 /// Entry of an identifier without message.
 const NONE: u32 = u32::MAX;
@@ -17,7 +16,6 @@ pub(crate) struct IdTable {
     buses: Vec<BusTable>,
 }
 
-/// Indices of the messages of one interface.
 #[derive(Debug, Clone, PartialEq)]
 struct BusTable {
     /// By identifier: 8 KiB; only cache lines of configured messages are used.

@@ -16,7 +16,6 @@ pub const MAX_MESSAGE: usize = 65_535;
 /// Flow control that allows all frames at once, without a pause.
 pub(crate) const FLOW_CONTROL: [u8; 3] = [0x30, 0, 0];
 
-/// Longest classic payload, bytes.
 const CLASSIC: usize = 8;
 
 /// Reason why a message is lost.

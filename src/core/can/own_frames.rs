@@ -14,7 +14,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Longest time in which an echo returns, s.
 const ECHO_S: f64 = 1.0;
-/// Number of sent frames that may return: those of a second of status, health and alarm frames on two interfaces.
+/// Number of sent frames that may return: one second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
 /// The other sender is gone after this time without a frame of it, s.
 const GONE_S: f64 = 10.0;
@@ -76,7 +76,6 @@ pub struct OwnFramesState {
 #[derive(Debug, Clone, Default)]
 pub struct OwnFrames {
     numbers: IdTable,
-    /// Number of packwatch's identifiers.
     count: usize,
     state: OwnFramesState,
     /// Changes to be published, in order.

@@ -116,11 +116,9 @@ pub struct PollOutputs {
     pub changes: Vec<PollChange>,
 }
 
-/// State of one request.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Item {
     due: Timestamp,
-    /// Consecutive failures.
     failures: u32,
     /// Never sent again.
     is_refused: bool,
@@ -157,7 +155,6 @@ pub struct PollProgress {
     foreign_until: Timestamp,
     /// Time of the latest frame from other nodes on each polled bus.
     heard: Vec<(BusIndex, Timestamp)>,
-    /// The silence last reported.
     silence: Option<PollSilence>,
 }
 

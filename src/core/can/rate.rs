@@ -8,7 +8,7 @@
 //! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the currents
 //! alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither. Short intervals
 //! that a message always has, such as those between the pages of a multiplexed message sent in a burst, are learned
-//! with its rate and do not count. The expected number is the highest steady rate so far, or that of the DBC's cycle
+//! with its rate and do not count. The expected number is the highest steady rate so far, or the rate from the DBC's cycle
 //! time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
 //!
 //! Limits: the following second senders are not found: one of a message with fewer than [`LEAST_PER_S`] frames a second
@@ -22,7 +22,6 @@ use crate::can::CanId;
 use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Length of a window, ns.
 const WINDOW_NS: i64 = 1_000_000_000;
 /// Factor on the expected number of frames above which there are too many; a second sender with the same cycle doubles
 /// it.
@@ -85,7 +84,6 @@ pub struct MessageRate {
     latest: Timestamp,
     /// The previous two currents of the message, A.
     currents_a: [Option<f64>; 2],
-    /// Whether there is a second sender.
     is_doubtful: bool,
 }
 
@@ -228,7 +226,7 @@ impl MessageRate {
         if self.window_from.is_none() {
             self.window_from = Some(now);
         } else if self.candidate > 0.0 {
-            // Uses the mean rate up to the previous window, because that of the current window is not known yet.
+            // Uses the mean rate up to the previous window, because the rate of the current window is not known yet.
             let interval_ns = now.nanos().saturating_sub(self.latest.nanos()) as f64;
             self.short = self.short.saturating_add(u32::from(interval_ns * self.candidate < SHORT * WINDOW_NS as f64));
         }

@@ -191,7 +191,7 @@ pub struct MacCheck {
 }
 
 impl MacCheck {
-    /// The freshness for which the authenticator of `payload` is correct; `None` = for none. `mac` computes
+    /// The freshness that makes the authenticator of `payload` correct; `None` = no such freshness. `mac` computes
     /// AES-128-CMAC.
     pub fn verify(&self, payload: &[u8], mac: impl Fn(&[u8]) -> Mac) -> Option<u64> {
         let is_right = |freshness: &u64| {

@@ -10,7 +10,6 @@
 use crate::can::MAX_DATA;
 use crate::quantity::Fault;
 
-/// Most bits of a payload.
 const MAX_BITS: u16 = 512;
 const _: () = assert!(MAX_DATA * 8 == MAX_BITS as usize);
 

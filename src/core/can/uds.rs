@@ -93,7 +93,7 @@ impl Question {
 pub struct AnswerSignal {
     /// Byte at which the layout starts, counted after the echoed service and identifier.
     pub first_byte: usize,
-    /// The signal, relative to this byte. Interface and identifier are those of the response frames.
+    /// The signal, relative to this byte. Interface and identifier come from the response frames.
     pub binding: Binding,
 }
 
@@ -135,7 +135,7 @@ pub struct ControllerCounts {
     pub pending: u64,
     /// Code of the latest negative response, except "response pending".
     pub latest_refusal: Option<u8>,
-    /// Decoded responses for which no request was received in the preceding five seconds.
+    /// Decoded responses without a request in the preceding five seconds.
     pub unasked: u64,
     /// Lost messages, indexed like [`IsoTpFault::ALL`].
     pub lost: [u64; IsoTpFault::ALL.len()],
@@ -224,7 +224,6 @@ pub enum Heard<'a> {
     },
 }
 
-/// One controller's state.
 #[derive(Debug, Clone)]
 struct Link {
     controller: Controller,
@@ -302,7 +301,7 @@ impl Listener {
         self.links.iter().map(|link| (link.controller, link.counts))
     }
 
-    /// Restores stored counts; ignores those of other controllers.
+    /// Restores stored counts; ignores counts of other controllers.
     pub fn restore(&mut self, counts: impl Iterator<Item = (Controller, ControllerCounts)>) {
         for (controller, counts) in counts {
             if let Some(link) = self.links.iter_mut().find(|link| link.controller == controller) {
@@ -389,7 +388,6 @@ impl Listener {
         }
     }
 
-    /// Handles a complete message.
     fn whole(&mut self, now: Timestamp, controller: usize, is_single: bool) -> Heard<'_> {
         let Self { answers, links, .. } = self;
         let Some(link) = links.get_mut(controller) else { return Heard::Nothing };
@@ -453,7 +451,7 @@ impl Link {
     }
 }
 
-/// Identifiers to be received for these responses. Includes those of the requests, to tell whether a response was
+/// Identifiers to be received for these responses, including the request identifiers, which show whether a response was
 /// requested.
 pub fn wanted(answers: &[Answer]) -> Vec<(BusIndex, CanId)> {
     let both = |answer: &Answer| {

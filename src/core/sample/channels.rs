@@ -4,7 +4,6 @@ use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};
 use crate::quantity::{CellIndex, Channel, SensorIndex};
 
-/// Limits of a channel's readings.
 pub(super) fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
     match channel {
         Channel::Current => &config.current,

@@ -50,7 +50,6 @@ impl ReadingCounts {
         }
     }
 
-    /// Counts a reading by its fault.
     pub(super) fn note(&mut self, fault: Option<Fault>) {
         let count = match fault {
             None => &mut self.accepted,

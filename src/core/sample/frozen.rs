@@ -18,7 +18,7 @@ use crate::quantity::{InvalidState, Timestamp, bounds};
 
 /// Fewest equal current readings.
 const MIN_READINGS: u32 = 20;
-/// Time for which the reading must remain unchanged after the voltages turned back, s. No current arrives that much
+/// How long the reading must remain unchanged after the voltages turned back, s. No current arrives that much
 /// later.
 const MIN_FROZEN_S: f64 = 5.0;
 /// Longest time between an extreme voltage and the return from it, s. Cells that rest, cool or balance turn more
@@ -57,7 +57,6 @@ struct Reversals {
 }
 
 impl Reversals {
-    /// Handles a voltage.
     fn handle(&mut self, now: Timestamp, voltage_v: f64, step_v: f64) {
         let Some((low, high)) = self.range_v else {
             (self.range_v, self.extreme_at) = (Some((voltage_v, voltage_v)), now);
@@ -116,7 +115,6 @@ pub(super) fn step_v(noise_v: f64) -> f64 {
 }
 
 impl FrozenCheck {
-    /// Whether the current is frozen.
     #[inline]
     pub(super) fn is_frozen(&self) -> bool {
         self.is_frozen

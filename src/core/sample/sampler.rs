@@ -41,9 +41,7 @@ pub struct SamplerState {
     unused_readings: u64,
     counts: ReadingCounts,
     frozen: FrozenCheck,
-    /// Configured number of parallel strings.
     strings: u16,
-    /// Configured number of cells in series.
     series: u16,
 }
 
@@ -95,9 +93,7 @@ pub struct Sampler {
     state: SamplerState,
     /// No signal becomes stale before this time; `None` = to be computed.
     next_stale: Option<Timestamp>,
-    /// Number of bad signals.
     bad_signals: usize,
-    /// Inputs shared by readings with the same time stamp.
     shared: SharedInputs,
 }
 

@@ -29,7 +29,6 @@ pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 /// Number of readings after which an old one has lost most of its weight in the share of bad readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
-/// A value and its time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(super) struct TimedValue {
     value: f64,
@@ -42,7 +41,6 @@ impl TimedValue {
     }
 }
 
-/// State of one signal.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {
     pub(super) good: Option<TimedValue>,
@@ -57,7 +55,6 @@ pub(super) struct Signal {
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]
     pub(super) received: Option<Timestamp>,
-    /// Current fault of the signal.
     fault: Option<Fault>,
     /// Bad readings since the signal turned bad.
     bad_readings: u64,
@@ -107,7 +104,6 @@ impl Signal {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
 
-    /// Whether the signal is bad.
     pub(super) fn is_bad(&self) -> bool {
         self.fault.is_some()
     }

@@ -1,4 +1,4 @@
-//! Passive balancing: a BMS that bleeds cells whose voltage is above that of the lowest cell.
+//! Passive balancing: a BMS that bleeds cells whose voltage is above the lowest cell voltage.
 //!
 //! The BMS bleeds near the end of a charge and during the first rest after it, also while the buses sleep. A drive
 //! between the charge and that rest pauses the balancing. The BMS compares voltages as its own channels measure them,
@@ -26,7 +26,6 @@ impl Balancing {
     }
 }
 
-/// State of the balancing.
 #[derive(Debug, Clone)]
 pub(crate) struct Balancer {
     settings: Balancing,

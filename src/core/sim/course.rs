@@ -15,7 +15,6 @@ pub(super) use demand::Demand;
 use drive::DayCourse;
 use walk::WalkCourse;
 
-/// The course of one scenario.
 #[derive(Debug, Clone)]
 pub(crate) enum Course {
     Cycle(CycleCourse),

@@ -32,7 +32,7 @@ pub enum Leak {
 pub enum ContactResistance {
     /// Ohm.
     Ohm(f64),
-    /// Share of the cell's own ohmic resistance at SOC 50 % and 25 degrees C when the fault begins.
+    /// Share of the cell's own ohmic resistance at SOC 50 % and 25 degrees C when the fault starts.
     OfCell(f64),
 }
 

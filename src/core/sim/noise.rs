@@ -11,17 +11,11 @@ use rand_chacha::ChaCha8Rng;
 /// Use of a stream of random numbers. Its number affects results, so it is never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
-    /// Spread of the cells.
     Spread,
-    /// Course of the current.
     Course,
-    /// Current sensor.
     Current,
-    /// Pack voltage sensor.
     PackVoltage,
-    /// One temperature sensor.
     Temperature(u16),
-    /// One cell's voltage sensor.
     CellVoltage(u16),
 }
 
@@ -38,7 +32,6 @@ impl Stream {
     }
 }
 
-/// One stream of random numbers.
 #[derive(Debug, Clone)]
 pub(crate) struct Noise {
     generator: ChaCha8Rng,
@@ -46,7 +39,6 @@ pub(crate) struct Noise {
 }
 
 impl Noise {
-    /// Creates the stream of `seed` for one use.
     pub(crate) fn new(seed: u64, stream: Stream) -> Self {
         Self::of_number(seed, stream.number())
     }

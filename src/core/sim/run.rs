@@ -43,7 +43,6 @@ pub struct Moment {
     pub cells_sampled: bool,
 }
 
-/// The sensors of the pack, each with its own random errors.
 #[derive(Debug, Clone)]
 struct PackSensors {
     current: Sensor,

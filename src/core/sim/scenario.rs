@@ -55,7 +55,7 @@ pub struct Settings {
 }
 
 impl Scenario {
-    /// Capacity of the cell for which the scenario's amounts are given, Ah.
+    /// Capacity of the cell in the scenario's source, Ah.
     pub const fn nominal_ah(self) -> f64 {
         match self {
             Self::Paper => 2.6,

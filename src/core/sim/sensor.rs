@@ -90,7 +90,6 @@ impl Sensors {
     }
 }
 
-/// One sensor with its own noise stream.
 #[derive(Debug, Clone)]
 pub(crate) struct Sensor {
     error: SensorError,

@@ -16,7 +16,6 @@ fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_e
     RuleConfig { rule, severity, threshold, clear, when, debounce_s, debounce_events, is_latching: false }
 }
 
-/// A new value.
 fn see(
     engine: &mut AlarmEngine,
     now: Timestamp,

@@ -14,7 +14,6 @@ const STATES: [AlarmState; 8] = [
     AlarmState::Cleared,
 ];
 
-/// Input of an alarm machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MachineInput {
     Check(LimitCheck),

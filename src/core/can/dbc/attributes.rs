@@ -1,6 +1,6 @@
 //! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection, authentication.
 //!
-//! The attribute names and the order of the values of `VFrameFormat` are those of DBC editors; the attributes for
+//! The attribute names and the order of the values of `VFrameFormat` follow DBC editors; the attributes for
 //! end-to-end protection and authentication are specific to packwatch. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
@@ -19,7 +19,6 @@ pub(super) const FAST_CYCLE_TIME: &str = "GenMsgCycleTimeFast";
 pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
 /// Standard or extended, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
-/// The values of [`FRAME_FORMAT`].
 pub(super) const FRAME_FORMATS: [&str; 16] = {
     let mut words = ["reserved"; 16];
     (words[0], words[1]) = ("StandardCAN", "ExtendedCAN");
@@ -28,34 +27,23 @@ pub(super) const FRAME_FORMATS: [&str; 16] = {
 };
 /// Index of the first FD format in [`FRAME_FORMATS`].
 pub(super) const FIRST_FD_FORMAT: usize = 14;
-/// Bit rate switch.
 pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
-/// The values of [`BIT_RATE_SWITCH`].
 pub(super) const NO_YES: [&str; 2] = ["0", "1"];
-/// End-to-end protection: profile.
 pub(super) const E2E_PROFILE: &str = "E2EProfile";
-/// The values of [`E2E_PROFILE`].
 pub(super) const E2E_PROFILES: [&str; 4] = ["off", "1A", "1C", "5"];
-/// End-to-end protection: data id.
 pub(super) const E2E_DATA_ID: &str = "E2EDataId";
-/// Authentication: profile.
 pub(super) const SECOC_PROFILE: &str = "SecOCProfile";
-/// The values of [`SECOC_PROFILE`].
 pub(super) const SECOC_PROFILES: [&str; 5] = ["off", "1", "3", "fd", "announcement"];
-/// Authentication: data id.
 pub(super) const SECOC_DATA_ID: &str = "SecOCDataId";
 
-/// Index of the profile in [`E2E_PROFILES`].
 pub(super) fn profile_index(profile: Profile) -> usize {
     E2E_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
-/// Index of the profile in [`SECOC_PROFILES`].
 pub(super) fn secoc_index(profile: secoc::Profile) -> usize {
     SECOC_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
-/// Repetition of the message after an event.
 pub(super) fn repetition(dbc: &Dbc, id: MessageId) -> Repetition {
     let [count, period_ms, delay_ms] = [REPETITIONS, FAST_CYCLE_TIME, DELAY_TIME].map(|name| positive(dbc, id, name));
     Repetition { count, period_ms, delay_ms }

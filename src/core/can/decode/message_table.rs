@@ -20,14 +20,12 @@ const MAX_CODES: u64 = 1024;
 /// Most entries in all tables of one message, so that wide ranges on many signals use little memory.
 const MAX_GROUPS: usize = 1 << 16;
 
-/// The table of all messages.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct MessageTable {
     indices: IdTable,
     messages: Vec<MessageGroups>,
 }
 
-/// The signals of one message.
 #[derive(Debug, Clone, PartialEq)]
 struct MessageGroups {
     bus: BusIndex,
@@ -67,7 +65,6 @@ struct PageTable {
 /// Number of words in [`PayloadWords::words`]. As a word index, it marks signals outside these words.
 const FAR: u8 = 2;
 
-/// Position of a signal's bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct BitPosition {
     /// Index in [`PayloadWords::words`]; plus [`FAR`] for a signal outside these words.
@@ -148,7 +145,6 @@ impl<'a> PayloadWords<'a> {
 }
 
 impl MessageTable {
-    /// Creates the table from bindings sorted by message and channel.
     pub(super) fn new(bindings: &[Binding]) -> Self {
         let mut messages = Vec::new();
         let mut end = 0;
@@ -163,7 +159,6 @@ impl MessageTable {
         Self { indices: IdTable::new(messages.iter().map(|message| (message.bus, message.id))), messages }
     }
 
-    /// Every message and the number of its groups.
     pub(super) fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
         self.messages.iter().map(|message| (message.bus, message.id, message.all.len()))
     }

@@ -81,7 +81,6 @@ fn messages_have_at_least_one_group_per_page() {
     assert_eq!(found, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
 }
 
-/// All readings of one frame.
 pub(crate) fn readings(map: &InputMap, bus: u8, frame: &Frame) -> Vec<(Channel, Result<f64, Fault>)> {
     let mut found = Vec::new();
     map.decode(BusIndex(bus), frame, |reading| found.push((reading.channel, reading.value)));

@@ -11,7 +11,6 @@ use crate::can::dbc::Database;
 use crate::can::e2e::crc16;
 use crate::quantity::CellIndex;
 
-/// Number of alarm rules.
 const RULE_COUNT: usize = RULES.len();
 
 /// State of a rule; the number is the wire code.
@@ -82,7 +81,6 @@ impl TableChecksum {
     }
 }
 
-/// The digest frame, prepared for encoding.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct DigestPlan {
     pub(super) message: OutputMessage,
@@ -115,7 +113,6 @@ impl DigestPlan {
         }))
     }
 
-    /// Number of pages of the digest.
     pub(super) fn page_count(&self) -> usize {
         self.pages.len()
     }

@@ -44,7 +44,6 @@ struct PlacedRow<'a> {
     of_fields: &'a [Option<usize>],
 }
 
-/// A position in a row of values.
 #[derive(Debug, Clone, Copy)]
 struct RowChannel {
     channel: Channel,
@@ -54,7 +53,6 @@ struct RowChannel {
     is_carried: bool,
 }
 
-/// One diagnostic response.
 #[derive(Debug, Clone)]
 struct AnswerPage {
     question: Question,
@@ -85,7 +83,7 @@ struct InputField {
     offset: f64,
     /// Code for "no value"; `None` = no such code exists.
     missing: Option<u64>,
-    /// `missing` is a configured "not available" code, for which a frame is sent even without any value.
+    /// `missing` is a configured "not available" code: a frame is sent even without any value.
     has_not_available: bool,
 }
 
@@ -188,7 +186,6 @@ impl InputEncoder {
         channels.iter().zip(values).filter(|(of, (_, value))| is_open(of) && is_known(*value)).count()
     }
 
-    /// Assigns a number to each field.
     fn numbered(mut self) -> Self {
         let of_pages = self.pages.iter_mut().flat_map(|page| &mut page.fields);
         let of_answers = self.answers.iter_mut().flat_map(|answer| &mut answer.fields).map(|(_, field)| field);

@@ -106,7 +106,6 @@ impl LayoutMessage {
         }
     }
 
-    /// Repetition after an event.
     const fn repetition(self) -> Repetition {
         match self {
             Self::Alarm => Repetition {
@@ -121,7 +120,6 @@ impl LayoutMessage {
         }
     }
 
-    /// Whether the message is sent periodically.
     const fn is_cyclic(self) -> bool {
         matches!(self, Self::Status | Self::Health | Self::Alarm | Self::Digest | Self::Freshness)
     }
@@ -333,7 +331,6 @@ fn move_down(message: &mut Message) {
     message.comment = Some("Authenticated command from another ECU: see PACKWATCH_Freshness.".to_owned());
 }
 
-/// Replaces the signals of header and trailer.
 fn set_header(message: &mut Message) {
     let mut header = message.e2e.map(header_signals).unwrap_or_default();
     header.extend(message.secoc.into_iter().flat_map(|secoc| trailer_signals(message.len_bytes, secoc)));

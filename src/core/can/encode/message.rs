@@ -37,7 +37,6 @@ pub(super) const RULES: [&str; 17] = [
     "ChannelFaulty",
 ];
 
-/// One message to send.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct OutputMessage {
     pub(super) id: CanId,
@@ -58,7 +57,7 @@ struct OutputField {
     not_available: u64,
     /// Factor from the internal unit: 100 if the DBC's unit is % or %/d, else 1.
     per_inside_unit: f64,
-    /// Selector codes for which the signal is present; empty = always.
+    /// Selector codes with which the signal is present; empty = always.
     pages: Vec<(u64, u64)>,
     is_multiplexor: bool,
 }
@@ -249,7 +248,7 @@ impl OutputField {
         }
     }
 
-    /// The code next to the "not available" code: below it, or above it if there is none below.
+    /// The code next to the "not available" code: below it, or above it if it is the lowest.
     fn neighbour(&self, taken: u64) -> u64 {
         let lowest = match self.plan.value_type() {
             ValueType::Signed => 1 << (self.plan.length_bits() - 1),

@@ -5,8 +5,8 @@
 //! (signed) or NaN (float). A known value never has that code: it saturates before it. End-to-end headers use the
 //! counters that the caller keeps ([`SendCounters`]).
 //!
-//! A DBC is rejected with all its faults if signals are missing, or if a value could be mistaken for that of another
-//! rule or page.
+//! A DBC is rejected with all its faults if signals are missing, or if a value could be mistaken for another rule's or
+//! page's value.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,7 +23,6 @@ use crate::quantity::{CellIndex, Mode};
 /// Signals of a message with the functions that return their values.
 type SignalTable<T, const N: usize> = [(&'static str, fn(&T) -> Option<f64>); N];
 
-/// Signals of the status frame.
 const STATUS: SignalTable<StatusFields, 8> = [
     ("Soc", |f| f.soc),
     ("SocStd", |f| f.soc_std),
@@ -164,7 +163,6 @@ pub struct OutputPlan {
     /// `None` = the layout has no digest.
     digest: Option<DigestPlan>,
     reply: Option<OutputMessage>,
-    /// The announcement of the freshness of commands.
     freshness: Option<OutputMessage>,
 }
 
@@ -348,12 +346,10 @@ fn freshness_message(database: &Database, faults: &mut Vec<String>) -> Option<Ou
 /// Name of a signal and the function that returns its value.
 type SignalValue<T> = (&'static str, fn(&T) -> Option<f64>);
 
-/// Value of the signal at an index of the table.
 fn value_of<T>(signals: &[SignalValue<T>], fields: &T, place: Option<usize>) -> Option<f64> {
     signals.get(place?).and_then(|(_, value)| value(fields))
 }
 
-/// Wire code of the mode.
 fn mode_code(mode: Mode) -> f64 {
     match mode {
         Mode::Unknown => 0.0,

@@ -13,7 +13,6 @@ use crate::can::Frame;
 use crate::can::dbc::Database;
 use crate::can::e2e::Status;
 
-/// Signals of the reply.
 const REQUIRED: [&str; 9] =
     ["Result", "Reason", "Command", "Rule", "Severity", "Cell", "CounterExpected", "Changed", "Refused"];
 
@@ -26,7 +25,7 @@ pub enum CommandRefusal {
     FirstFrame = 1,
     /// Damaged, too short, or from another message.
     WrongChecksum = 2,
-    /// The counter equals that of the last accepted frame.
+    /// The counter was already used by the last accepted frame.
     RepeatedCounter = 3,
     /// The counter jumped further than allowed.
     WrongCounter = 4,
@@ -42,7 +41,7 @@ pub enum CommandRefusal {
 }
 
 impl CommandRefusal {
-    /// The reason for which a frame with this end-to-end status is not executed; `None` = it may be executed.
+    /// The reason why a frame with this end-to-end status is not executed; `None` = it may be executed.
     pub const fn of(status: Status) -> Option<Self> {
         match status {
             Status::Ok | Status::OkSomeLost | Status::Sync => None,
@@ -127,7 +126,6 @@ pub(super) fn reply_message(database: &Database, faults: &mut Vec<String>) -> Op
     OutputMessage::new(database, name, &REQUIRED, faults)
 }
 
-/// Encodes the reply.
 pub(super) fn reply_frame(message: &OutputMessage, fields: &ReplyFields, counter: &mut u8) -> Frame {
     message.frame(0, counter, |name, _| fields.value(name))
 }

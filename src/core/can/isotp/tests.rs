@@ -10,7 +10,6 @@ fn at(ms: i64) -> Timestamp {
     Timestamp::from_nanos(ms * 1_000_000)
 }
 
-/// Modifications of the frames of a message.
 type Harm = fn(&mut Vec<Vec<u8>>);
 
 /// Receives payloads of one sender at intervals of a millisecond; returns the messages and faults.

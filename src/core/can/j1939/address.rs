@@ -23,20 +23,16 @@ use crate::quantity::Timestamp;
 /// reaches the wire later than its time here (interface start, queues; 12 ms were measured).
 const CONTENTION_NS: i64 = 300_000_000;
 
-/// State of the claim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum ClaimState {
     /// Not started.
     Idle,
     /// Waiting for objections to the claim.
     Claiming,
-    /// The node has the address.
     Claimed,
-    /// Another node has the address.
     Lost,
 }
 
-/// Input of the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
     /// The program starts, or resumes after time without listening.
@@ -51,7 +47,6 @@ pub(super) enum ClaimEvent {
     Unopposed,
 }
 
-/// Response of the state machine: a frame to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ClaimAnswer {
     Nothing,
@@ -83,7 +78,6 @@ fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
     }
 }
 
-/// The claim to one address.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct AddressClaim {
     name: Name,
@@ -138,7 +132,6 @@ impl AddressClaim {
         }
     }
 
-    /// Handles a request for claims.
     pub(super) fn handle_request(&mut self, now: Timestamp) {
         self.handle(now, ClaimEvent::Requested);
     }

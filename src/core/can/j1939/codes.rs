@@ -29,17 +29,14 @@ pub struct ActiveCode {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
-    /// Whether the code is active now.
     is_active: bool,
     /// Whether the code became active since its last change on the bus.
     is_unseen: bool,
     /// Most severe lamp since the last change on the bus.
     lamp: Lamp,
-    /// Lamp now.
     lamp_now: Lamp,
     /// Lamp as sent; `None` = the code is not sent.
     shown: Option<Lamp>,
-    /// Time of the last change on the bus.
     changed_at: Option<Timestamp>,
     /// Whether the change is part of the message that is being transferred.
     is_in_flight: bool,
@@ -101,7 +98,6 @@ fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
     changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(1_000_000_000))
 }
 
-/// All followed codes.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(super) struct Codes {
     followed: Vec<FollowedCode>,
@@ -111,7 +107,7 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Handles a list of active codes, of which at most [`MAX_FOLLOWED`] are followed.
+    /// Handles a list of active codes; follows at most [`MAX_FOLLOWED`].
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
         self.all_known = all_known;
@@ -193,7 +189,7 @@ impl Codes {
         }
     }
 
-    /// The lamps as sent: those of all codes, including codes that do not fit into the message.
+    /// The lamps as sent, including the lamps of codes that do not fit into the message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }

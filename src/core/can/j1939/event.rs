@@ -13,7 +13,7 @@ pub enum NodeEvent {
         /// The address.
         address: u8,
     },
-    /// Another node took the address; no codes are sent any more.
+    /// Another node took the address; codes are no longer sent.
     AddressLost {
         /// Its NAME; this node's own NAME if two nodes have the same configuration.
         to: Name,

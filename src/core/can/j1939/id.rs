@@ -41,7 +41,6 @@ pub(super) struct Header {
     pub(super) pgn: u32,
     /// Receiver; [`GLOBAL_ADDRESS`] for a group without destination.
     pub(super) destination: u8,
-    /// Sender.
     pub(super) source: u8,
 }
 

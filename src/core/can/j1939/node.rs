@@ -65,7 +65,6 @@ pub struct NodeOutputs {
     pub events: Vec<NodeEvent>,
 }
 
-/// A response to a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum PendingAnswer {
     Dm1,

@@ -21,7 +21,6 @@ pub(super) const PACKET_BYTES: usize = 7;
 // Sequence numbers are one byte and start at 1.
 const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);
 
-/// A transfer in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Transfer {
     /// The transferred parameter group.
@@ -61,7 +60,6 @@ impl Transfer {
         Frame::classic(can_id(TRANSPORT_PRIORITY, PGN_TRANSPORT_DATA, GLOBAL_ADDRESS, source), &packet)
     }
 
-    /// Whether the last packet was sent.
     pub(super) fn is_complete(&self) -> bool {
         usize::from(self.sent_packets) * PACKET_BYTES >= self.payload.as_slice().len()
     }

@@ -17,7 +17,6 @@ use super::name::OutOfRange;
 /// number, only the most severe is sent, so 17 rules give 17 codes.
 pub const MAX_CODES: usize = 27;
 
-/// Length of a message with [`MAX_CODES`] codes, bytes.
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
 
 /// Largest suspect parameter number: 19 bits.

@@ -7,10 +7,8 @@ use crate::sim::truth::Pack;
 
 /// Discharge pulses of the example, A for 30 Ah: uniformly distributed in this range, mean 15 A.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
-/// Length of a pulse, s.
 const PULSE_S: f64 = 60.0;
 
-/// Discharge current of a cycle.
 #[derive(Debug, Clone)]
 enum Load {
     Constant { current_a: f64 },

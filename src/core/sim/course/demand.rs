@@ -6,10 +6,7 @@ pub(crate) enum Demand {
     /// This cell current flows until the next sample, A, positive = discharge.
     Current(f64),
     /// The vehicle sleeps: no current, no measurements.
-    Asleep {
-        /// Duration, s.
-        duration_s: f64,
-    },
+    Asleep { duration_s: f64 },
     /// The scenario is over.
     Finished,
 }

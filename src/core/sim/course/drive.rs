@@ -7,7 +7,6 @@ use super::demand::Demand;
 use crate::sim::noise::Noise;
 use crate::sim::truth::Pack;
 
-/// Power of all other consumers, W.
 const AUXILIARY_W: f64 = 600.0;
 /// Largest acceleration and deceleration, m/s^2.
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
@@ -31,7 +30,6 @@ enum DayPhase {
     FastCharge,
 }
 
-/// Length of a day, s.
 const DAY_S: f64 = 86_400.0;
 
 /// Plan of a day that starts at 7:30: drive to work, drive back at 17:00 with a stop at the charger, park overnight.
@@ -116,10 +114,10 @@ impl DayCourse {
         let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // a small difference is closed over 1 s
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
-        // The power belongs to a pack of this energy, Wh.
+        // `power_w` is for a pack of this energy, Wh.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        // Cell voltage for which that energy is stated, V.
+        // Nominal cell voltage behind that energy, V.
         let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {

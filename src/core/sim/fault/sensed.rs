@@ -24,7 +24,6 @@ impl SensorFaults {
         self.begun.push(fault);
     }
 
-    /// The current at the sensor, A.
     pub(crate) fn current_a(&self, truth_a: f64) -> f64 {
         self.begun.iter().fold(truth_a, |current_a, fault| match fault {
             FaultKind::CurrentOffset(offset_a) => current_a + offset_a,

@@ -19,7 +19,6 @@ enum State {
     Silent,
 }
 
-/// Input of the receiver.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Input {
     NoFrame,

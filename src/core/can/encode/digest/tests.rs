@@ -3,7 +3,6 @@
 use super::*;
 use crate::can::encode::{OutputPlan, SendCounters, default_database};
 
-/// Physical value of a signal of one page.
 fn read(frames: &[Frame], name: &str) -> f64 {
     let database = default_database().unwrap();
     let (_, signal) = database.signal(&format!("PACKWATCH_Digest.{name}")).unwrap();

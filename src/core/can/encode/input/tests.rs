@@ -41,7 +41,7 @@ fn messages_and_pages_decode_to_encoded_values() {
     let found = round_trip(&map(), &values);
     for (channel, wanted) in &values {
         let readings: Vec<_> = found.iter().filter(|(name, _)| name == channel).collect();
-        // The temperature beside the cells is on both pages.
+        // The temperature is always present, so it is on both pages.
         assert_eq!(readings.len(), if *channel == sensor(1) { 2 } else { 1 }, "{channel:?}");
         assert!(readings.iter().all(|(_, value)| near(*value, wanted.unwrap(), 1e-9)), "{channel:?}: {readings:?}");
     }

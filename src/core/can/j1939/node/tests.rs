@@ -33,7 +33,6 @@ fn claim_of(identity_number: u32) -> Frame {
     frame(0x18EE_FF00 | u32::from(ADDRESS), &name(identity_number).to_bytes())
 }
 
-/// A complete message, as received.
 #[derive(Debug, Clone, PartialEq)]
 struct Message {
     ms: i64,
@@ -103,7 +102,6 @@ impl Bench {
         self.take();
     }
 
-    /// Polls every millisecond.
     fn run_to(&mut self, ms: i64) {
         self.take();
         while self.now_ms < ms {

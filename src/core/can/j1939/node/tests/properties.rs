@@ -6,7 +6,6 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// An input of the node.
 #[derive(Debug, Clone)]
 enum Act {
     Wait(u16),
