@@ -88,8 +88,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let manufacturer = args.manufacturer.as_deref().map(read_static).transpose()?;
     let manufacturer = manufacturer.unwrap_or_else(|| Value::Object(Map::new()));
     let (record, vehicle) = match &args.state {
-        Some(folder) => of_store(folder, &config)?,
-        None => (of_replay(args, &config)?, config.vehicle.clone()),
+        Some(folder) => load_store(folder, &config)?,
+        None => (replay_logs(args, &config)?, config.vehicle.clone()),
     };
     let model =
         cell_model(record.snapshot(), Some(&config))?.map_or_else(|| config.monitor.model.clone(), |it| it.model);
@@ -137,7 +137,7 @@ fn read_static(path: &Path) -> Result<Value, Failure> {
     serde_json::from_slice(&bytes).map_err(|error| named(path, error))
 }
 
-fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {
+fn load_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity), Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let vehicle = reader.vehicle().map_err(Failure::new)?;
     if vehicle.is_stated() && config.vehicle.is_stated() && vehicle != config.vehicle {
@@ -147,7 +147,7 @@ fn of_store(folder: &Path, config: &Config) -> Result<(Record, VehicleIdentity),
     Ok((record, vehicle))
 }
 
-fn of_replay(args: &Args, config: &Config) -> Result<Record, Failure> {
+fn replay_logs(args: &Args, config: &Config) -> Result<Record, Failure> {
     let record = Rc::new(RefCell::new(Record::of_replay(reading_limits(config))));
     let shared = Rc::clone(&record);
     let take: OutputSink = Box::new(move |out| shared.borrow_mut().take(out));

@@ -57,8 +57,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let reference = args.reference.as_deref().map(report::read_reference).transpose();
     let reference = reference.map_err(failure)?;
     let (data, provenance, vehicle, snapshot) = match (&args.state, &config) {
-        (Some(folder), _) => of_store(folder)?,
-        (None, Some(config)) => of_replay(args, config)?,
+        (Some(folder), _) => load_store(folder)?,
+        (None, Some(config)) => replay_logs(args, config)?,
         (None, None) => return Err(Failure::new("give --state DIR, or --config FILE and logs")),
     };
     let mut provenance = provenance;
@@ -108,12 +108,12 @@ impl Args {
 }
 
 /// Data, provenance, vehicle and last state of a report.
-type Parts = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
+type ReportInput = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
 
 /// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
-fn of_store(folder: &Path) -> Result<Parts, Failure> {
+fn load_store(folder: &Path) -> Result<ReportInput, Failure> {
     let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let vehicle = reader.vehicle().map_err(Failure::new)?;
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
@@ -132,7 +132,7 @@ fn of_store(folder: &Path) -> Result<Parts, Failure> {
     Ok((data, provenance, vehicle, reader.snapshot()))
 }
 
-fn of_replay(args: &Args, config: &Config) -> Result<Parts, Failure> {
+fn replay_logs(args: &Args, config: &Config) -> Result<ReportInput, Failure> {
     let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
     let watched = Rc::clone(&data);
     let watch: OutputWatch = Box::new(move |_, out| {

@@ -93,7 +93,7 @@ pub(crate) fn replay(
     let config = py.detach(|| config::load(&config)).map_err(error::config)?;
     let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
     let result = background_task::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
-    let (mut outputs, json) = result.map_err(of_replay)?;
+    let (mut outputs, json) = result.map_err(replay_error)?;
     let outputs = outputs.finish(py, &config.interface_names())?;
     Ok(Replay { outputs: Py::new(py, outputs)?, json })
 }
@@ -124,7 +124,7 @@ fn run(
     Ok((columns, json))
 }
 
-fn of_replay(failure: ReplayError) -> PyErr {
+fn replay_error(failure: ReplayError) -> PyErr {
     match failure {
         ReplayError::Write(error) if error.kind() == std::io::ErrorKind::BrokenPipe => {
             PyBrokenPipeError::new_err(error.to_string())

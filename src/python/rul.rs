@@ -13,7 +13,7 @@ use crate::error::{data, of_library};
 
 /// An end of life: Ah, or a text such as "70 %".
 #[derive(FromPyObject)]
-pub(crate) enum End {
+pub(crate) enum EndOfLife {
     AmpereHours(f64),
     Text(String),
 }
@@ -24,12 +24,12 @@ pub(crate) enum End {
 pub(crate) fn rul<'py>(
     py: Python<'py>,
     files: List<PathBuf>,
-    end_of_life: List<End>,
+    end_of_life: List<EndOfLife>,
     at: Option<Vec<f64>>,
     alpha: f64,
 ) -> PyResult<Bound<'py, PyAny>> {
     let files = files.0;
-    let thresholds = end_of_life.0.into_iter().map(End::threshold).collect::<PyResult<Vec<Threshold>>>()?;
+    let thresholds = end_of_life.0.into_iter().map(EndOfLife::threshold).collect::<PyResult<Vec<Threshold>>>()?;
     if let Some(part) = at.iter().flatten().chain([&alpha]).find(|part| !(**part > 0.0 && **part < 1.0)) {
         return Err(data(format!("at or alpha = {part}, must be above 0 and below 1")));
     }
@@ -72,7 +72,7 @@ fn document(
     if at.is_none() { lab_rul::now_json(&now) } else { lab_rul::scored_json(&scored, alpha) }
 }
 
-impl End {
+impl EndOfLife {
     fn threshold(self) -> PyResult<Threshold> {
         let text = match self {
             Self::AmpereHours(ah) => ah.to_string(),

@@ -12,19 +12,19 @@
 //! | `messages` | the protocol |
 //! | `routes` | signal ids of one connection |
 //! | `outgoing` | pending messages; only the newest batch is kept |
-//! | `questions` | requests of the broker for values, and when not to answer |
+//! | `value_requests` | requests of the broker for values, and when not to answer |
 //! | `session` | one connection |
 //! | `journal` | counters and log lines |
 
 mod journal;
 mod messages;
 mod outgoing;
-mod questions;
 mod routes;
 mod session;
 pub(crate) mod settings;
 pub(crate) mod signals;
 pub(crate) mod value;
+mod value_requests;
 
 use std::time::Duration;
 

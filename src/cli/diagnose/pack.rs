@@ -15,12 +15,12 @@ use crate::lab::pack_view::energy_kwh;
 pub(super) struct PackPage {
     unknown: Option<String>,
     #[serde(flatten)]
-    known: Option<Known>,
+    known: Option<KnownImbalance>,
 }
 
 /// Known values; cells count from 1.
 #[derive(Debug, Serialize)]
-struct Known {
+struct KnownImbalance {
     time: String,
     cells: usize,
     mean_capacity_ah: Value,
@@ -76,13 +76,13 @@ impl PackPage {
     }
 }
 
-fn known(pack: &Imbalance, model: Option<&CellModel>) -> Known {
+fn known(pack: &Imbalance, model: Option<&CellModel>) -> KnownImbalance {
     let charge = |fraction: ScalarGaussian| Charge {
         fraction: fraction.into(),
         ah: pack.ah(fraction).into(),
         kwh: model.map(|model| energy_kwh(pack, fraction, model).into()),
     };
-    Known {
+    KnownImbalance {
         time: format_utc(pack.time),
         cells: pack.cells,
         mean_capacity_ah: pack.mean_ah.into(),

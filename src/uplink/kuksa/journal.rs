@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use super::routes::{Points, Skipped};
+use super::routes::{DataPoints, SkippedSignal};
 
 /// Most reasons remembered as logged: all signals with a few reasons each. Further reasons from a broker are not logged.
 const MAX_LOGGED: usize = 1000;
@@ -39,8 +39,8 @@ impl Journal {
         tracing::info!(address, signals, "providing values to the databroker");
     }
 
-    pub(crate) fn note_skipped(&mut self, skipped: Vec<Skipped>) {
-        for Skipped { path, reason } in skipped {
+    pub(crate) fn note_skipped(&mut self, skipped: Vec<SkippedSignal>) {
+        for SkippedSignal { path, reason } in skipped {
             self.counts.skipped += 1;
             if self.is_new(format!("{path} {reason}")) {
                 tracing::warn!(path, reason, "signal skipped");
@@ -48,7 +48,7 @@ impl Journal {
         }
     }
 
-    pub(crate) fn note_published(&mut self, points: &Points) {
+    pub(crate) fn note_published(&mut self, points: &DataPoints) {
         self.counts.batches += 1;
         let outside: HashSet<_> = points.withheld.iter().copied().collect();
         self.counts.withheld += u64::try_from(outside.len()).unwrap_or_default();
@@ -65,8 +65,8 @@ impl Journal {
         }
     }
 
-    pub(crate) fn note_unanswered(&mut self, questions: u64) {
-        self.counts.unanswered += questions;
+    pub(crate) fn note_unanswered(&mut self, requests: u64) {
+        self.counts.unanswered += requests;
     }
 
     /// Logs the counts.

@@ -3,7 +3,7 @@
 //! * While the connection cannot send, only the newest batch of values is kept.
 //! * An empty claim follows each batch. The broker accepts it after it has read everything before it, so the acceptance serves as a
 //!   receipt; the protocol has no other. A check is such a claim without a batch.
-//! * An answer overtakes a waiting batch. See `questions` for why the order matters.
+//! * An answer overtakes a waiting batch. See `value_requests` for why the order matters.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -21,7 +21,7 @@ const MAX_ANSWERS: usize = 8;
 
 /// What a receipt confirms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Sent {
+pub(crate) enum ReceiptScope {
     /// The batch with this number, and everything before it.
     Batch(u32),
     /// Everything before it.
@@ -29,7 +29,7 @@ pub(crate) enum Sent {
 }
 
 /// Sent messages not yet confirmed as read, in order.
-type Unread = Arc<Mutex<VecDeque<Sent>>>;
+type UnreadMessages = Arc<Mutex<VecDeque<ReceiptScope>>>;
 
 /// Takes the session's messages. Dropping it ends the stream after the waiting messages.
 #[derive(Debug)]
@@ -37,7 +37,7 @@ pub(crate) struct Outbox {
     batches: watch::Sender<PublishValuesRequest>,
     /// `None` = a check.
     answers: mpsc::Sender<Option<GetProviderValueResponse>>,
-    unread: Unread,
+    unread: UnreadMessages,
 }
 
 impl Outbox {
@@ -45,7 +45,7 @@ impl Outbox {
     pub(crate) fn open(claim: ProvideSignalRequest) -> (Self, Messages) {
         let (batches, newest) = watch::channel(PublishValuesRequest::default());
         let (answers, waiting) = mpsc::channel(MAX_ANSWERS);
-        let unread = Unread::default();
+        let unread = UnreadMessages::default();
         let next = Some(Action::Provide(claim));
         let messages = Messages {
             next,
@@ -72,7 +72,7 @@ impl Outbox {
     }
 
     /// Handles a receipt: returns what the broker has read.
-    pub(crate) fn acknowledge(&self) -> Option<Sent> {
+    pub(crate) fn acknowledge(&self) -> Option<ReceiptScope> {
         self.unread.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
     }
 }
@@ -84,11 +84,11 @@ pub(crate) struct Messages {
     next: Option<Action>,
     answers: mpsc::Receiver<Option<GetProviderValueResponse>>,
     batches: WatchStream<PublishValuesRequest>,
-    unread: Unread,
+    unread: UnreadMessages,
 }
 
 impl Messages {
-    fn note_unread(&self, sent: Sent) {
+    fn note_unread(&self, sent: ReceiptScope) {
         self.unread.lock().unwrap_or_else(PoisonError::into_inner).push_back(sent);
     }
 
@@ -100,7 +100,7 @@ impl Messages {
         match self.answers.poll_recv(context) {
             Poll::Ready(Some(Some(answer))) => return Poll::Ready(Some(Action::Answer(answer))),
             Poll::Ready(Some(None)) => {
-                self.note_unread(Sent::Check);
+                self.note_unread(ReceiptScope::Check);
                 return Poll::Ready(Some(receipt));
             }
             // The outbox is closed, so the batches end too.
@@ -109,7 +109,7 @@ impl Messages {
         let Some(batch) = std::task::ready!(Pin::new(&mut self.batches).poll_next(context)) else {
             return Poll::Ready(None);
         };
-        self.note_unread(Sent::Batch(batch.request_id));
+        self.note_unread(ReceiptScope::Batch(batch.request_id));
         self.next = Some(receipt);
         Poll::Ready(Some(Action::Publish(batch)))
     }
@@ -149,7 +149,7 @@ mod tests {
         drop(outbox);
         let claim = || Action::Provide(ProvideSignalRequest::default());
         assert_eq!(sent(messages).await, [claim(), Action::Publish(batch(1000)), claim()]);
-        assert_eq!(*unread.lock().unwrap(), [Sent::Batch(1000)]);
+        assert_eq!(*unread.lock().unwrap(), [ReceiptScope::Batch(1000)]);
     }
 
     #[tokio::test]
@@ -161,7 +161,7 @@ mod tests {
         let claim = || Action::Provide(ProvideSignalRequest::default());
         assert_eq!(actions, [claim(), Action::Answer(answer(7)), claim(), Action::Publish(batch(1)), claim()]);
         let read = [outbox.acknowledge(), outbox.acknowledge(), outbox.acknowledge()];
-        assert_eq!(read, [Some(Sent::Check), Some(Sent::Batch(1)), None]);
+        assert_eq!(read, [Some(ReceiptScope::Check), Some(ReceiptScope::Batch(1)), None]);
     }
 
     #[tokio::test]

@@ -23,7 +23,7 @@ struct Route {
 
 /// A signal that this connection does not provide, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Skipped {
+pub(crate) struct SkippedSignal {
     pub(crate) path: String,
     /// Why it is skipped.
     pub(crate) reason: String,
@@ -31,7 +31,7 @@ pub(crate) struct Skipped {
 
 /// Data points for the broker.
 #[derive(Debug, Default)]
-pub(crate) struct Points {
+pub(crate) struct DataPoints {
     pub(crate) by_id: BTreeMap<i32, Datapoint>,
     /// Signals whose values exceed the broker's limits.
     pub(crate) withheld: Vec<&'static str>,
@@ -45,7 +45,7 @@ pub(crate) struct Routes {
 
 impl Routes {
     /// Finds every signal in the broker's metadata. The overlay's signals are below `branch`.
-    pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<Skipped>) {
+    pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<SkippedSignal>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
         for entry in metadata {
@@ -63,7 +63,7 @@ impl Routes {
                 .and_then(|entry| check(signal, entry, &uses))
             {
                 Ok((id, route)) => drop(by_id.insert(id, route)),
-                Err(reason) => skipped.push(Skipped { path, reason }),
+                Err(reason) => skipped.push(SkippedSignal { path, reason }),
             }
         }
         (Self { by_id }, skipped)
@@ -87,7 +87,7 @@ impl Routes {
     }
 
     /// Returns a data point for every signal; without a document, all are unknown.
-    pub(crate) fn points(&self, document: Option<&StatusDocument>) -> Points {
+    pub(crate) fn points(&self, document: Option<&StatusDocument>) -> DataPoints {
         self.points_of(self.by_id.keys(), document)
     }
 
@@ -96,9 +96,9 @@ impl Routes {
         &self,
         ids: impl IntoIterator<Item = &'a i32>,
         document: Option<&StatusDocument>,
-    ) -> Points {
+    ) -> DataPoints {
         let timestamp = Some(document.map_or_else(now, |document| timestamp(document.wall_time)));
-        let mut points = Points::default();
+        let mut points = DataPoints::default();
         for (id, route) in ids.into_iter().filter_map(|id| self.by_id.get_key_value(id)) {
             let value = document
                 .and_then(|document| route.signal.value(document))

@@ -18,10 +18,10 @@ use tonic::{Code, Status, Streaming};
 use super::journal::Journal;
 use super::messages::{Client, Event, FromBroker, GetProviderValueResponse, PublishValuesRequest};
 use super::outgoing::Outbox;
-use super::questions::Questions;
 use super::routes::Routes;
 use super::settings::KuksaSettings;
 use super::signals::STANDARD_BRANCH;
+use super::value_requests::ValueRequests;
 use crate::files::read_credential;
 use crate::status_stream::Documents;
 
@@ -59,7 +59,7 @@ pub(crate) async fn run(
                 session.publish(document.as_deref(), journal);
                 session.receipts.check(Instant::now())?;
             }
-            () = wait_until(session.questions.due()) => session.handle_time()?,
+            () = wait_until(session.value_requests.due()) => session.handle_time()?,
             message = session.incoming.message() => match message.map_err(|status| words(&status))? {
                 None => return Err("the broker ended the stream".to_owned()),
                 Some(message) => session.handle(message, documents.borrow().as_deref(), journal),
@@ -75,7 +75,7 @@ struct Session {
     routes: Routes,
     outbox: Outbox,
     incoming: Streaming<FromBroker>,
-    questions: Questions,
+    value_requests: ValueRequests,
     request_id: u32,
     receipts: Receipts,
 }
@@ -129,7 +129,7 @@ impl Session {
             routes,
             outbox,
             incoming,
-            questions: Questions::default(),
+            value_requests: ValueRequests::default(),
             request_id: 0,
             receipts: Receipts::default(),
         })
@@ -140,7 +140,7 @@ impl Session {
         let points = self.routes.points(document);
         journal.note_published(&points);
         self.request_id = self.request_id.wrapping_add(1);
-        self.questions.note_batch(self.request_id);
+        self.value_requests.note_batch(self.request_id);
         self.receipts.note_sent(Instant::now());
         self.outbox.publish(PublishValuesRequest { request_id: self.request_id, data_points: points.by_id });
     }
@@ -148,10 +148,10 @@ impl Session {
     fn handle(&mut self, message: FromBroker, document: Option<&StatusDocument>, journal: &mut Journal) {
         let now = Instant::now();
         match message.event {
-            Some(Event::Asked(question)) => journal.note_unanswered(u64::from(!self.questions.ask(question, now))),
+            Some(Event::Asked(request)) => journal.note_unanswered(u64::from(!self.value_requests.ask(request, now))),
             Some(Event::Provided(_)) => {
                 self.receipts.note_read();
-                self.questions.note_read(self.outbox.acknowledge());
+                self.value_requests.note_read(self.outbox.acknowledge());
             }
             Some(Event::Rejected(rejected)) => {
                 for (id, rejection) in &rejected.status {
@@ -160,18 +160,18 @@ impl Session {
             }
             None => {}
         }
-        let (questions, expired) = self.questions.take(now);
+        let (requests, expired) = self.value_requests.take(now);
         journal.note_unanswered(expired);
-        for (_, question) in questions {
-            let entries = self.routes.points_of(&question.signal_ids, document).by_id;
-            let answer = GetProviderValueResponse { request_id: question.request_id, entries };
+        for (_, request) in requests {
+            let entries = self.routes.points_of(&request.signal_ids, document).by_id;
+            let answer = GetProviderValueResponse { request_id: request.request_id, entries };
             journal.note_unanswered(u64::from(!self.outbox.answer(answer)));
         }
     }
 
     /// Requests the receipt of an answer when it is due.
     fn handle_time(&mut self) -> Result<(), String> {
-        if self.questions.handle_time(Instant::now())? && !self.outbox.check() {
+        if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
         }
         Ok(())

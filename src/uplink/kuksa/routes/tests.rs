@@ -30,7 +30,7 @@ fn reason(metadata: &[Metadata], path: &str) -> String {
     skipped.into_iter().find(|skipped| skipped.path == path).map(|skipped| skipped.reason).unwrap_or_default()
 }
 
-fn sent(points: &Points, id: i32) -> Option<f32> {
+fn sent(points: &DataPoints, id: i32) -> Option<f32> {
     match points.by_id[&id].value.as_ref()?.typed.as_ref()? {
         TypedValue::Float(number) => Some(*number),
         other => panic!("{other:?}"),

@@ -14,7 +14,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::messages::GetProviderValueRequest;
-use super::outgoing::Sent;
+use super::outgoing::ReceiptScope;
 
 /// Longest wait before an answer: half of the broker's timeout.
 const DEADLINE: Duration = Duration::from_millis(500);
@@ -24,15 +24,15 @@ const CHECK_AFTER: Duration = Duration::from_millis(100);
 /// Latest time of the proof: the broker's timeout minus 200 ms of transport latency.
 const LATEST_PROOF: Duration = Duration::from_millis(800);
 /// Most waiting requests; the broker sends one at a time.
-const MAX_QUESTIONS: usize = 8;
+const MAX_REQUESTS: usize = 8;
 
 /// A request and its time of arrival.
-pub(crate) type Question = (Instant, GetProviderValueRequest);
+pub(crate) type ValueRequest = (Instant, GetProviderValueRequest);
 
 /// The requests of one connection.
 #[derive(Debug, Default)]
-pub(crate) struct Questions {
-    waiting: Vec<Question>,
+pub(crate) struct ValueRequests {
+    waiting: Vec<ValueRequest>,
     /// Number of the latest batch made, and of the latest batch the broker has read.
     made: u32,
     read: u32,
@@ -41,35 +41,35 @@ pub(crate) struct Questions {
     is_checking: bool,
 }
 
-impl Questions {
+impl ValueRequests {
     /// Notes that a batch was made.
     pub(crate) fn note_batch(&mut self, number: u32) {
         self.made = number;
     }
 
     /// Notes that the broker has read a message.
-    pub(crate) fn note_read(&mut self, sent: Option<Sent>) {
-        match sent {
-            Some(Sent::Batch(number)) => self.read = number,
-            Some(Sent::Check) => (self.unproved, self.is_checking) = (None, false),
+    pub(crate) fn note_read(&mut self, scope: Option<ReceiptScope>) {
+        match scope {
+            Some(ReceiptScope::Batch(number)) => self.read = number,
+            Some(ReceiptScope::Check) => (self.unproved, self.is_checking) = (None, false),
             None => {}
         }
     }
 
     /// Adds a request; `false` if too many are waiting.
-    pub(crate) fn ask(&mut self, question: GetProviderValueRequest, now: Instant) -> bool {
+    pub(crate) fn ask(&mut self, request: GetProviderValueRequest, now: Instant) -> bool {
         if self.unproved.is_some_and(|asked| now.duration_since(asked) <= LATEST_PROOF) {
             self.unproved = None;
         }
-        let has_room = self.waiting.len() < MAX_QUESTIONS;
+        let has_room = self.waiting.len() < MAX_REQUESTS;
         if has_room {
-            self.waiting.push((now, question));
+            self.waiting.push((now, request));
         }
         has_room
     }
 
     /// Requests to answer now, and the number of requests that expired.
-    pub(crate) fn take(&mut self, now: Instant) -> (Vec<Question>, u64) {
+    pub(crate) fn take(&mut self, now: Instant) -> (Vec<ValueRequest>, u64) {
         if self.made != self.read || self.is_checking {
             return (Vec::new(), 0);
         }
@@ -81,7 +81,7 @@ impl Questions {
         (open, expired)
     }
 
-    /// Time when [`Questions::handle_time`] is due; `None` = not before the next message.
+    /// Time when [`ValueRequests::handle_time`] is due; `None` = not before the next message.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.unproved.map(|asked| asked + if self.is_checking { LATEST_PROOF } else { CHECK_AFTER })
     }
@@ -104,13 +104,13 @@ impl Questions {
 mod tests {
     use super::*;
 
-    fn question(id: i32) -> GetProviderValueRequest {
+    fn request(id: i32) -> GetProviderValueRequest {
         GetProviderValueRequest { request_id: 0, signal_ids: vec![id] }
     }
 
-    fn answered(questions: &mut Questions, now: Instant) -> (Vec<i32>, u64) {
-        let (open, expired) = questions.take(now);
-        (open.iter().flat_map(|(_, question)| question.signal_ids.clone()).collect(), expired)
+    fn answered(requests: &mut ValueRequests, now: Instant) -> (Vec<i32>, u64) {
+        let (open, expired) = requests.take(now);
+        (open.iter().flat_map(|(_, request)| request.signal_ids.clone()).collect(), expired)
     }
 
     fn ms(milliseconds: u64) -> Duration {
@@ -119,65 +119,65 @@ mod tests {
 
     #[test]
     fn request_waits_until_latest_batch_is_read() {
-        let (mut questions, start) = (Questions::default(), Instant::now());
-        questions.note_batch(1);
-        questions.note_batch(2);
-        assert!(questions.ask(question(5), start));
-        assert_eq!(answered(&mut questions, start), (vec![], 0));
-        questions.note_read(Some(Sent::Batch(1)));
-        assert_eq!(answered(&mut questions, start), (vec![], 0), "batch 2 is on its way");
-        questions.note_read(Some(Sent::Batch(2)));
-        assert_eq!(answered(&mut questions, start), (vec![5], 0));
-        assert_eq!(answered(&mut questions, start), (vec![], 0), "answered once");
+        let (mut requests, start) = (ValueRequests::default(), Instant::now());
+        requests.note_batch(1);
+        requests.note_batch(2);
+        assert!(requests.ask(request(5), start));
+        assert_eq!(answered(&mut requests, start), (vec![], 0));
+        requests.note_read(Some(ReceiptScope::Batch(1)));
+        assert_eq!(answered(&mut requests, start), (vec![], 0), "batch 2 is on its way");
+        requests.note_read(Some(ReceiptScope::Batch(2)));
+        assert_eq!(answered(&mut requests, start), (vec![5], 0));
+        assert_eq!(answered(&mut requests, start), (vec![], 0), "answered once");
     }
 
     #[test]
     fn expired_request_gets_no_answer() {
-        let (mut questions, start) = (Questions::default(), Instant::now());
-        questions.note_batch(1);
-        assert!(questions.ask(question(5), start));
-        questions.note_read(Some(Sent::Batch(1)));
-        assert_eq!(answered(&mut questions, start + DEADLINE + ms(1)), (vec![], 1));
-        assert_eq!(questions.due(), None);
-        assert!((0..8).all(|id| questions.ask(question(id), start)) && !questions.ask(question(9), start));
+        let (mut requests, start) = (ValueRequests::default(), Instant::now());
+        requests.note_batch(1);
+        assert!(requests.ask(request(5), start));
+        requests.note_read(Some(ReceiptScope::Batch(1)));
+        assert_eq!(answered(&mut requests, start + DEADLINE + ms(1)), (vec![], 1));
+        assert_eq!(requests.due(), None);
+        assert!((0..8).all(|id| requests.ask(request(id), start)) && !requests.ask(request(9), start));
     }
 
     #[test]
     fn next_request_within_second_proves_answer() {
-        let (mut questions, start) = (Questions::default(), Instant::now());
-        questions.ask(question(5), start);
-        assert_eq!(answered(&mut questions, start), (vec![5], 0));
-        assert_eq!(questions.due(), Some(start + CHECK_AFTER));
-        questions.ask(question(6), start + ms(50));
-        assert_eq!(questions.due(), None);
-        assert_eq!(answered(&mut questions, start + ms(50)), (vec![6], 0));
+        let (mut requests, start) = (ValueRequests::default(), Instant::now());
+        requests.ask(request(5), start);
+        assert_eq!(answered(&mut requests, start), (vec![5], 0));
+        assert_eq!(requests.due(), Some(start + CHECK_AFTER));
+        requests.ask(request(6), start + ms(50));
+        assert_eq!(requests.due(), None);
+        assert_eq!(answered(&mut requests, start + ms(50)), (vec![6], 0));
     }
 
     #[test]
-    fn a_receipt_proves_an_answer_and_no_question_is_answered_before_it() {
-        let (mut questions, start) = (Questions::default(), Instant::now());
-        questions.ask(question(5), start);
-        answered(&mut questions, start);
-        assert_eq!(questions.handle_time(start + ms(99)), Ok(false));
-        assert_eq!(questions.handle_time(start + ms(100)), Ok(true));
-        assert_eq!(questions.handle_time(start + ms(101)), Ok(false), "asked for once");
-        questions.ask(question(6), start + ms(102));
-        assert_eq!(answered(&mut questions, start + ms(102)), (vec![], 0));
-        questions.note_read(Some(Sent::Check));
-        assert_eq!(answered(&mut questions, start + ms(103)), (vec![6], 0));
+    fn receipt_proves_answer_and_precedes_next_answer() {
+        let (mut requests, start) = (ValueRequests::default(), Instant::now());
+        requests.ask(request(5), start);
+        answered(&mut requests, start);
+        assert_eq!(requests.handle_time(start + ms(99)), Ok(false));
+        assert_eq!(requests.handle_time(start + ms(100)), Ok(true));
+        assert_eq!(requests.handle_time(start + ms(101)), Ok(false), "asked for once");
+        requests.ask(request(6), start + ms(102));
+        assert_eq!(answered(&mut requests, start + ms(102)), (vec![], 0));
+        requests.note_read(Some(ReceiptScope::Check));
+        assert_eq!(answered(&mut requests, start + ms(103)), (vec![6], 0));
     }
 
     #[test]
     fn unproved_answer_ends_connection() {
-        let (mut questions, start) = (Questions::default(), Instant::now());
-        questions.ask(question(5), start);
-        answered(&mut questions, start);
-        assert_eq!(questions.handle_time(start + ms(100)), Ok(true));
-        assert_eq!(questions.due(), Some(start + LATEST_PROOF));
-        assert!(questions.handle_time(start + LATEST_PROOF).is_err());
-        questions.ask(question(6), start + ms(900));
+        let (mut requests, start) = (ValueRequests::default(), Instant::now());
+        requests.ask(request(5), start);
+        answered(&mut requests, start);
+        assert_eq!(requests.handle_time(start + ms(100)), Ok(true));
+        assert_eq!(requests.due(), Some(start + LATEST_PROOF));
+        assert!(requests.handle_time(start + LATEST_PROOF).is_err());
+        requests.ask(request(6), start + ms(900));
         assert!(
-            questions.handle_time(start + ms(901)).is_err(),
+            requests.handle_time(start + ms(901)).is_err(),
             "a request after the first one's second proves nothing"
         );
     }
