@@ -1,12 +1,12 @@
-//! The exporter: serves the daemon's status as metrics over HTTP, from a separate process, so that no fault in it can affect
+//! The exporter: serves the daemon's status as metrics over HTTP. It is a separate process, so that no fault in it can affect
 //! the estimation loop.
 //!
-//! * `/metrics`: each scrape reads the status socket, within [`STATUS_LIMIT`]; without a fresh document the answer is
-//!   `packwatch_up 0` alone. OpenMetrics 1.0 for clients that accept it, else Prometheus' text 0.0.4.
-//! * `/`: a short page; `/-/healthy`: a sign of life.
-//! * At most [`MAX_CONNECTIONS`], and [`MAX_PER_ADDRESS`] of one client; a further one takes the place of the one that has
-//!   been idle longest ([`crate::io::places`]). Requests of at most [`MAX_REQUEST_BYTES`], with their
-//!   head within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
+//! * `/metrics`: each scrape reads the status socket within [`STATUS_LIMIT`]. Without a fresh document the answer contains
+//!   only `packwatch_up 0`. OpenMetrics 1.0 for clients that accept it, else Prometheus' text format 0.0.4.
+//! * `/`: a short page; `/-/healthy`: a liveness check.
+//! * At most [`MAX_CONNECTIONS`], and [`MAX_PER_ADDRESS`] per client address. A further connection replaces the one that has
+//!   been idle longest ([`ConnectionSlots`]). Requests may have [`MAX_REQUEST_BYTES`], and their head must arrive within
+//!   [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT stop the exporter cleanly.
 
 use std::cell::Cell;
 use std::convert::Infallible;
@@ -37,23 +37,23 @@ use super::status::client::{check_length, explain, parse};
 use super::status::document::StatusDocument;
 use super::status::metrics::{openmetrics, prometheus_text};
 
-/// Connections at once: two servers and a browser, several times over.
+/// Most connections: several times two servers and a browser.
 const MAX_CONNECTIONS: usize = 16;
-/// Connections of one address at once.
+/// Most connections of one address.
 const MAX_PER_ADDRESS: usize = 8;
-/// Longest head of a request, bytes: hyper's least.
+/// Longest head of a request, bytes; the smallest limit that hyper supports.
 const MAX_REQUEST_BYTES: usize = 8192;
-/// Headers of a request.
+/// Most headers of a request.
 const MAX_HEADERS: usize = 64;
-/// Longest wait for the head of a request; a connection that is silent for as long is closed.
+/// Longest wait for the head of a request; a connection silent for this long is closed.
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
-/// Longest life of a connection: a slow reader must not keep its place for ever.
+/// Longest life of a connection, so that a slow reader does not keep its slot for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time for the answer that is under way at that limit: as long as a scrape may take.
+/// Time to finish the current answer at that limit; as long as a scrape may take.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Time for the status of the daemon: under the ten seconds of a scrape.
+/// Time to read the daemon's status; less than the ten seconds of a scrape.
 const STATUS_LIMIT: Duration = Duration::from_secs(3);
-/// Time for running answers when the exporter stops.
+/// Time to finish running answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after a connection could not be accepted.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -65,14 +65,14 @@ const PLAIN: &str = "text/plain; charset=utf-8";
 const PAGE: &str = "<!DOCTYPE html><html lang=\"en\"><head><title>packwatch</title></head><body><h1>packwatch</h1>\
     <p><a href=\"/metrics\">metrics</a></p></body></html>\n";
 
-/// The status socket, and whether the daemon answered last time.
+/// The status socket, and whether the daemon answered the last request.
 #[derive(Debug)]
 struct StatusSource {
     path: PathBuf,
     is_up: Cell<Option<bool>>,
 }
 
-/// Serves on `listen` the status of the daemon at `socket`, until a signal.
+/// Serves the status of the daemon at `socket` on the address `listen`, until a signal.
 ///
 /// # Errors
 /// When the address cannot be bound.
@@ -88,7 +88,7 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
 async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()> {
     let mut stop = Stop::new(None)?;
     let address = listener.local_addr()?;
-    tracing::info!(%address, socket = %source.path.display(), "exporter listens");
+    tracing::info!(%address, socket = %source.path.display(), "exporter listening");
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
     let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
@@ -116,7 +116,7 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     }
     notify(&[NotifyState::Stopping]);
     drop(listener);
-    // Idle connections have nothing to finish: after a short wait all are closed.
+    // Idle connections have nothing to finish, so all connections are closed after a short wait.
     let drained = async { while connections.join_next().await.is_some() {} };
     let _ = timeout(DRAIN_LIMIT, drained).await;
     tracing::info!("exporter stopped");
@@ -140,7 +140,7 @@ async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity:
     let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
         Ok(ended) => ended,
         Err(_) => {
-            // Finishes the answer under way and accepts no further request.
+            // Finishes the current answer and accepts no further request.
             connection.as_mut().graceful_shutdown();
             timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
         }
@@ -198,14 +198,14 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
 }
 
 impl StatusSource {
-    /// Reads the daemon's status; `None` = none came in time. Logs changes.
+    /// Reads the daemon's status; `None` = not received in time. Logs changes.
     async fn read(&self) -> Option<StatusDocument> {
         let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
         let document = line.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
         let was_up = self.is_up.replace(Some(document.is_ok()));
         match &document {
             Ok(_) if was_up != Some(true) => tracing::info!("the daemon reports its status"),
-            Err(error) if was_up != Some(false) => tracing::warn!(error, "no status of the daemon"),
+            Err(error) if was_up != Some(false) => tracing::warn!(error, "no status from the daemon"),
             Ok(_) | Err(_) => {}
         }
         document.ok()
@@ -229,7 +229,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slow_clients_give_way_to_a_scrape() {
+    fn scrape_displaces_slow_clients() {
         use tokio::io::AsyncWriteExt as _;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
@@ -240,7 +240,7 @@ mod tests {
             let mut slow = Vec::new();
             for _ in 0..2 * MAX_CONNECTIONS {
                 let mut client = TcpStream::connect(address).await.unwrap();
-                // It may be refused already.
+                // The client may already have been rejected.
                 let _ = client.write_all(b"GET /met").await;
                 slow.push(client);
             }
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn openmetrics_is_for_clients_that_accept_version_1() {
+    fn openmetrics_is_sent_if_version_1_accepted() {
         for (accept, wanted) in [
             // What Prometheus 2.42 sends.
             (

@@ -1,26 +1,26 @@
-//! Why a command ended without success: the text for the terminal and the exit code, of every program of packwatch.
+//! Why a command failed: the message for the terminal and the exit code, for every program of packwatch.
 
 use crate::config::ConfigFaults;
 
 /// Exit code of a bad configuration (EX_CONFIG; systemd does not restart on it).
 pub const EXIT_CONFIG: u8 = 78;
 
-/// Why a command ended without success.
+/// Why a command failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
-    /// For the terminal, without the program's name; empty = the output reports it.
+    /// Message for the terminal, without the program's name; empty = the output already reports the failure.
     pub message: String,
     /// Exit code.
     pub code: u8,
 }
 
 impl Failure {
-    /// A failure of the work itself: exit code 1.
+    /// A failure of the work itself; exit code 1.
     pub fn new(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: 1 }
     }
 
-    /// A failure that another start does not repair: exit code 78.
+    /// A failure that another start does not fix; exit code 78.
     pub fn config(message: impl Into<String>) -> Self {
         Self { message: message.into(), code: EXIT_CONFIG }
     }

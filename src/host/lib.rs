@@ -1,5 +1,5 @@
-//! Everything that touches the computer: configuration, log files, sockets, the state store, the service and its status,
-//! control and metrics sockets, and the loops that drive the core from recorded logs.
+//! Everything that interacts with the computer: configuration, log files, sockets, the state store, the service with its
+//! status, control and metrics sockets, and the loops that run the core on recorded logs.
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 

@@ -1,6 +1,6 @@
-//! The log: to journald with fields when systemd connected standard error to it, else to standard error.
+//! The log: written to journald with fields if systemd connected standard error to it, else to standard error.
 //!
-//! The number of lines is limited in both cases (`limit`). In: a filter of `--log`. Out: log lines.
+//! In both cases the number of lines is limited (`limit`). In: a filter from `--log`. Out: log lines.
 
 mod journald;
 mod limit;
@@ -23,13 +23,13 @@ use crate::io::clock::Reading;
 use crate::io::stamp::format_utc_micros;
 use crate::quantity::Timestamp;
 
-/// Environment variable with the filter, where `--log` is not given.
+/// Environment variable with the filter, used if `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
 
-/// Lines in no log: over the limit, or rejected by journald.
+/// Lines that are in no log because they exceeded the limit or journald did not accept them.
 static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 
-/// Crates of this program that log, besides `packwatch` itself.
+/// Crates of this program that log, in addition to `packwatch` itself.
 const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch_lab", "packwatch_uplink"];
 
 /// Counts a line that is in no log.
@@ -37,7 +37,7 @@ fn note_left_out() {
     LEFT_OUT.fetch_add(1, Ordering::Relaxed);
 }
 
-/// Lines left out of the log since the last call.
+/// Lines dropped from the log since the last call.
 pub fn take_left_out() -> u64 {
     LEFT_OUT.swap(0, Ordering::Relaxed)
 }
@@ -45,14 +45,14 @@ pub fn take_left_out() -> u64 {
 /// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
 ///
 /// # Errors
-/// When the filter cannot be read.
+/// When the filter cannot be parsed.
 pub fn start(filter: Option<&str>) -> Result<(), String> {
     let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
     let registry = tracing_subscriber::registry().with(targets(&text)?);
-    // A second start (tests) keeps the first logger.
+    // A second start (in tests) keeps the first logger.
     let _ = match stderr_is_journal().then(Journal::new) {
         Some(Ok(journal)) => registry.with(journal.with_filter(RateLimit::default())).try_init(),
-        // Colours only on a terminal. An empty NO_COLOR counts as unset.
+        // Colours only on a terminal. An empty NO_COLOR counts as not set.
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
@@ -63,7 +63,7 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     Ok(())
 }
 
-/// The time of a line, UTC to the microsecond. Not tracing's own: std's `SystemTime::now` panics from 2038 on processors of 32 bits with musl.
+/// Formats the time of a line, UTC to the microsecond. tracing's own timer uses `SystemTime::now`, which panics from 2038 on 32-bit processors with musl.
 struct WallClock;
 
 impl FormatTime for WallClock {
@@ -72,7 +72,7 @@ impl FormatTime for WallClock {
     }
 }
 
-/// Reads a filter; `packwatch::MODULE` stands for that module of every member crate.
+/// Parses a filter; `packwatch::MODULE` means that module of every member crate.
 fn targets(text: &str) -> Result<Targets, String> {
     let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
     let modules = filter.iter().filter_map(|(target, level)| Some((target.strip_prefix("packwatch::")?, level)));
@@ -82,7 +82,7 @@ fn targets(text: &str) -> Result<Targets, String> {
     Ok(filter.with_targets(members))
 }
 
-/// Whether standard error is the journal. systemd names the journal's stream by device and inode.
+/// Whether standard error is the journal. systemd identifies the journal's stream by device and inode.
 fn stderr_is_journal() -> bool {
     let Ok(stream) = std::env::var("JOURNAL_STREAM") else { return false };
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.st_dev(), file.st_ino()))
@@ -94,7 +94,7 @@ mod tests {
     use tracing::Level;
 
     #[test]
-    fn a_filter_names_a_module_without_its_member_crate() {
+    fn filter_module_matches_every_member_crate() {
         let filter = targets("warn,packwatch::io=debug,packwatch_host::store=trace").unwrap();
         for (target, level, expected) in [
             ("packwatch_host::io::socket", Level::DEBUG, true),

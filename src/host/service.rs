@@ -1,8 +1,8 @@
 //! The service: runs the core on live interfaces, with a tick every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS).
 //!
-//! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core; every
-//! input is journalled before the core handles it, in that order, so that a replay of the journal gives the same frames.
-//! No fault of a bus, a disk or a service manager ends the loop; SIGTERM and SIGINT end it cleanly.
+//! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every input
+//! is written to the journal before the core handles it, so that a replay of the journal produces the same frames. No fault of
+//! a bus, a disk or the service manager ends the loop; SIGTERM and SIGINT end it cleanly.
 
 mod engine;
 mod j1939_carrier;
@@ -41,10 +41,10 @@ use live::ServiceLoop;
 use reload::Reload;
 use status_publisher::StatusPublisher;
 
-/// Frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
+/// Frames and events waiting for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
-/// Threads for work that would block the loop: reading a configuration, long answers, the fit of a model. More would only wait for the disk.
+/// Threads for work that would block the loop: reading a configuration, long answers, the fit of a cell model. More threads would only wait for the disk.
 const BLOCKING_THREADS: usize = 4;
 
 /// The settings of a run.
@@ -52,15 +52,15 @@ const BLOCKING_THREADS: usize = 4;
 pub struct Service {
     /// Checked configuration.
     pub config: Config,
-    /// Journal of every input.
+    /// Journal of all inputs.
     pub record: Option<PathBuf>,
-    /// Sizes of a journal in segments; `None` = it is one file.
+    /// Size limits of a segmented journal; `None` = one file.
     pub record_limits: Option<SegmentLimits>,
-    /// Log of the frames sent, with the time of the input that caused each.
+    /// Log of the sent frames, with the time of the input that caused each frame.
     pub frames: Option<PathBuf>,
-    /// Events as JSON, a line each.
+    /// Events as JSON lines.
     pub events: Option<PathBuf>,
-    /// State to start from.
+    /// Initial state.
     pub restore: Option<Snapshot>,
     /// Age of that state.
     pub downtime: Downtime,
@@ -74,13 +74,13 @@ pub struct Service {
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: PlaceSetting,
-    /// Where state and history are kept.
+    /// Folder of state and history.
     pub state: PlaceSetting,
     /// The status sockets.
     pub status: PlaceSetting,
     /// The configuration file, for the status document.
     pub config_file: Option<ConfigFile>,
-    /// Key of authenticated frames; `None` = none is configured.
+    /// Key of authenticated frames; `None` = not configured.
     pub key: Option<CanKey>,
 }
 
@@ -90,9 +90,9 @@ pub enum ServiceError {
     /// A file could not be written.
     #[error("{}: {error}", path.display())]
     File {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         error: io::Error,
     },
     /// The snapshot does not fit.
@@ -117,9 +117,9 @@ impl Service {
     pub fn run(self) -> Result<(), ServiceError> {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
-        // Spawned as a task: waking the future of `block_on` itself goes through the kernel, for every frame.
+        // Spawned as a task, because waking the future of `block_on` itself costs a system call per frame.
         let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
-        // A fit under way is begun again after the next start.
+        // A running fit is abandoned and started again after the next start.
         runtime.shutdown_background();
         served.unwrap_or_else(|stopped| std::panic::resume_unwind(stopped.into_panic()))
     }
@@ -130,7 +130,7 @@ impl Service {
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
-        // Before any file is opened: a second daemon must not overwrite those of the first.
+        // Before any file is opened, so that a second daemon does not overwrite the files of the first.
         let (sender_of_requests, requests) = mpsc::channel(MAX_CONNECTIONS);
         let control = ControlServer::start(&self.control, sender_of_requests).await.map_err(ServiceError::Socket)?;
         let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
@@ -138,7 +138,7 @@ impl Service {
         let (links, outputs) = self.start_links(clock, &sender);
         engine.links = outputs;
         drop(sender);
-        // The first input is the time of the start; frames it sends wait for the interfaces.
+        // The first input is the time of the start; the frames that it causes wait for the interfaces.
         engine.handle(&Record::tick(clock.now()));
         engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
@@ -203,7 +203,7 @@ fn log_commands(config: &Config) {
     }
 }
 
-/// Notifies the service manager; does nothing without one.
+/// Notifies the service manager, if there is one.
 pub(super) fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::warn!(%error, "service manager not notified");

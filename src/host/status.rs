@@ -1,22 +1,21 @@
-//! Serves the daemon's status once a second.
+//! Publishes the daemon's status once a second.
 //!
-//! Two Unix sockets that only write; nothing is ever read from a client:
+//! Two Unix sockets that only write; the daemon reads nothing from a client:
 //!
-//! | socket | what a client gets |
+//! | socket | what a client receives |
 //! | --- | --- |
-//! | `status.sock` | one [`StatusDocument`] as a line of JSON, then the end |
+//! | `status.sock` | one [`StatusDocument`] as a line of JSON, then end of file |
 //! | `status-stream.sock` | the same, one line a second, until the client closes |
 //!
-//! * Every user that can reach the sockets may read (mode 0666): the document has no secrets, and the exporter runs as a
-//!   separate user. Under the shipped unit only root and the exporter reach them, because the folder of a dynamic user's
-//!   service lies in a closed folder. Only the control socket changes something, and it is closed to other users.
-//! * Once a second the loop copies structs into a draft and offers it; a separate thread serialises it
-//!   and serves the clients. No client affects the loop's thread. A draft offered while the thread is busy is dropped and
-//!   counted.
-//! * At most [`MAX_CLIENTS`]; further ones are refused immediately and counted. A client that does not read within
+//! * Every user who can reach the sockets may read (mode 0666), because the document contains no secrets and the exporter runs
+//!   as a separate user. Under the shipped unit only root and the exporter can reach them, because the folder of a dynamic
+//!   user's service is in a closed folder. Only the control socket can change anything; other users cannot connect to it.
+//! * Once a second the loop copies structs into a draft and offers it. A separate thread serialises the draft and serves the
+//!   clients, so no client affects the loop. A draft offered while the thread is busy is dropped and counted.
+//! * At most [`MAX_CLIENTS`]; further ones are rejected immediately and counted. A client that does not read within
 //!   [`MAX_SILENCE`] is dropped and counted.
-//! * A document older than [`STALE`] is not served: a client waits for a fresh one, and gets nothing if none comes within
-//!   [`MAX_SILENCE`]. So a loop that hangs does not look healthy.
+//! * A document older than [`STALE`] is not sent: a client waits for a fresh one, and receives nothing if none arrives within
+//!   [`MAX_SILENCE`]. A loop that hangs therefore does not look healthy.
 
 pub mod client;
 pub mod collect;
@@ -38,12 +37,12 @@ pub use server::StatusServer;
 
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
-/// Clients at once, of both sockets: a display, an exporter and a few scripts, many times over; each is a descriptor and
-/// a few kilobytes.
+/// Most clients of both sockets together: many times a display, an exporter and a few scripts. Each uses a descriptor and a
+/// few kilobytes.
 pub const MAX_CLIENTS: usize = 64;
-/// Longest time in which a client has to read what it was sent.
+/// Longest time for a client to read what was sent.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);
-/// Period of the documents.
+/// Time between documents.
 pub const PERIOD: Duration = Duration::from_secs(1);
 /// Age at which a document is stale: three periods.
 pub const STALE: Duration = Duration::from_secs(3);
@@ -58,12 +57,12 @@ pub fn daemon_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
 }
 
-/// The default path at which a client looks for it.
+/// The default path at which a client looks for the socket.
 pub fn standard_path() -> PathBuf {
     client_folder().join(FILE_NAME)
 }
 
-/// The streaming socket of a status socket: `status-stream.sock` next to `status.sock`.
+/// The streaming socket that belongs to a status socket: `status-stream.sock` for `status.sock`.
 pub fn stream_path(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let name = match path.extension() {
@@ -78,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_stream_socket_is_next_to_the_status_socket() {
+    fn stream_socket_is_next_to_status_socket() {
         assert_eq!(
             stream_path(Path::new("/run/packwatch/status.sock")),
             Path::new("/run/packwatch/status-stream.sock")

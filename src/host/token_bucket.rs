@@ -1,14 +1,14 @@
-//! A bound on how often something may happen: a number at once, then one per period.
+//! Limits how often something may happen: a burst, then once per period.
 //!
-//! Bounds the rows and commits of an alarm that flickers (`store`) and the lines of the log (`logging`). In: the time of
-//! each request. Out: whether it may go. Times before the last one count as no time passed.
+//! Limits the rows and commits caused by a flickering alarm (`store`) and the lines of the log (`logging`). In: the time of
+//! each request. Out: whether it is allowed. A time before the previous one counts as no time passed.
 
 use crate::quantity::Timestamp;
 
-/// A burst and a period.
+/// Burst and period of a bucket.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BucketSize {
-    /// Tokens at once, after a long quiet time.
+    /// Tokens of a full bucket.
     pub(crate) burst: f64,
     /// Time until the next token, s.
     pub(crate) period_s: f64,
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn after_the_burst_there_is_one_per_period() {
+    fn burst_is_followed_by_one_per_period() {
         let mut bucket = TokenBucket::new(BucketSize { burst: 3.0, period_s: 10.0 });
         let taken = (0..100).filter(|&second| bucket.take(Timestamp::from_secs(f64::from(second)))).count();
         assert_eq!(taken, 3 + 9);
@@ -52,7 +52,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_quiet_time_fills_it_to_the_burst_and_no_further() {
+    fn bucket_fills_only_to_burst() {
         let mut bucket = TokenBucket::new(BucketSize { burst: 150.0, period_s: 2.0 });
         let at = |ms: u32| Timestamp::from_secs(f64::from(ms) / 1e3);
         assert_eq!((0..100_000).filter(|ms| bucket.take(at(*ms))).count(), 150 + 49);

@@ -45,7 +45,7 @@ async fn read_for_ever(path: &Path, sender: &watch::Sender<Option<Box<StatusDocu
             Err(error) => explain(path, &error),
         };
         if was_up != Some(false) {
-            tracing::warn!(error, "no status of the daemon");
+            tracing::warn!(error, "no status from the daemon");
         }
         was_up = Some(false);
         sender.send_if_modified(|document| document.take().is_some());

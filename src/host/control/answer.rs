@@ -1,4 +1,4 @@
-//! Answers to requests, from the present alarms. Pure.
+//! Answers to requests, computed from the current alarms. Pure.
 
 use super::MAX_LISTED;
 use super::protocol::{AlarmList, Answer, CommandOutcome, UnknownAlarms};
@@ -6,12 +6,12 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
 use crate::monitor::{Command, Event, EventKind, Source};
 use crate::quantity::Timestamp;
 
-/// Lists the alarms; without `all` only those that need attention: raised, about to be raised, or not yet acknowledged.
+/// Lists the alarms; without `all` only those that need attention (raised, about to be raised, or not yet acknowledged).
 pub fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
     Answer::Alarms(alarm_list(engine, time, all))
 }
 
-/// As [`list`], without the envelope.
+/// Like [`list`], without the envelope.
 pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList {
     let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_attention(alarm)).collect();
     let omitted = shorten(&mut alarms);
@@ -32,7 +32,7 @@ fn needs_attention(alarm: &Alarm) -> bool {
     }
 }
 
-/// Keeps the alarms for which an answer has room, raised ones first; returns the number of the others.
+/// Keeps the alarms that fit into an answer, raised ones first; returns the number of the others.
 fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     let omitted = alarms.len().saturating_sub(MAX_LISTED);
     if omitted > 0 {
@@ -69,10 +69,10 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// The outcome of a command, from the events it caused and the alarms after it; `is_stored` is left to the caller.
+/// The outcome of a command, from the events it caused and the alarms after it. The caller sets `is_stored`.
 ///
 /// # Errors
-/// When the core has reported none.
+/// When the core has not reported an outcome.
 pub fn outcome(
     engine: &AlarmEngine,
     command: &Command,
@@ -99,9 +99,9 @@ pub fn outcome(
 /// Why an alarm was not cleared, in words.
 pub fn refusal(alarm: &Alarm) -> &'static str {
     match alarm.state {
-        AlarmState::Suppressed => "its value is not known",
+        AlarmState::Suppressed => "its value is unknown",
         AlarmState::Clearing => "healthy again, but not yet for long enough",
-        AlarmState::Active if alarm.value.is_none() => "its value is not known",
+        AlarmState::Active if alarm.value.is_none() => "its value is unknown",
         _ => "still beyond its threshold",
     }
 }
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn alarms_at_rest_are_listed_only_on_request_and_unknown_ones_are_counted() {
+    fn quiet_alarms_are_listed_only_on_request() {
         let mut engine = engine(3);
         see(&mut engine, Rule::CapacityLow, Some(1), Some(1.9));
         see(&mut engine, Rule::CapacityLow, Some(2), Some(2.5));
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_list_keeps_the_raised_ones_and_counts_the_rest() {
+    fn long_list_keeps_raised_alarms() {
         let mut engine = engine(1024);
         see(&mut engine, Rule::TemperatureHigh, None, Some(60.0));
         let list = listed(super::list(&engine, Timestamp::ZERO, true));
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_that_matches_no_configured_alarm_gets_the_list_of_rules() {
+    fn command_without_matching_alarm_lists_rules() {
         let engine = engine(2);
         let clear = |rule, cell: Option<u16>| {
             meaningless(&engine, &Command::Clear(Selector { rule, severity: None, cell: cell.map(CellIndex) }))
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn refused_alarms_come_with_their_state() {
+    fn refused_alarms_state_the_reason() {
         let mut engine = engine(1);
         see(&mut engine, Rule::TemperatureHigh, None, Some(60.0));
         let command = Command::Clear(Selector::default());
@@ -190,6 +190,6 @@ mod tests {
         assert_eq!(refusal(&done.refused_alarms[0]), "still beyond its threshold");
         see(&mut engine, Rule::TemperatureHigh, None, None);
         let Ok(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
-        assert_eq!(refusal(&done.refused_alarms[0]), "its value is not known");
+        assert_eq!(refusal(&done.refused_alarms[0]), "its value is unknown");
     }
 }

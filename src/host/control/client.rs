@@ -1,4 +1,4 @@
-//! The client of the control socket: sends a request to a running daemon and waits for its answer. Blocking.
+//! Client of the control socket: sends a request to a running daemon and waits for its answer. Blocking.
 
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -10,9 +10,9 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// Longest wait for a list: a daemon answers between two ticks, so one that needs longer hangs.
+/// Longest wait for a list. A daemon answers between two ticks, so one that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Longest answer, bytes: a thousand alarms of 400 bytes, ten times over.
+/// Longest answer, bytes: ten times a thousand alarms of 400 bytes.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
 
 /// A daemon's control socket.
@@ -22,12 +22,12 @@ pub struct ControlClient {
 }
 
 impl ControlClient {
-    /// The socket at `path`; `None` = at the standard path.
+    /// The socket at `path`; `None` = the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
-    /// Whether a daemon may listen there: false only for a missing or abandoned socket.
+    /// Whether a daemon may be listening; false only for a missing or abandoned socket.
     pub fn is_served(&self) -> bool {
         let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
         UnixStream::connect(&self.path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)
@@ -36,7 +36,7 @@ impl ControlClient {
     /// Sends a request; returns the answer as a line of JSON.
     ///
     /// # Errors
-    /// When no daemon answers: names the socket and the remedy.
+    /// When no daemon answers; names the socket and the next step.
     pub fn ask_line(&self, request: Request) -> Result<Vec<u8>, String> {
         self.exchange(request).map_err(|error| self.explain(request, &error))
     }
@@ -53,7 +53,7 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // A daemon without a free place may have answered and closed already.
+        // A daemon without a free slot may already have answered and closed.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;
@@ -71,8 +71,8 @@ impl ControlClient {
         let path = self.path.display();
         match error.kind() {
             ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-                "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or name its socket with \
-                 --control"
+                "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its \
+                 socket with --control"
             ),
             ErrorKind::PermissionDenied => {
                 format!("{path}: permission denied; the daemon's own user, its group and root may connect")

@@ -1,14 +1,14 @@
-//! Requests and answers of the control socket, a line of JSON each.
+//! Requests and answers of the control socket, one line of JSON each.
 //!
 //! | request | keys | answer |
 //! | --- | --- | --- |
-//! | `alarms` | `all` (false): includes those at rest | [`AlarmList`] |
-//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects every | [`CommandOutcome`] |
+//! | `alarms` | `all` (default false): includes quiet alarms | [`AlarmList`] |
+//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects all | [`CommandOutcome`] |
 //! | `pack_replaced` | | [`CommandOutcome`] |
-//! | `poll` | `standby`: no diagnostic requests are sent | [`CommandOutcome`] |
+//! | `poll` | `standby`: stops sending diagnostic requests | [`CommandOutcome`] |
 //! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
-//! Every line has `version`. Anything else gets an error with the value found and the values allowed.
+//! Every line has `version`. Any other line gets an error with the value found and the values allowed.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -30,45 +30,45 @@ const REQUESTS: [(&str, &[&str]); 6] = [
     ("test", &["rule", "seconds"]),
 ];
 
-/// A request of a client.
+/// A client's request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Request {
-    /// Lists the present alarms.
+    /// Lists the current alarms.
     Alarms {
-        /// Includes alarms at rest.
+        /// Whether to include quiet alarms.
         all: bool,
     },
     /// A command, which changes something.
     Command(Command),
 }
 
-/// An answer of the daemon.
+/// The daemon's answer.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
     /// The answer to `alarms`.
     Alarms(AlarmList),
     /// The answer to a command.
     Outcome(CommandOutcome),
-    /// The request failed: the value found, the values allowed.
+    /// The request failed; states the value found and the values allowed.
     Error(String),
 }
 
-/// The present alarms.
+/// The current alarms.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AlarmList {
     /// Time, on the daemon's clock.
     pub time: Timestamp,
-    /// Thresholds configured.
+    /// Number of configured thresholds.
     pub thresholds: usize,
     /// Thresholds with alarms that cannot be evaluated.
     pub unknown: Vec<UnknownAlarms>,
-    /// Alarms, in the order rule, severity, cell.
+    /// Alarms, ordered by rule, severity and cell.
     pub alarms: Vec<Alarm>,
-    /// Number of further alarms, for which there was no room.
+    /// Number of further alarms that did not fit.
     pub omitted: usize,
 }
 
-/// Alarms of one threshold that cannot be evaluated, because their value is not known.
+/// The alarms of one threshold that cannot be evaluated because their value is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct UnknownAlarms {
     /// The rule.
@@ -84,19 +84,19 @@ pub struct UnknownAlarms {
 pub struct CommandOutcome {
     /// Time, on the daemon's clock.
     pub time: Timestamp,
-    /// Alarms changed.
+    /// Number of alarms that were changed.
     pub changed: u32,
-    /// Number of refusals: alarms that are not healthy, a test without output.
+    /// Number of refusals: alarms that are not healthy, or a test without output.
     pub refused: u32,
     /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,
-    /// Whether its changes are on the disk: a power cut does not undo them. `None` = nothing changed that is stored, or no
-    /// state is kept.
+    /// Whether its changes are on disk, so that a power cut does not undo them. `None` = nothing stored has changed, or no state
+    /// is kept.
     #[serde(default)]
     pub is_stored: Option<bool>,
 }
 
-/// The keys of every answer, with its contents.
+/// The keys that every answer has, and its contents.
 #[derive(Serialize)]
 struct Envelope<'a, T> {
     version: u64,
@@ -109,9 +109,9 @@ impl Request {
     /// Parses a line.
     ///
     /// # Errors
-    /// The value found and the values allowed.
+    /// States the value found and the values allowed.
     pub fn parse(line: &[u8]) -> Result<Self, String> {
-        let value: Value = serde_json::from_slice(line).map_err(|error| format!("no JSON document: {error}"))?;
+        let value: Value = serde_json::from_slice(line).map_err(|error| format!("not a JSON document: {error}"))?;
         let Value::Object(mut keys) = value else { return Err(format!("found {value}, must be a JSON object")) };
         match keys.remove("version") {
             Some(version) if version.as_u64() == Some(VERSION) => {}
@@ -183,9 +183,9 @@ impl Answer {
 /// Parses the contents of an answer.
 ///
 /// # Errors
-/// The error in the answer, or its fault.
+/// The error in the answer, or why the answer is not valid.
 pub fn contents<T: for<'de> Deserialize<'de>>(line: &[u8]) -> Result<T, String> {
-    let strange = |what: String| format!("the daemon's answer is not understood: {what}");
+    let strange = |what: String| format!("unexpected answer of the daemon: {what}");
     let value: Value = serde_json::from_slice(line).map_err(|error| strange(error.to_string()))?;
     if value.get("version").and_then(Value::as_u64) != Some(VERSION) {
         return Err(strange(must_be("version", value.get("version"), &VERSION.to_string())));
@@ -207,7 +207,7 @@ fn must_be(key: &str, found: Option<&Value>, allowed: &str) -> String {
 fn only_keys(keys: &Map<String, Value>, allowed: &[&str]) -> Result<(), String> {
     match keys.keys().find(|key| !allowed.contains(&key.as_str())) {
         None => Ok(()),
-        Some(key) if allowed.is_empty() => Err(format!("{key} is not a key of this request, it has none")),
+        Some(key) if allowed.is_empty() => Err(format!("{key} is not a key of this request, which has no keys")),
         Some(key) => Err(format!("{key} is not a key of this request, must be {}", allowed.join(", "))),
     }
 }
@@ -234,16 +234,16 @@ mod tests {
     }
 
     #[test]
-    fn every_request_is_read_as_it_was_written() {
+    fn every_request_round_trips() {
         for request in requests() {
             assert_eq!(Request::parse(request.to_line().as_bytes()), Ok(request));
         }
     }
 
     #[test]
-    fn an_error_names_the_value_found_and_the_values_allowed() {
+    fn error_states_found_and_allowed_values() {
         let fault = |line: &str| Request::parse(line.as_bytes()).unwrap_err();
-        assert!(fault("").starts_with("no JSON document"), "{}", fault(""));
+        assert!(fault("").starts_with("not a JSON document"), "{}", fault(""));
         assert_eq!(fault("[1]"), "found [1], must be a JSON object");
         assert_eq!(fault("{}"), "version is missing, must be 1");
         assert_eq!(fault(r#"{"version":2,"request":"alarms"}"#), "version = 2, must be 1");
@@ -261,7 +261,7 @@ mod tests {
         );
         assert_eq!(
             fault(r#"{"version":1,"request":"pack_replaced","cell":1}"#),
-            "cell is not a key of this request, it has none"
+            "cell is not a key of this request, which has no keys"
         );
         assert!(
             fault(r#"{"version":1,"request":"clear","rule":"soc"}"#)
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_is_its_contents_or_its_error() {
+    fn answer_gives_contents_or_error() {
         let done = CommandOutcome {
             time: Timestamp::from_secs(1.5),
             changed: 2,

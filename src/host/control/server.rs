@@ -1,4 +1,4 @@
-//! The server of the control socket: accepts connections, passes requests to the loop and sends its answers back.
+//! Server of the control socket: accepts connections, passes requests to the loop and returns the loop's answers.
 
 use std::time::{Duration, Instant};
 
@@ -16,7 +16,7 @@ use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
-/// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
+/// Pause after a connection could not be accepted (no descriptor left); an immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
 /// A request on its way to the loop.
@@ -28,7 +28,7 @@ pub struct PendingRequest {
     pub answer: oneshot::Sender<Answer>,
 }
 
-/// The running socket; dropping this closes it and deletes its file.
+/// The running socket. Dropping this closes it and deletes its file.
 #[derive(Debug)]
 pub struct ControlServer {
     _tasks: JoinSet<()>,
@@ -36,10 +36,10 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Opens the socket, which feeds `requests`. `None` = there is none, which is logged.
+    /// Opens the socket, whose requests go to `requests`. `None` = there is no socket (logged).
     ///
     /// # Errors
-    /// When another daemon uses it, or a requested one cannot be created.
+    /// When another daemon uses it, or a requested socket cannot be created.
     pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {
@@ -56,7 +56,7 @@ impl ControlServer {
         requests: mpsc::Sender<PendingRequest>,
         max_silence: Duration,
     ) -> std::io::Result<Self> {
-        // The daemon's own user as the kernel reports it, in the same form as a peer's.
+        // The daemon's own user, as the kernel reports it for a peer.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");
         let mut tasks = JoinSet::new();
@@ -65,7 +65,7 @@ impl ControlServer {
     }
 }
 
-/// Shared by all connections.
+/// State shared by all connections.
 #[derive(Debug, Clone)]
 struct ConnectionContext {
     requests: mpsc::Sender<PendingRequest>,
@@ -104,9 +104,9 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
     }
 }
 
-/// Refuses a connection; sends the reason only if that does not block.
+/// Rejects a connection; sends the reason only if that does not block.
 fn refuse(stream: &UnixStream) {
-    tracing::warn!(limit = MAX_CONNECTIONS, "connection to the control socket refused: too many at once");
+    tracing::warn!(limit = MAX_CONNECTIONS, "connection to the control socket rejected: too many at once");
     let error = format!("{MAX_CONNECTIONS} connections are open, which is the limit; try again later");
     let _ = stream.try_write(&Answer::Error(error).to_line());
 }
@@ -118,19 +118,19 @@ async fn serve_connection(stream: UnixStream, peer: UCred, context: &ConnectionC
     let mut line = Vec::new();
     loop {
         line.clear();
-        // One byte more than allowed shows a line that is too long.
+        // One byte more than allowed, to detect a line that is too long.
         let mut limited = (&mut reader).take(MAX_REQUEST_BYTES as u64 + 1);
         match timeout(context.max_silence, limited.read_until(b'\n', &mut line)).await {
             Ok(Ok(0) | Err(_)) => return,
             Ok(Ok(_)) => {}
             Err(_) => {
                 let limit = context.max_silence.as_secs_f64();
-                let silent = Answer::Error(format!("no request within {limit} s, the connection is closed"));
+                let silent = Answer::Error(format!("no request within {limit} s, connection closed"));
                 return drop(send(&mut write, silent, context).await);
             }
         }
         if line.len() > MAX_REQUEST_BYTES {
-            let long = format!("a request of more than {MAX_REQUEST_BYTES} bytes, must be a line of at most that many");
+            let long = format!("request too long, must be a line of at most {MAX_REQUEST_BYTES} bytes");
             return drop(send(&mut write, Answer::Error(long), context).await);
         }
         let answer = match Request::parse(&line) {
@@ -166,9 +166,9 @@ async fn ask(context: &ConnectionContext, request: Request) -> Answer {
     answered.await.unwrap_or_else(|_| stopping())
 }
 
-/// Writes an answer; an error ends the connection, also when the client does not read in time.
+/// Writes an answer. An error ends the connection; it is also returned if the client does not read in time.
 async fn send(write: &mut OwnedWriteHalf, answer: Answer, context: &ConnectionContext) -> std::io::Result<()> {
-    // Serialising a long list takes milliseconds: not on the thread of the loop.
+    // Serialising a long list takes milliseconds, so it does not run on the loop's thread.
     let line = tokio::task::spawn_blocking(move || answer.to_line()).await?;
     timeout(context.max_silence, write.write_all(&line)).await.unwrap_or_else(|late| Err(late.into()))
 }

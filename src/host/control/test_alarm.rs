@@ -1,7 +1,7 @@
-//! Tests a rule's alarm from outside: asks the daemon to send it and listens for the frames that are really sent.
+//! Tests a rule's alarm from outside: asks the daemon to send it and listens for the frames on the bus.
 //!
-//! In: the configuration of the daemon, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames come with the kernel's
-//! stamps, from a separate socket. Alarm frames without the test marker are genuine alarms; they are counted separately.
+//! In: the daemon's configuration, a rule, a duration. Out: a [`ChannelReport`] per interface. Frames are received on a separate
+//! socket with the kernel's stamps. Alarm frames without the test marker are genuine alarms and are counted separately.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -21,7 +21,7 @@ use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Command, RecordKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Period of reading the sockets; stamps are the kernel's, so nothing depends on it.
+/// Period of reading the sockets; results do not depend on it because stamps are the kernel's.
 const READ_PERIOD: Duration = Duration::from_millis(10);
 /// Longest delay of the last frame after the end of the test: fifty ticks of the daemon.
 const GRACE: Duration = Duration::from_millis(500);
@@ -29,36 +29,36 @@ const GRACE: Duration = Duration::from_millis(500);
 /// The alarm frames of one interface.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChannelReport {
-    /// Its interface.
+    /// Interface.
     pub interface: String,
     /// Identifier.
     pub id: CanId,
-    /// The frames seen.
+    /// The observed frames.
     pub observed: ObservedFrames,
-    /// Statuses of the end-to-end check of all frames; `None` = they are not protected.
+    /// Results of the end-to-end check of all frames; `None` = the frames are not protected.
     pub protection: Option<StatusCounts>,
-    /// Frames the kernel dropped.
+    /// Frames dropped by the kernel.
     pub dropped: u64,
     /// Why listening ended early.
     pub error: Option<String>,
 }
 
-/// Counts of frames.
+/// Counts of observed frames.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ObservedFrames {
-    /// Frames of the rule, with the marker.
+    /// Frames of the tested rule with the test marker.
     pub tests: u64,
-    /// Time of the first of them.
+    /// Time of the first of these.
     pub first: Option<Timestamp>,
-    /// Time of the last.
+    /// Time of the last of these.
     pub last: Option<Timestamp>,
-    /// Whether one of them reported the end of the test.
+    /// Whether one of these reported the end of the test.
     pub ended: bool,
-    /// Frames of other rules, with the marker: another test runs.
+    /// Frames of other rules with the test marker: another test is running.
     pub foreign: u64,
-    /// Frames without the marker, by the numbers of rule and state.
+    /// Frames without the marker, by the codes of rule and state.
     pub genuine: BTreeMap<(u8, u8), u64>,
-    /// Frames that could not be read.
+    /// Frames that could not be decoded.
     pub unreadable: u64,
 }
 
@@ -68,7 +68,7 @@ impl ChannelReport {
         self.observed.tests > 0 && self.error.is_none() && self.is_intact()
     }
 
-    /// Whether every frame was intact and none was missing; true without protection.
+    /// Whether every frame was intact and none was missing; true for unprotected frames.
     pub fn is_intact(&self) -> bool {
         let good = [Status::Ok, Status::Initial];
         self.protection.is_none_or(|counts| counts.iter().all(|(status, count)| count == 0 || good.contains(&status)))
@@ -89,14 +89,14 @@ impl AlarmReader {
         Some(Self { rule: plan("Rule")?, state: plan("State")?, test: plan("Test")? })
     }
 
-    /// Rule, state and marker; `None` = the frame is too short, or the number of its rule is too high.
+    /// Rule, state and marker; `None` = the frame is too short, or the rule's code is too large.
     fn read(&self, frame: &Frame) -> Option<(u8, u8, bool)> {
         let raw = |plan: &SignalPlan| plan.raw(frame.data()).ok().and_then(|code| u8::try_from(code).ok());
         Some((raw(&self.rule)?, raw(&self.state)?, raw(&self.test)? != 0))
     }
 }
 
-/// One channel during the test.
+/// One interface during the test.
 struct MonitoredChannel {
     tap: PassiveSocket,
     reader: AlarmReader,
@@ -149,10 +149,10 @@ impl ObservedFrames {
     }
 }
 
-/// Runs the test; `SIGINT` and `SIGTERM` end it early, also in the daemon.
+/// Runs the test. `SIGINT` and `SIGTERM` end it early, also in the daemon.
 ///
 /// # Errors
-/// When there is no channel, an interface cannot be opened, or the daemon refuses.
+/// When no alarm frame is configured, an interface cannot be opened, or the daemon refuses.
 pub fn run(
     config: &Config,
     client: &ControlClient,
@@ -166,10 +166,10 @@ pub fn run(
     Ok(channels.into_iter().map(|channel| channel.report).collect())
 }
 
-/// Opens a socket per channel, before anything is sent.
+/// Opens a socket per interface before the daemon sends anything.
 fn open(config: &Config) -> Result<Vec<MonitoredChannel>, String> {
     let path = config.path.display();
-    let nothing = || format!("{path}: nothing is sent, must have a table [output] that is enabled");
+    let nothing = || format!("{path}: no frames are sent, must have an enabled table [output]");
     let output = config.monitor.output.as_ref().ok_or_else(nothing)?;
     let layout = config.output_layout.as_ref().ok_or_else(nothing)?;
     let message = layout.message(crate::can::encode::LayoutMessage::Alarm.message()).ok_or_else(nothing)?;
@@ -234,7 +234,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn genuine_frames_are_never_taken_for_tests() {
+    fn genuine_frames_do_not_count_as_tests() {
         let mut observed = ObservedFrames::default();
         let rule = Rule::SocLow;
         let at = |seconds: f64| Timestamp::from_secs(seconds);
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_channel_without_a_frame_or_with_a_broken_counter_is_not_good() {
+    fn missing_frame_or_counter_fault_is_not_good() {
         use crate::can::e2e::{Profile, Protection};
         let protection = Protection { profile: Profile::P01A, data_id: 0x123 };
         let config = CheckConfig::new(protection);

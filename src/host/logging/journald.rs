@@ -1,9 +1,9 @@
 //! Log lines as journal entries with fields, over journald's native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
 //!
 //! An entry has `MESSAGE` (the text, with the fields as `name=value`, so that `systemctl status` shows them), `PRIORITY`,
-//! `SYSLOG_IDENTIFIER`, `TARGET`, its place in the source, each field as `PACKWATCH_NAME`, and for messages that programs
-//! search for a `MESSAGE_ID`. Nothing here blocks: an entry that a stalled journald does not accept is dropped and counted,
-//! so that the estimation loop, which logs, continues.
+//! `SYSLOG_IDENTIFIER`, `TARGET`, its source location, each field as `PACKWATCH_NAME`, and, for messages that programs search
+//! for, a `MESSAGE_ID`. Nothing here blocks: an entry that a stalled journald does not accept is dropped and counted, so that
+//! the estimation loop, which also logs, continues.
 
 use std::fmt::{self, Write as _};
 use std::io::{self, ErrorKind};
@@ -17,16 +17,16 @@ use super::note_left_out;
 
 /// The socket of journald.
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// Longest value, bytes; an entry of a few of them fits a datagram.
+/// Longest value, bytes. An entry with a few such values fits into a datagram.
 const MAX_VALUE: usize = 8 * 1024;
 /// Permanent ids of messages that programs search for (`journalctl MESSAGE_ID=...`), by their text.
 const MESSAGE_IDS: [(&str, &str); 3] = [
     ("alarm raised", "7a9c9a5d3bc5449eb08f6ca450cbf382"),
     ("alarm cleared", "15d731239a594556adf6d13cc7b79ac2"),
-    ("configuration refused, the old one stays", "870d888fffdd45d08f0fbc3c3a1489e9"),
+    ("configuration rejected, the old one stays", "870d888fffdd45d08f0fbc3c3a1489e9"),
 ];
 
-/// See the module.
+/// The connection to journald.
 #[derive(Debug)]
 pub(super) struct Journal {
     socket: UnixDatagram,
@@ -36,11 +36,11 @@ impl Journal {
     /// Connects to the running journald.
     ///
     /// # Errors
-    /// When there is none, or its socket cannot be reached.
+    /// When journald is not running, or its socket cannot be reached.
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // journald ignores an empty datagram; sending it fails when journald does not listen. A full queue means it does.
+        // journald ignores an empty datagram. Sending one fails if journald does not listen; a full queue means that it does.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),
@@ -50,7 +50,7 @@ impl Journal {
 
 impl<S: Subscriber> Layer<S> for Journal {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        // Not connected: journald may have been restarted.
+        // The socket is not connected, because journald may be restarted.
         if self.socket.send_to(&entry(event), SOCKET).is_err() {
             note_left_out();
         }
@@ -80,7 +80,7 @@ fn entry(event: &Event<'_>) -> Vec<u8> {
     entry
 }
 
-/// The priority of syslog.
+/// The syslog priority.
 fn priority(level: Level) -> &'static str {
     match level {
         Level::ERROR => "3",
@@ -90,7 +90,7 @@ fn priority(level: Level) -> &'static str {
     }
 }
 
-/// `PACKWATCH_CELL` for `cell`; journald allows capital letters, digits and underscores.
+/// `PACKWATCH_CELL` for `cell`. journald allows capital letters, digits and underscores.
 fn field_name(name: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
     format!("PACKWATCH_{}", name.chars().map(allowed).collect::<String>())
@@ -148,7 +148,7 @@ mod tests {
     use std::sync::{Arc, Mutex};
     use tracing_subscriber::layer::SubscriberExt;
 
-    /// Captures entries as journald would get them.
+    /// Captures entries as journald would receive them.
     #[derive(Clone, Default)]
     struct CapturedEntries(Arc<Mutex<Vec<Vec<u8>>>>);
 
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn an_alarm_has_its_fields_its_priority_and_its_id() {
+    fn alarm_entry_has_fields_priority_and_id() {
         let cell = Some(3_u32);
         let entry = entry_of(|| tracing::warn!(rule = ?"capacity_low", cell, value = 1.5, "{}", "alarm raised"));
         let has = |line: &str| assert!(entry.lines().any(|found| found == line), "no {line} in {entry}");
@@ -180,20 +180,20 @@ mod tests {
     }
 
     #[test]
-    fn a_message_with_other_text_has_no_id() {
+    fn other_message_has_no_id() {
         let entry = entry_of(|| tracing::info!("alarm still raised, value unknown"));
         assert!(!entry.contains("MESSAGE_ID") && entry.contains("PRIORITY=6"), "{entry}");
     }
 
     #[test]
-    fn a_value_with_line_feeds_cannot_make_fields_of_its_own() {
+    fn value_with_line_feeds_cannot_inject_fields() {
         let entry = entry_of(|| tracing::error!(error = "a\nPRIORITY=0", "bad"));
         let wanted = "PACKWATCH_ERROR\n\u{c}\0\0\0\0\0\0\0a\nPRIORITY=0\n";
         assert!(entry.contains(wanted), "{entry:?}");
     }
 
     #[test]
-    fn a_long_value_is_cut_between_characters() {
+    fn long_value_is_cut_between_characters() {
         let mut entry = Vec::new();
         put(&mut entry, "X", &"\u{20ac}".repeat(MAX_VALUE));
         assert!(entry.len() <= MAX_VALUE + 3 && String::from_utf8(entry).is_ok());

@@ -1,4 +1,4 @@
-//! The core with its journal, its log, its files and its store. In: one input. Out: its frames and events, dispatched.
+//! The core with its journal, log, files and store. In: one input. Out: frames and events, dispatched.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -26,12 +26,12 @@ use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
 use crate::store::{HISTORY_SOURCE, STATE_SOURCE, StateCandidate, Store, StoreProgress};
 
-/// The core with everything that receives its outputs.
+/// The core and everything that receives its outputs.
 #[derive(Debug)]
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
     pub(super) outputs: Outputs,
-    /// Where its frames go; empty before the start and after the stop.
+    /// Where its frames are sent; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
     /// Key of authenticated frames.
     key: Option<CanKey>,
@@ -40,30 +40,30 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
-    /// A file failed and was closed.
+    /// Whether a file failed and was closed.
     has_lost_file: bool,
     /// State and history.
     store: Option<Store>,
     /// Whether the store can be written.
     store_works: bool,
-    /// Whether the disk has room for more than what is urgent.
+    /// Whether the disk has room for more than urgent data.
     has_room: bool,
     /// Whether files can be written, as last reported to the core.
     reported_works: Option<bool>,
     barrier: CommitBarrier,
-    /// Frames have come since the last checkpoint.
+    /// Whether frames have arrived since the last checkpoint.
     is_fresh: bool,
     pub(super) readiness: Readiness,
     /// The latest events, for the status document.
     pub(super) recent: RecentEvents,
-    /// Progress of the store; `None` = not reported yet.
+    /// Progress of the store; `None` = not yet reported.
     progress: Option<StoreProgress>,
-    /// Announcements that were sent before they were stored.
+    /// Results that were announced before they were stored.
     late: u64,
 }
 
 impl Engine {
-    /// Opens store and files, and restores the state.
+    /// Opens the store and the files, and restores the state.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
         let (store, found) =
             Store::open(&service.state, &service.config.store, &service.config.vehicle).map_err(ServiceError::Store)?;
@@ -71,7 +71,7 @@ impl Engine {
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
         let mut stamped_s = 0.0;
-        // Before any file is opened: a failed start keeps the recording of an earlier run.
+        // Before any file is opened, so that a failed start keeps the recording of an earlier run.
         let (downtime, unfit) = if let Some(snapshot) = service.restore.take() {
             stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.downtime)?;
@@ -124,8 +124,8 @@ impl Engine {
         })
     }
 
-    /// Handles one record; checks the authenticator of a frame first, where it has one. Returns the ticket of the commit of what
-    /// it changed; `None` = nothing that is stored, or nothing is stored.
+    /// Handles one record; checks the authenticator of an authenticated frame first. Returns the ticket of the commit for what
+    /// the record changed; `None` = nothing to store, or no store.
     pub(super) fn handle(&mut self, record: &Record) -> Option<u64> {
         if let RecordKind::Frame { bus, frame } = &record.kind
             && let Some(check) = self.monitor.mac_check(*bus, frame)
@@ -145,10 +145,10 @@ impl Engine {
         self.dispatch_outputs(record.time)
     }
 
-    /// Gives the core another configuration, and journals that.
+    /// Applies another configuration to the core, and records that in the journal.
     ///
     /// # Errors
-    /// Why the core rejects it; then nothing has changed.
+    /// Why the core rejects it; nothing has changed then.
     pub(super) fn reconfigure(&mut self, config: MonitorConfig, time: Timestamp) -> Result<Reconfigured, Vec<String>> {
         self.outputs.clear();
         let changed =
@@ -158,8 +158,8 @@ impl Engine {
         Ok(changed)
     }
 
-    /// Sends the core's frames to the interfaces and its events to the log, and both to their files. Returns the ticket of
-    /// their commit.
+    /// Sends the core's frames to the interfaces and its events to the log, and writes both to their files. Returns the ticket
+    /// of their commit.
     fn dispatch_outputs(&mut self, time: Timestamp) -> Option<u64> {
         let ticket = self.commit_learned(time);
         for transmit in &self.outputs.frames {
@@ -180,7 +180,7 @@ impl Engine {
         ticket
     }
 
-    /// Commits learned results; their announcement waits for the commit, unless the store has failed.
+    /// Commits learned results. Their announcement waits for the commit unless the store has failed.
     fn commit_learned(&mut self, now: Timestamp) -> Option<u64> {
         let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
         if self.store_works {
@@ -189,7 +189,7 @@ impl Engine {
         Some(ticket)
     }
 
-    /// The progress of the store, with every change; `None` = there is no store.
+    /// The store's progress, updated with every change; `None` = no store.
     pub(super) fn store_progress(&self) -> Option<watch::Receiver<StoreProgress>> {
         self.store.as_ref().map(Store::progress)
     }
@@ -202,11 +202,11 @@ impl Engine {
         self.report_store_health(time);
     }
 
-    /// The store, for the status document.
+    /// The store's status, for the status document.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
         let path = match &self.store {
             Some(store) => store.folder().display().to_string(),
-            // A store that cannot be opened is reported as such, not as "none".
+            // A store that cannot be opened is reported as failed, not as absent.
             None if !self.store_works => String::new(),
             None => return None,
         };
@@ -222,16 +222,16 @@ impl Engine {
         })
     }
 
-    /// Sends all held frames: the daemon stops.
+    /// Sends all held frames when the daemon stops.
     pub(super) fn release_all(&mut self) {
         self.barrier.release(u64::MAX, |transmit| send(&self.links, self.key.as_ref(), transmit));
     }
 
-    /// Sends frames that have waited too long, and gives the store its checkpoints; called with every tick.
+    /// Sends frames that have waited too long, and lets the store write its checkpoints; called with every tick.
     pub(super) fn poll_store(&mut self, time: Timestamp) {
         if let Some(ticket) = self.barrier.overdue(Instant::now()) {
             self.barrier.release(ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
-            tracing::warn!("the disk is slow: announced before it was stored");
+            tracing::warn!("slow disk: results announced before they were stored");
             self.late += 1;
             self.store_works = false;
         }
@@ -243,9 +243,9 @@ impl Engine {
         self.report_store_health(time);
     }
 
-    /// Reports to the core whether files can be written, when that has changed.
+    /// Reports to the core whether files can be written, if that has changed.
     pub(super) fn report_store_health(&mut self, time: Timestamp) {
-        // The lost file may be the journal; the core gets the input anyway.
+        // The core receives this input even if the lost file is the journal.
         let works = self.store_works && self.has_room && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
@@ -253,7 +253,7 @@ impl Engine {
         }
     }
 
-    /// Writes the last state to the disk.
+    /// Writes the last state to disk.
     pub(super) fn close_store(&mut self, time: Timestamp) {
         if let Some(store) = self.store.take() {
             store.finish(&self.monitor, time);
@@ -272,38 +272,38 @@ impl Engine {
         let events = self.events.take().map(|file| ("events", file));
         for (what, file) in record.into_iter().chain(frames).chain(events) {
             if let Err(error) = file.finish() {
-                tracing::error!(what, %error, "file is not complete");
+                tracing::error!(what, %error, "file is incomplete");
             }
         }
     }
 }
 
-/// Sends a frame, with its authenticator where it has one.
+/// Sends a frame, with its authenticator if it has one.
 fn send(links: &[LinkOutput], key: Option<&CanKey>, transmit: &Transmit) {
     let Some(link) = links.get(transmit.bus.index()) else { return };
     match (transmit.secured, key) {
         (None, _) => link.send(transmit.frame),
         (Some(secured), Some(key)) => link.send(secured.seal(&transmit.frame, |bytes| key.mac(bytes))),
-        // Cannot be: the start fails without a key. A frame without its authenticator is never sent.
+        // Unreachable because the start fails without a key. A frame without its authenticator must never be sent.
         (Some(_), None) => {}
     }
 }
 
-/// A new state with what the history knows of the cells; `None` = it knows nothing of these cells.
+/// A new state with the learned values in the history; `None` = the history has none for these cells.
 fn state_of_history(config: &MonitorConfig, learned: &[LearnedCell]) -> Option<StateCandidate> {
     if learned.is_empty() {
         return None;
     }
     let mut monitor = Monitor::new(config.clone());
     if !monitor.relearn(learned) {
-        tracing::warn!("the learned values in the history are of other cells: not used");
+        tracing::warn!("learned values in the history belong to other cells, not used");
         return None;
     }
     Some(StateCandidate { snapshot: monitor.snapshot(), downtime: Downtime::Unknown, source: HISTORY_SOURCE })
 }
 
-/// Restores the first stored state that validates. Returns its age, and why the database's state does not fit, if it does
-/// not. Writes the state next to a journal, which starts from it.
+/// Restores the first valid stored state. Returns its age, and why the database's state does not fit if it does not. Writes the
+/// state next to a journal, because a replay of the journal starts from it.
 fn restore_first_valid(
     monitor: &mut Monitor,
     states: Vec<StateCandidate>,
@@ -317,24 +317,24 @@ fn restore_first_valid(
             Ok(()) => {
                 tracing::info!(source, away = %downtime, "state restored");
                 if let Some(Err(error)) = written {
-                    tracing::error!(%error, "the state from which this record starts was not written next to it");
+                    tracing::error!(%error, "initial state of the journal not written next to it");
                 }
                 return (Some(downtime), unfit);
             }
             Err(error) => {
-                tracing::error!(source, %error, "a stored state does not fit and is not used");
+                tracing::error!(source, %error, "stored state does not fit, not used");
                 unfit = unfit.or_else(|| (source == STATE_SOURCE).then(|| error.to_string()));
             }
         }
     }
-    tracing::info!("no stored state: nothing is known of the cells yet");
+    tracing::info!("no stored state: nothing learned about the cells yet");
     (None, unfit)
 }
 
-/// Writes to a file, if there is one. A file that cannot be written is closed; then returns `true`.
+/// Writes to a file, if there is one. If the file cannot be written, closes it and returns `true`.
 fn write_or_stop<F>(file: &mut Option<F>, what: &str, write: impl FnOnce(&mut F) -> io::Result<()>) -> bool {
     let Some(Err(error)) = file.as_mut().map(write) else { return false };
-    tracing::error!(what, %error, "file closed: it cannot be written");
+    tracing::error!(what, %error, "file cannot be written, closed");
     *file = None;
     true
 }

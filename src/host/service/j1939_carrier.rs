@@ -1,13 +1,13 @@
-//! Logs which program carries J1939: packwatch itself, frame by frame, so that a replay gives the same frames. The log
-//! line also says whether the kernel's own stack is loaded, for users who look for the node there.
+//! Logs what carries J1939: packwatch itself, frame by frame, so that a replay produces the same frames. The log line also
+//! states whether the kernel's J1939 stack is loaded, for users who look for the node there.
 
-/// Logs one line. A kernel that loads its stack on first use does not list it before.
+/// Logs one line. A kernel that loads its stack on first use does not list it before that.
 pub(super) fn log_kernel_stack() {
     let kernel_stack = stack_state(std::fs::read_to_string("/proc/net/protocols").ok().as_deref());
     tracing::info!(kernel_stack, "J1939 carried by packwatch itself over raw CAN");
 }
 
-/// The state of the stack in the list; `None` = the list could not be read.
+/// The stack's state according to the kernel's list of protocols; `None` = the list could not be read.
 fn stack_state(protocols: Option<&str>) -> &'static str {
     let is_listed = |list: &str| list.lines().any(|line| line.split_whitespace().next() == Some("CAN_J1939"));
     match protocols.map(is_listed) {
@@ -22,7 +22,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_kernels_stack_is_found_in_its_list_of_protocols() {
+    fn kernel_stack_is_found_in_protocol_list() {
         let list = "protocol  size sockets  memory press maxhdr  slab module     cl co\nPACKET    1600      0      -1   NI       0   no   kernel      y  n\n";
         assert_eq!(stack_state(Some(list)), "not loaded");
         let with_stack = format!("{list}CAN_J1939  896      1      -1   NI       0   no   can_j1939   n  n\n");

@@ -1,4 +1,4 @@
-//! The service loop: passes received frames, ticks, commands and configurations to the core, in their order.
+//! The service loop: passes received frames, ticks, commands and configurations to the core, in order.
 
 use std::path::Path;
 use std::time::Duration;
@@ -24,7 +24,7 @@ use crate::monitor::{Command, Record, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
-/// Records handled between two checks of the timer: under one tick's time of a full bus.
+/// Records handled between two checks of the timer; a full bus delivers fewer during one tick.
 const BATCH: usize = 256;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
@@ -41,7 +41,7 @@ pub(super) struct ServiceLoop {
     pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
-    /// The fit of the cells' model under way, beside the loop.
+    /// The running fit of the cell model, on another thread.
     pub(super) model_fit: Option<JoinHandle<(FitTask, FitFindings)>>,
 }
 
@@ -54,7 +54,7 @@ impl ServiceLoop {
         let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
         let (mut fed, mut flushed) = (Instant::now(), Instant::now());
         loop {
-            // In this order: a busy bus must delay neither the stop nor the ticks.
+            // In this order, so that a busy bus delays neither the stop nor the ticks.
             tokio::select! {
                 biased;
                 () = stop.wait() => return,
@@ -69,7 +69,7 @@ impl ServiceLoop {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
                     }
-                    // A crash of the daemon loses at most a second of the files.
+                    // A crash of the daemon loses at most the last second of the files.
                     if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
                         flushed = now;
@@ -93,7 +93,7 @@ impl ServiceLoop {
         }
     }
 
-    /// Runs the fit that the core has begun on another thread: it takes longer than frames and ticks can wait.
+    /// Runs a fit that the core requests on another thread, because it takes too long for frames and ticks to wait.
     fn begin_model_fit(&mut self) {
         if self.model_fit.is_none()
             && let Some(task) = self.engine.monitor.take_model_fit()
@@ -111,7 +111,7 @@ impl ServiceLoop {
             self.left_out_reported = now;
             let lines = logging::take_left_out();
             if lines > 0 {
-                tracing::warn!(left_out = lines, "lines left out of the log");
+                tracing::warn!(left_out = lines, "log lines dropped");
             }
         }
         let Engine { readiness, monitor, .. } = &mut self.engine;
@@ -125,7 +125,7 @@ impl ServiceLoop {
         }
     }
 
-    /// Handles a tick, after the input received before it; returns its time.
+    /// Handles a tick after the input received before it; returns its time.
     async fn tick(&mut self) -> Timestamp {
         self.drain().await;
         let time = self.clock.now();
@@ -134,7 +134,7 @@ impl ServiceLoop {
         time
     }
 
-    /// Answers a request of the control socket; a command that changes what is stored, when that is on the disk.
+    /// Answers a request of the control socket. The answer to a command that changes stored data waits until they are on disk.
     async fn answer(&mut self, PendingRequest { request, answer: client }: PendingRequest) {
         let alarms = self.engine.monitor.alarms();
         let answer = match request {
@@ -154,7 +154,7 @@ impl ServiceLoop {
         let _ = client.send(answer);
     }
 
-    /// Passes a command to the core, after the input received before it. Returns its outcome and the ticket of its commit.
+    /// Passes a command to the core after the input received before it. Returns its outcome and the ticket of its commit.
     async fn apply_command(&mut self, command: Command) -> (Result<CommandOutcome, Answer>, Option<u64>) {
         self.drain().await;
         let time = self.clock.now();
@@ -166,7 +166,7 @@ impl ServiceLoop {
     /// Handles everything that the interfaces have received so far.
     async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
-            // Lets the interfaces' tasks read their sockets, and send.
+            // Lets the tasks of the interfaces read from and write to their sockets.
             tokio::task::yield_now().await;
             while self.batch.len() < BATCH
                 && let Ok(received) = self.inbox.try_recv()
@@ -180,13 +180,13 @@ impl ServiceLoop {
         }
     }
 
-    /// Handles a batch in the order of time; items of one interface keep their order.
+    /// Handles a batch in order of time; records of one interface keep their order.
     fn handle_batch(&mut self) {
         self.batch.sort_by_key(|record| record.time);
         for received in &self.batch {
             self.engine.handle(received);
         }
-        // Outputs leave after the last item: then all frames have their estimates.
+        // Outputs are sent after the last record, when all frames have their estimates.
         self.status_publisher.note_frames(&self.batch, self.clock.now());
         self.batch.clear();
     }
@@ -197,7 +197,7 @@ impl ServiceLoop {
             ReloadStep::Requested => return self.notify_reloading(),
             ReloadStep::Read(read) => read,
         };
-        // Input received before it belongs to the old configuration.
+        // Input received before this point belongs to the old configuration.
         self.drain().await;
         let time = self.clock.now();
         let mut file = None;
@@ -210,19 +210,19 @@ impl ServiceLoop {
         let Engine { readiness, monitor, .. } = &mut self.engine;
         readiness.note_reload(taken.err().map(|faults| faults.join("; ")));
         let line = readiness.line_now(monitor, Instant::now());
-        // If a further reload waits, its end is reported.
+        // If a further reload waits, the end of that one is reported.
         let ready = (readiness.is_ready() && !self.reload.is_busy()).then_some(NotifyState::Ready);
         let status = line.as_deref().map(NotifyState::Status);
         notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
     }
 
     fn notify_reloading(&self) {
-        // Before the service is ready, the manager would take the end of a reload for readiness.
+        // Before the service is ready, the manager would mistake the end of a reload for readiness.
         if !self.engine.readiness.is_ready() {
             return;
         }
         let mut states = vec![NotifyState::Reloading];
-        // Version 253 and later require the time.
+        // systemd 253 and later requires the time.
         states.extend(NotifyState::monotonic_usec_now());
         notify(&states);
     }
@@ -234,9 +234,9 @@ impl ServiceLoop {
         self.inbox.close();
         let drained = async { while links.join_next().await.is_some() {} };
         if timeout(DRAIN_LIMIT, drained).await.is_err() {
-            tracing::warn!("not every queued frame was sent before the stop");
+            tracing::warn!("some queued frames were not sent before the stop");
         }
-        // The state first: files may block on a disk that does not answer.
+        // The state is stored first, because files may block on a disk that does not respond.
         self.engine.close_store(self.clock.now());
         let stored = snapshot.map_or(Ok(()), |path| {
             snapshot_file::write(path, &self.engine.monitor.snapshot())
@@ -248,7 +248,7 @@ impl ServiceLoop {
     }
 }
 
-/// Waits for the next progress of the store. If its thread has ended before the loop, reports a failure, once.
+/// Waits for the next progress of the store. Reports a failure once if its thread has ended before the loop.
 async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> StoreProgress {
     let Some(receiver) = stored else { return std::future::pending().await };
     if receiver.changed().await.is_ok() {
@@ -260,7 +260,7 @@ async fn next_progress(stored: &mut Option<watch::Receiver<StoreProgress>>) -> S
     StoreProgress { works: false, failures: last.failures + 1, ..last }
 }
 
-/// Waits for a fit; `None` = it has failed, and the core runs it itself.
+/// Waits for a fit; `None` = it failed, and the core runs it itself.
 async fn next_model_fit(fit: &mut Option<JoinHandle<(FitTask, FitFindings)>>) -> Option<(FitTask, FitFindings)> {
     let Some(running) = fit else { return std::future::pending().await };
     let found = running.await.ok();
@@ -273,7 +273,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_store_whose_thread_has_ended_is_reported_as_failed_once() {
+    async fn ended_store_thread_is_reported_once() {
         let last = StoreProgress { ticket: 7, works: true, ..StoreProgress::default() };
         let (sender, progress) = watch::channel(last);
         drop(sender);

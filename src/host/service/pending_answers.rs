@@ -1,8 +1,8 @@
-//! Holds the answers to commands until what they changed is on the disk: a client that reads "done" may cut the power.
+//! Holds the answers to commands until their changes are on disk, because a client that reads "done" may cut the power.
 //!
 //! In: the ticket of the commit with the command's outcome, the progress of the store, the time. Out: the answer, with
-//! whether its outcome is stored. A failing disk is answered at once, a slow one after [`MAX_WAIT`]; the outcome is in force
-//! in either case, and stored when the disk is back.
+//! whether its outcome is stored. A failing disk is answered at once, a slow one after [`MAX_WAIT`]. In both cases the outcome
+//! is in effect, and is stored when the disk works again.
 
 use tokio::sync::oneshot;
 use tokio::time::{Duration, Instant};
@@ -10,10 +10,10 @@ use tokio::time::{Duration, Instant};
 use crate::control::protocol::{Answer, CommandOutcome};
 use crate::store::StoreProgress;
 
-/// Longest wait for the disk. A client waits longer ([`crate::control::client`]).
+/// Longest wait for the disk; a client waits longer ([`crate::control::client`]).
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
 
-/// Answers that wait, at most one for each connection.
+/// Waiting answers, at most one per connection.
 #[derive(Debug, Default)]
 pub(super) struct PendingAnswers {
     waiting: Vec<PendingAnswer>,
@@ -33,7 +33,7 @@ impl PendingAnswers {
         self.waiting.push(PendingAnswer { ticket, until: now + MAX_WAIT, outcome, answer });
     }
 
-    /// Sends the answers that progress of the store decides.
+    /// Sends the answers that are decided by the store's progress.
     pub(super) fn note_progress(&mut self, progress: &StoreProgress) {
         self.send_if(Some(progress.works), |waiting| waiting.ticket <= progress.ticket);
     }
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_waits_for_its_commit() {
+    fn answer_waits_for_its_commit() {
         let now = Instant::now();
         let mut answers = PendingAnswers::default();
         let [mut first, mut second] = [3, 4].map(|ticket| held(&mut answers, ticket, now));
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_does_not_wait_for_ever() {
+    fn answer_wait_is_limited() {
         let now = Instant::now();
         let mut answers = PendingAnswers::default();
         let mut answer = held(&mut answers, 1, now);

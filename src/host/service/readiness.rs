@@ -1,8 +1,8 @@
 //! Determines the reports to the service manager: readiness, and a status line.
 //!
-//! The service is ready when the configuration is good and the first usable reading has come or the wait for it is over.
-//! The line names every problem; it is reported when it changes, at most every [`STATUS_PERIOD`]. The caller passes the
-//! times and sends the returned reports, so this file needs no service manager.
+//! The service is ready when the configuration is valid and the first usable reading has arrived or the wait for it has ended.
+//! The line states every problem. It is reported when it changes, at most every [`STATUS_PERIOD`]. The caller passes the times
+//! and sends the returned reports, so this file needs no service manager.
 
 use std::time::Duration;
 
@@ -15,25 +15,25 @@ use crate::quantity::Channel;
 
 /// Longest wait for the first reading, s; the unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Default wait, s: ten times as long as a bus needs to wake, and too short to look like a hung start.
+/// Default wait, s: ten times the time in which a bus wakes, and too short to look like a hung start.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
-/// Least time between two reports of the line.
+/// Shortest time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Signals named in the line; the rest is counted.
+/// Signals named in the line; further ones are counted.
 const MAX_NAMED: usize = 3;
-/// Longest line, bytes: a datagram to the service manager carries more, a terminal does not show more.
+/// Longest line, bytes: as much as a terminal can show; a datagram to the service manager could carry more.
 const MAX_LINE: usize = 1500;
 
 /// A report to the service manager.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct ManagerUpdate {
-    /// The service is ready.
+    /// Whether the service has become ready.
     pub(super) ready: bool,
-    /// Its line.
+    /// The new status line.
     pub(super) status: Option<String>,
 }
 
-/// See the module.
+/// Readiness and status line.
 #[derive(Debug)]
 pub(super) struct Readiness {
     interfaces: Vec<(String, LinkState)>,
@@ -48,16 +48,16 @@ pub(super) struct Readiness {
     store_works: bool,
     /// Why the last reload was rejected.
     refused: Option<String>,
-    /// Words about the restored state.
+    /// Description of the restored state.
     restored: Option<String>,
     reported: String,
     reported_at: Option<Instant>,
-    /// A subject of the line has changed since it was built: most ticks build none.
+    /// Whether something in the line has changed since it was built; most ticks build no line.
     is_changed: bool,
 }
 
 impl Readiness {
-    /// Readiness of a service that starts now with these interfaces and waits this long for its first reading.
+    /// Readiness of a service that starts now with these interfaces and waits this long for the first reading.
     pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
         Self {
             interfaces: names.iter().map(|name| (name.clone(), LinkState::Unknown)).collect(),
@@ -103,7 +103,7 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// Checks the core; returns the report that is due.
+    /// Checks the core, and returns the report that is due.
     pub(super) fn poll(&mut self, monitor: &Monitor, now: Instant) -> ManagerUpdate {
         let waited = now.duration_since(self.began);
         if self.first_after.is_none() && monitor.has_heard() {
@@ -121,7 +121,7 @@ impl Readiness {
         ManagerUpdate { ready, status: self.new_line(now) }
     }
 
-    /// The line, if it has changed, without waiting for the period.
+    /// The line if it has changed, regardless of the period.
     pub(super) fn line_now(&mut self, monitor: &Monitor, now: Instant) -> Option<String> {
         self.check_inputs(monitor);
         self.new_line(now)
@@ -145,7 +145,7 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// The line, if it differs from the one reported last.
+    /// The line if it differs from the last reported one.
     fn new_line(&mut self, now: Instant) -> Option<String> {
         if !std::mem::take(&mut self.is_changed) {
             return None;
@@ -168,13 +168,13 @@ impl Readiness {
         one_line(&line, MAX_LINE)
     }
 
-    /// The line's head: whether there is input.
+    /// The beginning of the line: whether there is input.
     fn state(&self) -> String {
         let count = self.interfaces.len();
         let mut line = match self.first_after {
             None if !self.is_ready => "waiting for the first frame".to_owned(),
             None => format!("running without input: no frame in {} s", self.timeout.as_secs_f64()),
-            Some(_) if self.is_asleep => "running: the buses sleep".to_owned(),
+            Some(_) if self.is_asleep => "running: buses asleep".to_owned(),
             Some(_) if !self.lost.is_empty() && self.lost.len() == self.inputs => "running without input".to_owned(),
             Some(after) => {
                 let plural = if count == 1 { "" } else { "s" };
@@ -207,12 +207,12 @@ impl Readiness {
         if !self.store_works {
             problems.push("a file cannot be written".to_owned());
         }
-        problems.extend(self.refused.as_ref().map(|why| format!("reload refused: {why}")));
+        problems.extend(self.refused.as_ref().map(|why| format!("reload rejected: {why}")));
         problems
     }
 }
 
-/// Words about a restored state of that age, s.
+/// Describes a restored state of this age, s.
 pub(super) fn describe_restored(age_s: Option<f64>) -> String {
     match age_s {
         Some(age_s) => format!("restored state {} old", describe_duration(age_s)),
@@ -231,7 +231,7 @@ fn describe_duration(seconds: f64) -> String {
     }
 }
 
-/// Replaces control characters (a line feed would start another assignment) and shortens to `limit` bytes.
+/// Replaces control characters (a line feed would start another assignment) and shortens the text to `limit` bytes.
 pub(super) fn one_line(text: &str, limit: usize) -> String {
     let line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     if line.len() <= limit {

@@ -1,9 +1,9 @@
-//! Reloads the configuration on SIGHUP, outside the loop. A bad configuration is rejected and the old one stays.
+//! Reloads the configuration on SIGHUP, outside the loop. If the new configuration is rejected, the old one stays.
 //!
-//! Reads one file at a time. Signals during a reading cause one further reading, at least [`MIN_PERIOD`] after the start
-//! of the last: a storm of signals neither fills the log nor blocks the loop, and the file as of the last signal applies in
-//! the end. A change of interfaces or store needs a restart and is rejected with that word; the core decides about the rest
-//! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
+//! Reads one file at a time. Signals that arrive while it reads cause one further reading, at least [`MIN_PERIOD`] after the
+//! start of the last. A storm of signals therefore neither fills the log nor blocks the loop, and in the end the file as of the
+//! last signal applies. A change of interfaces or store requires a restart and is rejected with that hint; the core decides
+//! about all other changes ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;
 use std::io;
@@ -19,9 +19,9 @@ use crate::config::{self, Config, InterfaceConfig, KeySource, StoreConfig, Vehic
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
-/// Least time between two readings of the file.
+/// Shortest time between two readings of the file.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
-/// Faults logged one by one: a file of another kind has thousands.
+/// Faults that are logged one by one; a file of another kind has thousands.
 const MAX_FAULTS_LOGGED: usize = 50;
 
 /// A step of a reload.
@@ -41,17 +41,17 @@ pub(super) struct LoadedConfig {
     pub(super) file: Option<ConfigFile>,
 }
 
-/// The task that reads.
+/// The reading task.
 type LoadTask = JoinHandle<Result<Box<LoadedConfig>, Vec<String>>>;
 
-/// See the module.
+/// Catches SIGHUP and reads the configuration.
 #[derive(Debug)]
 pub(super) struct Reload {
     hangup: Signal,
     path: PathBuf,
     fixed: Arc<FixedSettings>,
     reading: Option<LoadTask>,
-    /// A signal waits for a reading.
+    /// Whether a signal waits for a reading.
     is_requested: bool,
     /// Earliest start of the next reading.
     not_before: Instant,
@@ -91,7 +91,7 @@ impl Reload {
         }
     }
 
-    /// Whether a reload runs or waits.
+    /// Whether a reload is running or waiting.
     pub(super) fn is_busy(&self) -> bool {
         self.is_requested || self.reading.is_some()
     }
@@ -100,7 +100,7 @@ impl Reload {
         self.is_requested = false;
         self.not_before = Instant::now() + MIN_PERIOD;
         let (path, fixed) = (self.path.clone(), Arc::clone(&self.fixed));
-        // A large DBC takes longer than a tick.
+        // Reading a large DBC takes longer than a tick.
         self.reading = Some(tokio::task::spawn_blocking(move || {
             let new = config::load(&path).map_err(|faults| faults.0)?;
             fixed.check(&new).map_err(|why| vec![why])?;
@@ -116,7 +116,7 @@ async fn finished(reading: &mut Option<LoadTask>) -> Result<Box<LoadedConfig>, V
     }
 }
 
-/// Settings outside the core that cannot change while the service runs: the interfaces' names and kinds, the store.
+/// Settings outside the core that cannot change while the service runs: names and types of the interfaces, the store.
 #[derive(Debug)]
 struct FixedSettings {
     interfaces: Vec<InterfaceConfig>,
@@ -138,7 +138,7 @@ impl FixedSettings {
     /// Checks whether `new` can be applied.
     ///
     /// # Errors
-    /// The setting that needs a restart.
+    /// Names the setting that needs a restart.
     fn check(&self, new: &Config) -> Result<(), String> {
         let new = Self::of(new);
         if self.interfaces != new.interfaces {
@@ -149,10 +149,10 @@ impl FixedSettings {
             return Err(format!("[vehicle] = {found:?}, running with {running:?}: needs a restart"));
         }
         if self.store != new.store {
-            return Err("[store]: other settings than it was started with: needs a restart".to_owned());
+            return Err("[store]: the settings have changed: needs a restart".to_owned());
         }
         if self.key != new.key {
-            return Err("[authentication]: another key than it was started with: needs a restart".to_owned());
+            return Err("[authentication]: the key's location has changed: needs a restart".to_owned());
         }
         Ok(())
     }
@@ -176,11 +176,11 @@ pub(super) fn log_outcome(taken: &Result<Reconfigured, Vec<String>>) {
         }
         Err(faults) => {
             for fault in faults.iter().take(MAX_FAULTS_LOGGED) {
-                tracing::error!(fault, "configuration refused, the old one stays");
+                tracing::error!(fault, "configuration rejected, the old one stays");
             }
             let more = faults.len().saturating_sub(MAX_FAULTS_LOGGED);
             if more > 0 {
-                tracing::error!(more, "configuration refused: further faults");
+                tracing::error!(more, "configuration rejected: further faults");
             }
         }
     }
@@ -197,14 +197,14 @@ mod tests {
     }
 
     #[test]
-    fn another_threshold_is_applied() {
+    fn changed_threshold_is_applied() {
         let (old, mut new) = (example(), example());
         new.monitor.rules[0].threshold *= 0.5;
         assert_eq!(FixedSettings::of(&old).check(&new), Ok(()));
     }
 
     #[test]
-    fn another_checkpoint_period_needs_a_restart() {
+    fn changed_checkpoint_period_needs_restart() {
         let (old, mut new) = (example(), example());
         new.store.checkpoint_s *= 2.0;
         assert!(
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn another_vehicle_needs_a_restart_and_is_named() {
+    fn changed_vehicle_needs_restart() {
         let (old, mut new) = (example(), example());
         new.vehicle.id = Some("WDB1".to_owned());
         let why = FixedSettings::of(&old).check(&new).expect_err("another vehicle");
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn another_interface_needs_a_restart_and_is_named() {
+    fn changed_interface_needs_restart() {
         let (old, mut new) = (example(), example());
         new.interfaces[0].name = "can7".to_owned();
         let why = FixedSettings::of(&old).check(&new).expect_err("another interface");

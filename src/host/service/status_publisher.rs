@@ -11,7 +11,7 @@ use crate::status::collect::{CounterBaseline, ServiceIdentity, Sources};
 use crate::status::counters::{Latency, ServiceCounters};
 use crate::status::document::ConfigFile;
 
-/// See the module.
+/// Publishes the daemon's status once a second, and counts the work of the loop.
 #[derive(Debug)]
 pub(super) struct StatusPublisher {
     server: Option<StatusServer>,
@@ -19,7 +19,7 @@ pub(super) struct StatusPublisher {
     counters: ServiceCounters,
     latency: Latency,
     published: Option<Instant>,
-    /// Taken with the first document: the first tick has restored the stored state, and no frame was counted yet.
+    /// Taken with the first document: the first tick has restored the stored state, and no frame has been counted yet.
     before: Option<CounterBaseline>,
 }
 
@@ -34,7 +34,7 @@ impl StatusPublisher {
         self.counters.note_tick(due.elapsed().as_secs_f64(), f64::from(TICK_PERIOD_MS) / 1e3);
     }
 
-    /// Counts the frames of a batch, which have their estimates at `now`.
+    /// Counts the frames of a batch, whose estimates are available at `now`.
     pub(super) fn note_frames(&mut self, batch: &[Record], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.kind, RecordKind::Frame { .. }));
         frames.for_each(|received| self.latency.record(now.since(received.time)));
@@ -51,7 +51,7 @@ impl StatusPublisher {
         }
     }
 
-    /// Publishes a document, if a period has passed at the tick that was due at `tick`.
+    /// Publishes a document if a period has passed at the tick due at `tick`.
     pub(super) fn publish(&mut self, engine: &Engine, tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
         if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {

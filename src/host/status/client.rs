@@ -1,4 +1,4 @@
-//! The client of the status socket: reads one document, blocking, within a bounded time.
+//! Client of the status socket: reads one document, blocking, within a limited time.
 
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::net::UnixStream;
@@ -10,9 +10,9 @@ use serde::Deserialize;
 use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
 
-/// Longest wait: a second longer than a daemon waits for a fresh document.
+/// Longest wait: one second longer than a daemon waits for a fresh document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
-/// Longest document, bytes: 1,024 cells and as many alarms are under 1 MB.
+/// Longest document, bytes; 1,024 cells and as many alarms take less than 1 MB.
 pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;
 
 /// A daemon's status socket.
@@ -23,7 +23,7 @@ pub struct StatusClient {
 }
 
 impl StatusClient {
-    /// The socket at `path`; `None` = at the standard path.
+    /// The socket at `path`; `None` = the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
@@ -31,7 +31,7 @@ impl StatusClient {
     /// Reads the document as a line of JSON.
     ///
     /// # Errors
-    /// When no daemon sends it: names the socket and the remedy.
+    /// When no daemon sends it; names the socket and the next step.
     pub fn line(&self) -> Result<Vec<u8>, String> {
         self.read(PATIENCE).map_err(|error| explain(&self.path, &error))
     }
@@ -56,27 +56,30 @@ impl StatusClient {
     }
 }
 
-/// Rejects a document that does not end.
+/// Rejects a document that is too long.
 pub fn check_length(bytes: usize) -> io::Result<()> {
     if bytes <= MAX_DOCUMENT_BYTES {
         return Ok(());
     }
-    Err(io::Error::new(ErrorKind::InvalidData, format!("a document of more than {MAX_DOCUMENT_BYTES} bytes")))
+    Err(io::Error::new(
+        ErrorKind::InvalidData,
+        format!("document too long, must be at most {MAX_DOCUMENT_BYTES} bytes"),
+    ))
 }
 
-/// Explains why there is no document, and names the remedy.
+/// Explains why there is no document, and names the next step.
 pub fn explain(path: &Path, error: &io::Error) -> String {
     let option = if path == standard_path() { String::new() } else { format!(" --status {}", path.display()) };
     let path = path.display();
     match error.kind() {
         ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or name its socket with \
-             --socket"
+            "{path}: no daemon listens there; start one with \"packwatch run -c FILE{option}\", or give the path of its socket \
+             with --socket"
         ),
         ErrorKind::PermissionDenied => format!("{path}: only root may read the service's folder; try sudo"),
-        ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: no document in time"),
+        ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: the daemon sent no status in time"),
         ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => {
-            format!("{path}: the daemon has no document that is fresh, or too many clients")
+            format!("{path}: the daemon has no fresh status, or too many clients; try again")
         }
         _ => format!("{path}: {error}"),
     }
@@ -85,15 +88,18 @@ pub fn explain(path: &Path, error: &io::Error) -> String {
 /// Parses a document.
 ///
 /// # Errors
-/// When it is not a document, or of another version.
+/// When it is not a document, or has another version.
 pub fn parse(line: &[u8]) -> Result<StatusDocument, String> {
     #[derive(Deserialize)]
     struct Versioned {
         version: u32,
     }
-    let Versioned { version } = serde_json::from_slice(line).map_err(|error| format!("no status document: {error}"))?;
+    let Versioned { version } =
+        serde_json::from_slice(line).map_err(|error| format!("not a status document: {error}"))?;
     if version != VERSION {
-        return Err(format!("status document of version {version}, this program reads {VERSION}"));
+        return Err(format!(
+            "status document has version {version}, must be {VERSION}: use the daemon's packwatch version"
+        ));
     }
     serde_json::from_slice(line).map_err(|error| format!("status document: {error}"))
 }

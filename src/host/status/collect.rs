@@ -1,4 +1,4 @@
-//! Collects the status document from the core, the interfaces and the loop's counters: copies structs, serialises nothing.
+//! Collects the status document from the core, the interfaces and the loop's counters. It copies structs and serialises nothing.
 
 use std::collections::VecDeque;
 
@@ -19,10 +19,10 @@ use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, Event
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Events in the document: a screenful.
+/// Events in the document: one screen.
 pub const MAX_EVENTS: usize = 32;
 
-/// The latest events, without those that come once per cell and half-cycle: they would displace all others.
+/// The latest events, except those that occur once per cell and half-cycle, which would displace all others.
 #[derive(Debug, Default)]
 pub struct RecentEvents(VecDeque<Event>);
 
@@ -40,7 +40,7 @@ impl RecentEvents {
     }
 }
 
-/// Facts about the daemon that change only with a reload.
+/// Properties of the daemon that change only with a reload.
 #[derive(Debug, Clone)]
 pub struct ServiceIdentity {
     pub started: Timestamp,
@@ -49,7 +49,7 @@ pub struct ServiceIdentity {
     pub interfaces: Vec<String>,
 }
 
-/// Counts of earlier runs, which the stored state contains.
+/// Counts of earlier runs, as contained in the stored state.
 #[derive(Debug, Clone, Default)]
 pub struct CounterBaseline {
     statistics: Statistics,
@@ -62,14 +62,14 @@ pub struct CounterBaseline {
 }
 
 impl CounterBaseline {
-    /// The counts of a monitor that has just restored its state, if there is one. Events of the same tick (an alarm about an
-    /// input that was silent meanwhile) count as earlier.
+    /// The counts of a monitor that has just restored its state, if it has. Events of the same tick (such as an alarm about an
+    /// input that is missing since the downtime) count as earlier.
     pub fn of(monitor: &Monitor) -> Self {
         let mut statistics = monitor.statistics().clone();
         if statistics.restores == 0 {
             return Self::default();
         }
-        // This restore belongs to the present run.
+        // This restore belongs to the current run.
         statistics.restores -= 1;
         Self {
             statistics,
@@ -97,7 +97,7 @@ pub struct Sources<'a> {
 }
 
 impl Sources<'_> {
-    /// Collects the document, not yet serialised.
+    /// Collects the document, which is serialised later.
     pub fn draft(self, now: Timestamp) -> Draft {
         let events = self.events.0.iter().copied().collect();
         Draft { document: self.document(now), events }
@@ -124,7 +124,7 @@ impl Sources<'_> {
             alarms: alarms(monitor),
             counters: StatusCounters {
                 core,
-                // Counts of interfaces are by index: another order of the interfaces would exchange them.
+                // Interfaces are counted by index, so a changed order of interfaces would mix up their counts.
                 lifetime: Statistics { buses: Vec::new(), ..monitor.statistics().clone() },
                 readings: monitor.reading_counts().since(&before.readings),
                 time_backwards: monitor.time_backwards().saturating_sub(before.time_backwards),
@@ -168,7 +168,7 @@ impl Sources<'_> {
         each.chain(self.authentication()).collect()
     }
 
-    /// The authenticated command message, by outcome.
+    /// Checks of the authenticated command message, by outcome.
     fn authentication(&self) -> Option<MessageProtection> {
         let (bus, id, counts) = self.monitor.authenticated_commands()?;
         let counts = counts.since(&self.before.commands);

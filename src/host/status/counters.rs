@@ -1,11 +1,11 @@
-//! Counters of the loop and of the status clients, and the latency of frames: plain numbers that the loop owns.
+//! Counters of the loop and of the status clients, and the latency of frames: plain numbers owned by the loop.
 //!
-//! In: the lateness of ticks and the latency of frames, s. Out: the structs as the status document has them. Nothing is
-//! allocated or locked per frame.
+//! In: the lateness of ticks and the latency of frames, s. Out: structs of the status document. Nothing is allocated or
+//! locked per frame.
 
 use serde::{Deserialize, Serialize};
 
-/// Upper bounds of the latency's buckets, s.
+/// Upper bounds of the latency buckets, s.
 pub const LATENCY_BOUNDS_S: [f64; 14] =
     [50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 0.1, 0.2, 0.5, 1.0];
 
@@ -23,7 +23,7 @@ pub struct Latency {
 /// One bucket.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Bucket {
-    /// Its upper bound, s; `None` = no bound.
+    /// Its upper bound, s; `None` = unbounded.
     pub le_s: Option<f64>,
     /// Frames in it.
     pub frames: u64,
@@ -37,7 +37,7 @@ impl Default for Latency {
 }
 
 impl Latency {
-    /// Counts one frame. A latency below zero (two clocks, merged) counts as zero.
+    /// Counts one frame. A negative latency (stamps of two clocks) counts as zero.
     #[inline]
     pub fn record(&mut self, seconds: f64) {
         let seconds = seconds.max(0.0);
@@ -49,7 +49,7 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// The bound that this share of the frames did not exceed, s; `None` = no frame, or beyond the last bound.
+    /// The bound not exceeded by this share of the frames, s; `None` = no frames, or above the last bound.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;
@@ -66,7 +66,7 @@ impl Latency {
 pub struct ServiceCounters {
     /// Ticks.
     pub ticks: u64,
-    /// Ticks more than a period late.
+    /// Ticks that were more than one period late.
     pub missed_deadlines: u64,
     /// Greatest lateness of a tick, s.
     pub worst_lateness_s: f64,
@@ -74,7 +74,7 @@ pub struct ServiceCounters {
     pub reloads: u64,
     /// Configurations rejected while running.
     pub reloads_refused: u64,
-    /// Status documents dropped because the one before was not yet serialised.
+    /// Status documents dropped because the previous one was not yet serialised.
     pub documents_skipped: u64,
 }
 
@@ -90,13 +90,13 @@ impl ServiceCounters {
 /// Clients of the status sockets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClientCounts {
-    /// Connected now.
+    /// Connected at present.
     pub connected: u64,
-    /// Served so far, with those being served.
+    /// Served so far, including those being served.
     pub served: u64,
-    /// Refused: too many at once.
+    /// Rejected because there were too many.
     pub refused: u64,
-    /// Dropped: they did not read what they were sent.
+    /// Dropped because they did not read in time.
     pub dropped: u64,
 }
 
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_latency_counts_in_the_bucket_whose_bound_it_does_not_exceed() {
+    fn latency_counts_in_lowest_fitting_bucket() {
         let mut latency = Latency::default();
         for seconds in [-1.0, 50e-6, 51e-6, 1.0, 1.1, 60.0] {
             latency.record(seconds);
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_deadline_is_missed_by_more_than_a_period() {
+    fn deadline_is_missed_after_one_period() {
         let mut counters = ServiceCounters::default();
         for lateness_s in [0.0, 0.01, 0.011, 60.0] {
             counters.note_tick(lateness_s, 0.01);

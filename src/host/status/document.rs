@@ -1,11 +1,11 @@
 //! The status document that the status sockets send as JSON. This file is its reference.
 //!
-//! * Version 1. New keys may be added within a version, so a reader ignores unknown keys; changing the meaning of a key or
-//!   removing it makes a new version.
+//! * Version 1. New keys may be added within a version, so readers must ignore unknown keys. Removing a key or changing its
+//!   meaning requires a new version.
 //! * An unknown value is `null`, never 0 or 100 %.
-//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`; SOC and SOH are fractions.
-//!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's
-//!   clock, which never steps; `wall_time` is the computer's clock.
+//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`. SOC and SOH are fractions.
+//!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's clock, which
+//!   never steps; `wall_time` is the computer's clock.
 
 use std::path::Path;
 
@@ -39,7 +39,7 @@ pub struct StatusDocument {
     pub pid: u32,
     /// Time of the document, on the daemon's clock.
     pub time: Timestamp,
-    /// The same on the computer's clock.
+    /// The same time on the computer's clock.
     pub wall_time: Timestamp,
     /// Start of the daemon.
     pub started: Timestamp,
@@ -52,11 +52,11 @@ pub struct StatusDocument {
     pub vehicle: VehicleIdentity,
     /// Validity of the estimates.
     pub state: Validity,
-    /// The interfaces, in the order of the configuration.
+    /// The interfaces, in configuration order.
     pub interfaces: Vec<InterfaceStatus>,
     /// The pack.
     pub pack: PackView,
-    /// Its cells.
+    /// The cells of the pack.
     pub cells: Vec<CellView>,
     /// Alarms that need attention.
     pub alarms: AlarmStatus,
@@ -64,44 +64,44 @@ pub struct StatusDocument {
     pub counters: StatusCounters,
     /// Protected input messages, and the authenticated command message.
     pub protection: Vec<MessageProtection>,
-    /// Commands from the bus; `None` = none are executed.
+    /// Commands from the bus; `None` = not executed.
     #[serde(default)]
     pub commands: Option<CommandStatus>,
     /// Controllers that answer diagnostic requests.
     #[serde(default)]
     pub controllers: Vec<ControllerStatus>,
-    /// Since when the buses sleep; `None` = they are awake.
+    /// Time since which the buses are asleep; `None` = awake.
     #[serde(default)]
     pub asleep_since: Option<Timestamp>,
-    /// Diagnostic requests of this program; `None` = it sends none.
+    /// Diagnostic requests of this program; `None` = polling is not configured.
     #[serde(default)]
     pub poll: Option<PollStatus>,
-    /// Input messages with frames dropped beyond the accepted rate.
+    /// Input messages of which frames were dropped because their rate was too high.
     pub floods: Vec<MessageFlood>,
-    /// Senders on the buses that should not be there.
+    /// Unexpected senders on the buses.
     #[serde(default)]
     pub intruders: Vec<Intruder>,
-    /// The current's reading is frozen: the voltages show another load.
+    /// Whether the current's reading is frozen: the voltages show another load.
     #[serde(default)]
     pub current_frozen: bool,
-    /// What is found of single cells and of the sensors, as `--events` writes it.
+    /// Findings about cells and sensors, in the format of `--events`.
     #[serde(default)]
     pub findings: Vec<CellFault>,
     /// Latency from the kernel's receive stamp of a frame to its estimate.
     pub latency: Latency,
-    /// The store of state and history; `None` = it is off.
+    /// The store of state and history; `None` = disabled.
     pub store: Option<StoreStatus>,
-    /// The latest events without those of half-cycles of single cells, oldest first, as `--events` writes them.
+    /// The latest events except half-cycles of cells, oldest first, in the format of `--events`.
     pub events: Vec<serde_json::Value>,
 }
 
 impl StatusDocument {
-    /// The first cell with the least value, and that; `None` while the value of a cell is unknown.
+    /// The first cell with the lowest value, and the value; `None` if any cell's value is unknown.
     pub fn least(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate < best)
     }
 
-    /// The first cell with the greatest value, likewise.
+    /// The first cell with the highest value, and the value; `None` if any cell's value is unknown.
     pub fn greatest(&self, quantity: Quantity) -> Option<(CellIndex, f64)> {
         self.extreme(quantity, |candidate, best| candidate > best)
     }
@@ -118,11 +118,11 @@ impl StatusDocument {
 pub struct ConfigFile {
     /// The file.
     pub path: String,
-    /// Its drop-ins, in the order in which they are merged.
+    /// Its drop-ins, in merge order.
     #[serde(default)]
     pub drop_ins: Vec<String>,
-    /// SHA-256 of the text of the file and then of its drop-ins, in hexadecimal digits, as `cat FILE FILE.d/*.toml |
-    /// sha256sum` prints it (without the other files they name).
+    /// SHA-256 of the file followed by its drop-ins, hexadecimal, as printed by `cat FILE FILE.d/*.toml | sha256sum`. It does
+    /// not cover the other files they name.
     pub sha256: String,
 }
 
@@ -133,7 +133,7 @@ pub struct InterfaceStatus {
     pub name: String,
     /// Its state.
     pub state: LinkState,
-    /// Times it came up again.
+    /// How often it came up again.
     pub reconnects: u64,
     /// Frames received.
     #[serde(flatten)]
@@ -146,48 +146,49 @@ pub struct InterfaceStatus {
 /// The alarms.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AlarmStatus {
-    /// Thresholds configured.
+    /// Number of configured thresholds.
     pub thresholds: usize,
-    /// Rules with a threshold, each once; empty in documents of earlier programs.
+    /// Rules with a threshold, each once; empty in documents of older versions.
     #[serde(default)]
     pub rules: Vec<Rule>,
-    /// Alarms raised now.
+    /// Number of raised alarms.
     pub raised: usize,
-    /// The highest severity among them.
+    /// Highest severity of the raised alarms.
     pub highest_severity: Option<Severity>,
-    /// Thresholds with alarms that cannot be evaluated, because their value is not known.
+    /// Thresholds with alarms that cannot be evaluated because their value is unknown.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms that are raised, about to be raised, or not yet acknowledged.
     pub list: Vec<Alarm>,
-    /// Further alarms, for which there was no room.
+    /// Number of further alarms that did not fit.
     pub omitted: usize,
 }
 
 impl AlarmStatus {
-    /// Whether there are thresholds and each of them is judged: without raised alarms all is well then, else it is not known.
+    /// Whether there are thresholds and all of them can be evaluated. If so, no raised alarm means that all is well.
     pub fn are_judged(&self) -> bool {
         self.thresholds > 0 && self.unknown.is_empty()
     }
 
-    /// The highest severity of a raised alarm, or "none"; `None` = not known.
+    /// The highest severity of a raised alarm, or "none"; `None` = unknown.
     pub fn level(&self) -> Option<&'static str> {
         let none = (self.raised == 0 && self.are_judged()).then_some("none");
         self.highest_severity.map(Severity::name).or(none)
     }
 }
 
-/// Counters. All start at 0 with the program, also those of interfaces, protected messages, controllers and floods, except `lifetime`: a
-/// stored count may be a minute old after a power cut, and a falling counter is wrong for readers that sum differences.
+/// Counters. All of them start at 0 with the program (also those of interfaces, protected messages, controllers and floods),
+/// except `lifetime`. A stored count may be a minute old after a power cut, and readers that sum differences need counters that
+/// never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
     /// Counters of the core.
     pub core: Statistics,
-    /// The same since the first start, as far as it was stored; without the interfaces.
+    /// The same since the first start, as far as stored; without the interfaces.
     #[serde(default)]
     pub lifetime: Statistics,
     /// Readings by outcome.
     pub readings: ReadingCounts,
-    /// Inputs with a time before that of an earlier input.
+    /// Inputs with an earlier time than the input before them.
     pub time_backwards: u64,
     /// The loop.
     pub service: ServiceCounters,
@@ -198,11 +199,11 @@ pub struct StatusCounters {
 /// Checks of one protected input message.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MessageProtection {
-    /// Interface it comes on.
+    /// Interface of the message.
     pub interface: String,
-    /// Its identifier: 3 hexadecimal digits, or 8 when it is extended.
+    /// Its identifier: 3 hexadecimal digits, or 8 for an extended one.
     pub id: String,
-    /// Number of checks per status.
+    /// Number of checks with each status.
     pub checks: Vec<StatusCount>,
 }
 
@@ -218,11 +219,11 @@ pub struct StatusCount {
 /// Commands from the bus.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CommandStatus {
-    /// Interface they come on.
+    /// Interface of the commands.
     pub interface: String,
-    /// Their identifier, as in [`MessageProtection`].
+    /// Their identifier, formatted as in [`MessageProtection`].
     pub id: String,
-    /// Profile of SecOC; `None` = they are unauthenticated.
+    /// SecOC profile; `None` = the commands are unauthenticated.
     pub secoc: Option<String>,
 }
 
@@ -238,9 +239,9 @@ impl CommandStatus {
 /// Diagnostic requests of this program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PollStatus {
-    /// Why none is sent now; `None` = they are sent.
+    /// Why no requests are sent at present; `None` = they are sent.
     pub silent: Option<PollSilence>,
-    /// Requests that are not sent any more, because their controller refused them for good.
+    /// Number of requests that are no longer sent because their controller rejected them permanently.
     pub refused: usize,
 }
 
@@ -248,24 +249,24 @@ impl PollStatus {
     /// In words: `asking`, `silent: the bus sleeps`.
     pub fn words(&self) -> String {
         let state = self.silent.map_or_else(|| "asking".to_owned(), |reason| format!("silent: {}", reason.words()));
-        if self.refused == 0 { state } else { format!("{state}; {} refused for good", self.refused) }
+        if self.refused == 0 { state } else { format!("{state}; {} rejected permanently", self.refused) }
     }
 }
 
 /// A controller that answers diagnostic requests.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ControllerStatus {
-    /// Interface it is on.
+    /// Interface of the controller.
     pub interface: String,
-    /// Identifier of its answers, as in [`MessageProtection`].
+    /// Identifier of its answers, formatted as in [`MessageProtection`].
     pub id: String,
-    /// What came from it.
+    /// Counts of its answers.
     #[serde(flatten)]
     pub counts: ControllerCounts,
 }
 
 impl ControllerStatus {
-    /// The counts in words: `120 answers, 3 refused (latest code 31), 2 lost: wrong sequence 2`.
+    /// The counts in words: `120 answers, 3 rejections (latest code 31), 2 lost: wrong sequence`.
     pub fn words(&self) -> String {
         let counts = &self.counts;
         let mut words = format!("{} answers", counts.read);
@@ -277,7 +278,7 @@ impl ControllerStatus {
         add(counts.unasked, "of them unasked");
         add(counts.other, "not configured");
         add(counts.pending, "\"wait\"");
-        add(counts.refused, &format!("refused (latest code {:02X})", counts.latest_refusal.unwrap_or_default()));
+        add(counts.refused, &format!("rejections (latest code {:02X})", counts.latest_refusal.unwrap_or_default()));
         for (fault, count) in counts.losses() {
             add(count, &format!("lost: {}", fault.words()));
         }
@@ -285,28 +286,28 @@ impl ControllerStatus {
     }
 }
 
-/// Frames dropped of one input message.
+/// Dropped frames of one input message.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MessageFlood {
     /// Interface.
     pub interface: String,
-    /// Identifier, as in [`MessageProtection`].
+    /// Identifier, formatted as in [`MessageProtection`].
     pub id: String,
     /// Frames.
     pub dropped: u64,
 }
 
-/// What a sender that should not be there does.
+/// What an unexpected sender does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum IntruderKind {
-    /// It sends an input message beside its own sender.
+    /// It sends an input message in addition to the message's own sender.
     SecondSender,
-    /// It sends with an identifier of this program's frames.
+    /// It uses an identifier of this program's frames.
     OwnIdentifier,
 }
 
-/// A sender that should not be there.
+/// An unexpected sender.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Intruder {
     /// Interface.
@@ -321,22 +322,22 @@ pub struct Intruder {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct StoreStatus {
-    /// Its folder; empty when it could not be opened.
+    /// Its folder; empty if it could not be opened.
     pub path: String,
-    /// Whether it can be written; `None` = not tried yet.
+    /// Whether it can be written; `None` = not yet tried.
     pub works: Option<bool>,
     /// Commits done.
     pub commits: u64,
     /// Commits that failed.
     pub failures: u64,
-    /// Announcements sent before they were stored, because the commit took too long.
+    /// Results announced before they were stored, because the commit took too long.
     pub late: u64,
-    /// Size of the database and its log, bytes, as of the last commit; `None` = none yet.
+    /// Size of the database and its log at the last commit, bytes; `None` = no commit yet.
     pub file_bytes: Option<u64>,
 }
 
 impl ConfigFile {
-    /// Reads the files' names and fingerprint; `None` = they cannot be read any more.
+    /// Reads the files' names and checksum; `None` = they can no longer be read.
     pub fn of(path: &Path) -> Option<Self> {
         let files = ConfigFiles::find(path).ok()?;
         let mut digest = Sha256::new();

@@ -1,8 +1,8 @@
-//! The status document as metrics: OpenMetrics 1.0 text, or Prometheus' older text 0.0.4.
+//! The status document as metrics: OpenMetrics 1.0 text, or Prometheus' older text format 0.0.4.
 //!
 //! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`), counters end with
-//!   `_total`, cells count from 1 as people do.
-//! * Unknown values are left out: a value that is present is valid.
+//!   `_total`, cells count from 1.
+//! * Unknown values are omitted: a value that is present is valid.
 //! * All counters start with the daemon's process (`packwatch_uptime_seconds`), as readers that sum increases expect.
 //! * Without a daemon there is only `packwatch_up 0`.
 
@@ -25,7 +25,7 @@ use crate::monitor::{CellView, PackView, Validity};
 use crate::quantity::catalogue::{Part, Presentation, Unit, Values};
 use crate::quantity::{CellIndex, Mode};
 
-/// OpenMetrics text that ends with `# EOF`; `None` = there is no daemon.
+/// OpenMetrics text, which ends with `# EOF`; `None` = no daemon.
 pub fn openmetrics(document: Option<StatusDocument>) -> String {
     let mut registry = Registry::with_prefix("packwatch");
     registry.register_collector(Box::new(Metrics(document)));
@@ -35,7 +35,7 @@ pub fn openmetrics(document: Option<StatusDocument>) -> String {
     text
 }
 
-/// The same in Prometheus' form before OpenMetrics: a counter's description has its full name, units have no line.
+/// Converts it to Prometheus' older format: a counter's description has its full name, and there are no lines for units.
 pub fn prometheus_text(openmetrics: &str) -> String {
     let typed = |wanted: &str| -> HashSet<&str> {
         let types = openmetrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '));
@@ -71,10 +71,10 @@ pub fn prometheus_text(openmetrics: &str) -> String {
 #[derive(Debug)]
 struct Metrics(Option<StatusDocument>);
 
-/// Labels of one sample.
+/// Labels of a sample.
 type Labels = Vec<(&'static str, String)>;
 
-/// Writes families, each with its known samples.
+/// Writes metric families with the samples that are known.
 struct Families<'a>(DescriptorEncoder<'a>);
 
 impl Families<'_> {
@@ -260,7 +260,7 @@ fn cells(families: &mut Families<'_>, cells: &[CellView]) -> fmt::Result {
     quantities(families, "cell", &values)
 }
 
-/// The quantities of the catalogue, each with its standard deviation.
+/// The quantities of the catalogue and their standard deviations.
 fn quantities<const IS_PACK: bool>(
     families: &mut Families<'_>,
     owner: &str,
@@ -283,7 +283,7 @@ fn quantities<const IS_PACK: bool>(
     Ok(())
 }
 
-/// The unit in a metric's name, and its factor.
+/// The unit in a metric's name, and the factor to it.
 const fn metric_unit(unit: Unit) -> (&'static str, f64) {
     match unit {
         Unit::Level | Unit::Fraction | Unit::Ratio => ("ratio", 1.0),

@@ -1,4 +1,4 @@
-//! The thread that serialises documents and serves them. In: drafts from the loop. Out: lines to clients.
+//! The thread that serialises documents and sends them to clients. In: drafts from the loop. Out: lines to clients.
 
 use std::io;
 use std::path::PathBuf;
@@ -20,14 +20,14 @@ use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
-/// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
+/// Pause after a connection could not be accepted (no descriptor left); an immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
-/// Least time between two log lines about refusals.
+/// Shortest time between two log lines about rejected clients.
 const REFUSAL_LOG_PERIOD: Duration = Duration::from_secs(60);
-/// Stack of the thread, bytes: it serialises and waits.
+/// Stack of the thread, bytes; it only serialises and waits.
 const STACK_BYTES: usize = 512 << 10;
 
-/// A document that is not serialised yet.
+/// A document that has not been serialised yet.
 #[derive(Debug)]
 pub struct Draft {
     /// The document without its events.
@@ -56,7 +56,7 @@ struct PublishedLine {
 
 type Latest = watch::Receiver<Option<PublishedLine>>;
 
-/// The running sockets; dropping this closes them and deletes their files.
+/// The running sockets. Dropping this closes them and deletes their files.
 #[derive(Debug)]
 pub struct StatusServer {
     /// `None` only during the drop.
@@ -66,10 +66,10 @@ pub struct StatusServer {
 }
 
 impl StatusServer {
-    /// Opens the sockets. `None` = there are none, which is logged.
+    /// Opens the sockets. `None` = there are no sockets (logged).
     ///
     /// # Errors
-    /// When another daemon uses them, or a requested one cannot be created.
+    /// When another daemon uses them, or requested sockets cannot be created.
     pub fn start(setting: &PlaceSetting) -> Result<Option<Self>, String> {
         let Some((path, is_needed)) = setting.resolve(|| (daemon_path(), false)) else { return Ok(None) };
         match Self::open(path.clone(), Limits { max_silence: MAX_SILENCE, stale: STALE }) {
@@ -82,7 +82,7 @@ impl StatusServer {
     }
 
     fn open(path: PathBuf, limits: Limits) -> Result<Self, BindError> {
-        // One waits while another is serialised.
+        // One draft may wait while another is serialised.
         let (drafts, offered) = mpsc::channel(1);
         let (ready, opened) = sync_channel(1);
         let counters = Arc::<Mutex<ClientCounts>>::default();
@@ -96,12 +96,12 @@ impl StatusServer {
         }
     }
 
-    /// Offers a draft to the thread; `false` = the thread is busy, and the draft is dropped. Does not block.
+    /// Offers a draft to the thread; `false` = the thread is busy and the draft is dropped. Does not block.
     pub fn offer(&self, draft: Draft) -> bool {
         self.drafts.as_ref().is_some_and(|drafts| drafts.try_send(Box::new(draft)).is_ok())
     }
 
-    /// Counts of clients so far.
+    /// Client counts so far.
     pub fn clients(&self) -> ClientCounts {
         *self.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -112,19 +112,19 @@ impl Drop for StatusServer {
         // Closing the channel ends the thread; it does not wait for clients.
         self.drafts = None;
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
-            tracing::error!("the status thread had failed");
+            tracing::error!("the status thread has panicked");
         }
     }
 }
 
-/// Time limits; tests have shorter ones.
+/// Time limits; shorter in tests.
 #[derive(Debug, Clone, Copy)]
 struct Limits {
     max_silence: Duration,
     stale: Duration,
 }
 
-/// Shared by all clients.
+/// State shared by all clients.
 #[derive(Debug, Clone)]
 struct ClientContext {
     counters: Arc<Mutex<ClientCounts>>,
@@ -194,7 +194,7 @@ fn publish(draft: Draft, published: &watch::Sender<Option<PublishedLine>>) {
     }
 }
 
-/// Refusals since the last log line.
+/// Rejected clients since the last log line.
 #[derive(Debug, Default)]
 struct RefusalLog {
     unreported: u64,
@@ -205,13 +205,13 @@ impl RefusalLog {
     fn note(&mut self) {
         self.unreported += 1;
         if self.reported.is_none_or(|reported| reported.elapsed() >= REFUSAL_LOG_PERIOD) {
-            tracing::warn!(clients = self.unreported, limit = MAX_CLIENTS, "status clients refused: too many at once");
+            tracing::warn!(clients = self.unreported, limit = MAX_CLIENTS, "status clients rejected: too many at once");
             (self.unreported, self.reported) = (0, Some(Instant::now()));
         }
     }
 }
 
-/// Admits a client, if there is room.
+/// Admits a client if there is room.
 async fn admit(
     accepted: io::Result<UnixStream>,
     connected: usize,
@@ -242,7 +242,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
         latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
     let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
-        // The loop makes none, or has ended.
+        // The loop publishes nothing, or has ended.
         Ok(Err(_)) | Err(_) => None,
     };
     if let Some(line) = line {
@@ -250,7 +250,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
     }
 }
 
-/// Sends every document from here on; a slow client misses some.
+/// Sends every document from now on; a slow client misses some.
 async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     while latest.changed().await.is_ok() {
         let fresh =

@@ -21,8 +21,8 @@ interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 error
 counted    123456 readings used, 7 rejected; 3 late ticks; 99 % of estimates within 5.00 ms
 store      works, 21 commits, 0.1 MB
 commands   can0 6B3: unauthenticated
-requests   silent: another tester is active; 1 refused for good
-answers    can0 7EC: 120 answers, 3 refused (latest code 31), 2 lost: wrong sequence
+requests   silent: another tester is active; 1 rejected permanently
+answers    can0 7EC: 120 answers, 3 rejections (latest code 31), 2 lost: wrong sequence
 alarms     1 raised of 4 thresholds, 1 unknown
            severe capacity_low cell 1 active: 2.412 Ah, threshold 2.500 Ah, 97 % sure
            warning soc_low pack cleared: 63.2 %, threshold 10.0 %, acknowledged

@@ -1,4 +1,4 @@
-//! The control socket with good and bad clients: each is answered or dropped, and none blocks the loop or another client.
+//! The control socket with good and bad clients. Each is answered or dropped; none blocks the loop or another client.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ fn done(changed: u32) -> Answer {
     })
 }
 
-/// A server whose loop answers everything with the number of requests so far.
+/// A server whose loop answers every request with the number of requests so far.
 async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
     serve_patiently(folder, MAX_SILENCE).await
 }
@@ -57,7 +57,7 @@ async fn line(stream: &mut (impl AsyncRead + Unpin)) -> String {
 const REPLACED: Request = Request::Command(Command::PackReplaced);
 
 #[test]
-fn requests_of_a_connection_are_answered_in_turn() {
+fn requests_are_answered_in_order() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve(&folder).await;
@@ -68,22 +68,22 @@ fn requests_of_a_connection_are_answered_in_turn() {
             assert_eq!(done.changed, count);
         }
         client.write_all(b"rubbish\n").await.unwrap();
-        assert!(line(&mut client).await.contains("no JSON document"));
+        assert!(line(&mut client).await.contains("not a JSON document"));
         client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
         assert!(line(&mut client).await.contains("\"changed\":4"), "not served after rubbish");
     });
 }
 
 #[test]
-fn a_request_that_is_too_long_ends_its_connection() {
+fn overlong_request_ends_connection() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve(&folder).await;
         let mut client = connect(&path).await;
         client.write_all(&[b' '; MAX_REQUEST_BYTES + 1]).await.unwrap();
-        assert!(line(&mut client).await.contains("more than 4096 bytes"));
+        assert!(line(&mut client).await.contains("at most 4096 bytes"));
         assert_eq!(line(&mut client).await, "");
-        // The longest that is allowed is served.
+        // The longest allowed request is answered.
         let mut longest = REPLACED.to_line().into_bytes();
         longest.splice(0..0, std::iter::repeat_n(b' ', MAX_REQUEST_BYTES - longest.len()));
         let mut client = connect(&path).await;
@@ -93,7 +93,7 @@ fn a_request_that_is_too_long_ends_its_connection() {
 }
 
 #[test]
-fn a_silent_client_is_dropped() {
+fn silent_client_is_dropped() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         // Sockets need real time.
@@ -110,7 +110,7 @@ fn a_silent_client_is_dropped() {
 }
 
 #[test]
-fn a_client_that_never_reads_blocks_no_other_and_is_dropped() {
+fn client_that_never_reads_is_dropped() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve_patiently(&folder, Duration::from_millis(200)).await;
@@ -118,7 +118,7 @@ fn a_client_that_never_reads_blocks_no_other_and_is_dropped() {
         let flood = REPLACED.to_line().repeat(100);
         let mut client = connect(&path).await;
         let mut served = 0;
-        // Until its connection is closed, which is when a write to it fails.
+        // Until a write fails because the server has closed the connection.
         loop {
             match deaf.try_write(flood.as_bytes()) {
                 Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => break,
@@ -133,12 +133,12 @@ fn a_client_that_never_reads_blocks_no_other_and_is_dropped() {
 }
 
 #[test]
-fn silent_clients_give_way_to_one_that_asks() {
+fn request_displaces_silent_clients() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve(&folder).await;
         let mut silent = Vec::new();
-        // All of this process, which is one client.
+        // All connections of this process count as one client.
         for _ in 0..MAX_PER_PROCESS {
             silent.push(connect(&path).await);
         }
@@ -156,7 +156,7 @@ fn silent_clients_give_way_to_one_that_asks() {
 }
 
 #[test]
-fn a_dead_daemons_socket_is_replaced_and_a_live_ones_is_not() {
+fn only_dead_daemons_socket_is_replaced() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("control.sock");
@@ -175,7 +175,7 @@ fn a_dead_daemons_socket_is_replaced_and_a_live_ones_is_not() {
 }
 
 #[test]
-fn a_file_that_is_no_socket_is_not_touched() {
+fn file_that_is_not_a_socket_is_kept() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("control.sock");

@@ -1,4 +1,4 @@
-//! Reports of readiness, and the status line about interfaces, lost signals and reloads.
+//! Readiness reports, and the status line about interfaces, lost signals and reloads.
 
 use super::*;
 use crate::can::{CanId, Frame};
@@ -7,7 +7,7 @@ use crate::monitor::{MonitorConfig, Outputs, Record};
 use crate::quantity::{BusIndex, Timestamp};
 use std::path::Path;
 
-/// A core, its readiness, and the time of both.
+/// A core and its readiness, with their time.
 struct Scene {
     monitor: Monitor,
     readiness: Readiness,
@@ -53,7 +53,7 @@ impl Scene {
     }
 }
 
-/// A frame as the example's DBC has it: 3.7 V, 0 A, 25 degrees C.
+/// A frame that fits the example's DBC: 3.7 V, 0 A, 25 degrees C.
 fn good_frame() -> &'static Frame {
     leaked(0x100, &[0x50, 0xA5, 0x05, 0, 0, 0, 0xC4, 0x09])
 }
@@ -63,7 +63,7 @@ fn leaked(id: u16, data: &[u8]) -> &'static Frame {
 }
 
 #[test]
-fn ready_comes_with_the_first_usable_reading_and_not_before() {
+fn service_is_ready_with_first_usable_reading() {
     let mut scene = Scene::new(None);
     assert_eq!(scene.tick(0.0), ManagerUpdate { ready: false, status: Some("waiting for the first frame".to_owned()) });
     assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
@@ -78,7 +78,7 @@ fn ready_comes_with_the_first_usable_reading_and_not_before() {
 }
 
 #[test]
-fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_interface() {
+fn service_without_input_is_ready_after_wait() {
     let mut scene = Scene::new(Some(describe_restored(Some(12.4))));
     scene.bus(0.0, 0, BusEvent::Up);
     scene.bus(0.1, 1, BusEvent::Missing);
@@ -87,7 +87,7 @@ fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_inter
     assert!(update.ready);
     let line = update.status.expect("a line");
     assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
-    // The first frame after that is reported, too.
+    // The first frame is reported even after that.
     let frame = good_frame();
     scene.feed(1.5, |time| Record::frame(time, BusIndex(0), frame));
     assert_eq!(
@@ -97,7 +97,7 @@ fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_inter
 }
 
 #[test]
-fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
+fn status_line_changes_at_most_once_a_second() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
     scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
@@ -112,11 +112,11 @@ fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
 }
 
 #[test]
-fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
+fn lost_signals_are_counted_and_named() {
     let mut scene = Scene::with(None, |config| config.asleep_after_s = None);
     let frame = good_frame();
     scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
-    // Longer than a temperature may be old.
+    // Longer than the maximum age of a temperature.
     let line = scene.wait(130).expect("signals were lost");
     assert!(line.starts_with("running without input; 3 of 3 signals lost (pack current, "), "{line}");
     for _ in 0..20 {
@@ -126,11 +126,11 @@ fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
 }
 
 #[test]
-fn a_parked_vehicle_sleeps_and_has_lost_nothing() {
+fn parked_vehicle_is_asleep_without_lost_signals() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
     scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
-    assert_eq!(scene.wait(130).as_deref(), Some("running: the buses sleep"));
+    assert_eq!(scene.wait(130).as_deref(), Some("running: buses asleep"));
     for _ in 0..20 {
         scene.feed(0.1, |time| Record::frame(time, BusIndex(0), frame));
     }
@@ -138,20 +138,20 @@ fn a_parked_vehicle_sleeps_and_has_lost_nothing() {
 }
 
 #[test]
-fn a_rejected_reload_stays_in_the_line_until_one_is_applied() {
+fn rejected_reload_stays_in_line_until_next() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
     scene.feed(0.0, |time| Record::frame(time, BusIndex(0), frame));
     scene.readiness.note_reload(Some("pack.toml:3: pack.cells = 0,\nmust be 1 to 1024".to_owned()));
     let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("reported at once");
-    assert!(line.ends_with("; reload refused: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");
+    assert!(line.ends_with("; reload rejected: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");
     scene.readiness.note_reload(None);
     let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("reported at once");
     assert!(!line.contains("reload"), "{line}");
 }
 
 #[test]
-fn a_line_is_one_line_and_bounded() {
+fn status_line_has_no_control_characters() {
     assert_eq!(one_line("a\nREADY=1\tb", 100), "a READY=1 b");
     let long = "\u{fc}".repeat(2000);
     let line = one_line(&long, 1000);

@@ -1,4 +1,4 @@
-//! Metrics of a sample document, read as text and by the judge of the Prometheus project.
+//! Metrics of a sample document, checked as text and with promtool of the Prometheus project.
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
@@ -30,7 +30,7 @@ fn values_have_units_and_cells_count_from_1() {
 }
 
 #[test]
-fn the_vehicle_is_one_metric_and_no_label_of_the_others() {
+fn vehicle_is_a_metric_not_a_label() {
     let mut document = sample(2);
     let without = openmetrics(Some(document.clone()));
     document.vehicle.name = Some("Bus \"12\"".to_owned());
@@ -43,7 +43,7 @@ fn the_vehicle_is_one_metric_and_no_label_of_the_others() {
 }
 
 #[test]
-fn what_is_not_known_is_left_out() {
+fn unknown_values_are_omitted() {
     let mut document = sample(2);
     document.pack.values.set(Quantity::Soc, None::<f64>);
     document.cells[0].values.set(Quantity::Voltage, None::<f64>);
@@ -51,22 +51,22 @@ fn what_is_not_known_is_left_out() {
     assert!(!text.contains("packwatch_pack_soc_ratio") && !text.contains("packwatch_cell_voltage_volts"));
     let mut samples_only = text.lines().filter(|line| !line.starts_with('#'));
     assert!(samples_only.all(|line| !line.ends_with("NaN") && !line.ends_with("inf")));
-    // The second cell is silent, and of the first nothing else is lost.
+    // The second cell is silent; all values of the first cell except its voltage are present.
     assert_eq!(samples(&text, "packwatch_cell_soc_ratio"), ["packwatch_cell_soc_ratio{cell=\"1\"} 0.6"]);
-    // Without a daemon nothing is known at all.
+    // Without a daemon there is only one metric.
     let none = openmetrics(None);
     assert_eq!(none.lines().filter(|line| !line.starts_with('#')).collect::<Vec<_>>(), ["packwatch_up 0.0"]);
 }
 
 #[test]
-fn the_older_text_names_counters_in_full_and_has_no_units() {
+fn older_format_has_full_counter_names_without_units() {
     let text = prometheus_text(&openmetrics(Some(sample(2))));
     assert!(text.contains("# TYPE packwatch_half_cycles_total counter\npackwatch_half_cycles_total 12\n"), "{text}");
     assert!(text.contains("# TYPE packwatch_build_info gauge\npackwatch_build_info{version=\"1.2.3\"} 1\n"));
     assert!(!text.contains("# UNIT") && !text.contains("# EOF"));
 }
 
-/// `promtool check metrics` of the Debian package `prometheus`; `None` = it is not here.
+/// `promtool check metrics` of the Debian package `prometheus`; `None` = not installed.
 fn promtool(text: &str) -> Option<(bool, String)> {
     let mut child = Command::new("promtool")
         .args(["check", "metrics"])
@@ -82,7 +82,7 @@ fn promtool(text: &str) -> Option<(bool, String)> {
 }
 
 #[test]
-fn promtool_finds_no_fault() {
+fn promtool_accepts_metrics() {
     for cells in [1, 96, 1024] {
         let text = prometheus_text(&openmetrics(Some(sample(cells))));
         let Some((is_good, said)) = promtool(&text) else { return println!("SKIPPED: no promtool here") };

@@ -1,4 +1,4 @@
-//! Real sockets, in real time.
+//! The status sockets, tested with real sockets in real time.
 
 use std::io::Read;
 use std::os::unix::net::UnixStream;
@@ -22,7 +22,7 @@ fn draft(cells: u16, pid: u32) -> Draft {
     Draft { document: StatusDocument { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
 }
 
-/// Offers until the thread takes it.
+/// Offers until the thread accepts.
 fn offer(server: &StatusServer, cells: u16, pid: u32) {
     while !server.offer(draft(cells, pid)) {
         std::thread::sleep(Duration::from_millis(1));
@@ -35,7 +35,7 @@ fn connect(path: &Path) -> UnixStream {
     stream
 }
 
-/// Everything until the end.
+/// Reads until the end.
 fn rest(mut stream: UnixStream) -> Vec<u8> {
     let mut all = Vec::new();
     let _ = stream.read_to_end(&mut all);
@@ -51,10 +51,10 @@ fn until(what: &str, mut is_so: impl FnMut() -> bool) {
 }
 
 #[test]
-fn a_client_gets_one_document_and_the_end() {
+fn client_receives_one_document_then_eof() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
-    // Connected before there is a document: waits for the first.
+    // Connected before there is a document: the client waits for the first one.
     let early = connect(&path);
     offer(&server, 96, 1);
     let received = parse(&rest(early)).unwrap();
@@ -68,7 +68,7 @@ fn a_client_gets_one_document_and_the_end() {
 }
 
 #[test]
-fn the_stream_has_a_line_per_document() {
+fn stream_sends_a_line_per_document() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
     let mut stream = std::io::BufReader::new(connect(&stream_path(&path)));
@@ -87,7 +87,7 @@ fn the_stream_has_a_line_per_document() {
 }
 
 #[test]
-fn clients_beyond_the_limit_are_refused_at_once_and_counted() {
+fn clients_beyond_limit_are_rejected_and_counted() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
     let seated: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect(&stream_path(&path))).collect();
@@ -98,9 +98,9 @@ fn clients_beyond_the_limit_are_refused_at_once_and_counted() {
     assert_eq!((server.clients().served, server.clients().refused), (MAX_CLIENTS as u64, 136));
     offer(&server, 1, 7);
     for mut stream in seated {
-        assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "a client that is seated is not served");
+        assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "an admitted client is not served");
     }
-    // Those have closed: there is room again.
+    // They have closed, so there is room again.
     until("room", || {
         offer(&server, 1, 8);
         server.clients().connected == 0
@@ -109,12 +109,12 @@ fn clients_beyond_the_limit_are_refused_at_once_and_counted() {
 }
 
 #[test]
-fn a_client_that_never_reads_is_dropped_and_blocks_no_other() {
+fn client_that_never_reads_is_dropped() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), ..PATIENT });
     let deaf = [connect(&path), connect(&stream_path(&path))];
     until("connected", || server.clients().connected == 2);
-    // More than a socket holds.
+    // More than a socket's buffer can hold.
     let mut pid = 0;
     until("both are dropped", || {
         pid += 1;
@@ -126,7 +126,7 @@ fn a_client_that_never_reads_is_dropped_and_blocks_no_other() {
 }
 
 #[test]
-fn an_old_document_is_not_served() {
+fn stale_document_is_not_served() {
     let folder = tempfile::tempdir().unwrap();
     let stale = Duration::from_millis(100);
     let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), stale });
@@ -139,7 +139,7 @@ fn an_old_document_is_not_served() {
 }
 
 #[test]
-fn a_second_daemon_does_not_take_the_sockets() {
+fn second_daemon_cannot_take_the_sockets() {
     let folder = tempfile::tempdir().unwrap();
     let (_server, path) = serve(&folder, PATIENT);
     let error = StatusServer::start(&PlaceSetting::At(path)).unwrap_err();
@@ -147,10 +147,10 @@ fn a_second_daemon_does_not_take_the_sockets() {
 }
 
 #[test]
-fn an_offer_never_waits() {
+fn offer_never_blocks() {
     let folder = tempfile::tempdir().unwrap();
     let (server, _path) = serve(&folder, PATIENT);
-    // A document of 1,024 cells takes the thread milliseconds; offers come faster, and some must be refused.
+    // Serialising 1,024 cells takes the thread milliseconds; offers come faster, so some must be rejected.
     let taken = (0..200).filter(|pid| server.offer(draft(1024, *pid))).count();
     assert!((1..200).contains(&taken), "{taken} of 200 taken");
 }

@@ -1,4 +1,4 @@
-//! The manual's page of the quantities, written from the catalogue. `PACKWATCH_WRITE_PAGES=1 cargo test quantities` rewrites it.
+//! Generates the manual's page of quantities from the catalogue. `PACKWATCH_WRITE_PAGES=1 cargo test quantities` rewrites it.
 
 use std::fmt::Write as _;
 
@@ -35,7 +35,7 @@ fn table(
 }
 
 #[test]
-fn the_manual_lists_every_quantity() {
+fn manual_lists_every_quantity() {
     let wanted =
         HEAD.to_owned() + &table("Pack", "pack", PackValues::rows()) + &table("Cells", "cell", CellValues::rows());
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/src/reference/quantities.md");
