@@ -74,7 +74,6 @@ impl Timestamp {
 pub struct InvalidState {
     /// Name of the number.
     pub what: &'static str,
-    /// Its value.
     pub found: f64,
     /// Allowed range, with unit.
     pub allowed: &'static str,

@@ -19,13 +19,10 @@ use crate::quantity::{CellIndex, Timestamp};
 /// Current state of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {
-    /// The rule.
     pub rule: Rule,
-    /// Its severity.
     pub severity: Severity,
     /// The cell; `None` = the pack.
     pub cell: Option<CellIndex>,
-    /// Its state.
     pub state: AlarmState,
     /// The latest value, in the rule's unit; `None` = unknown.
     pub value: Option<f64>,
@@ -48,18 +45,14 @@ pub struct Alarm {
 /// A change of an alarm, with the state of the alarm after the change.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AlarmChange {
-    /// The change.
     pub change: Change,
-    /// The alarm after the change.
     pub alarm: Alarm,
 }
 
 /// Summary of all alarms of one threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ThresholdState {
-    /// The rule.
     pub rule: Rule,
-    /// Its severity.
     pub severity: Severity,
     /// Whether any alarm of the threshold is raised.
     pub is_raised: bool,
@@ -70,9 +63,7 @@ pub struct ThresholdState {
 /// One alarm of a stored state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StoredAlarm {
-    /// The rule.
     pub rule: Rule,
-    /// Its severity.
     pub severity: Severity,
     /// The cell; `None` = the pack.
     pub cell: Option<CellIndex>,

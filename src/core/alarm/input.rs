@@ -17,28 +17,23 @@ use crate::quantity::{CellIndex, Timestamp};
 pub enum AlarmInput {
     /// [`AlarmEngine::observe`].
     Observe {
-        /// The rule.
         rule: Rule,
         /// The cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// The value.
         observation: Observation,
     },
     /// Whether the inputs of a learned value are valid now. While they are not, the value cannot be renewed and changes
     /// no alarm. Ignored for rules that are not learned.
     InputsValid {
-        /// The rule.
         rule: Rule,
         /// The cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// Whether the inputs are valid.
         valid: bool,
     },
     /// [`AlarmEngine::poll`].
     Poll,
     /// [`AlarmEngine::handle_gap`].
     Gap,
-    /// Acknowledges alarms.
     Acknowledge(Selector),
     /// Clears alarms: latched alarms end (unless they are beyond their threshold again), the history of past alarms is
     /// forgotten. Alarms that are active, or whose value has not been healthy since, stay and count as refused. Learned

@@ -34,7 +34,6 @@ pub enum Comparison {
 /// One threshold of a rule, with debounce, hysteresis and latching.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RuleConfig {
-    /// The rule.
     pub rule: Rule,
     /// Its severity. A rule has at most one threshold per severity.
     pub severity: Severity,

@@ -76,7 +76,6 @@ pub enum Direction {
 pub enum Unit {
     /// Ah; the configuration may give a threshold as a fraction of the rated capacity.
     AmpereHours,
-    /// s.
     Seconds,
     /// 0 to 1.
     Fraction,
@@ -84,9 +83,7 @@ pub enum Unit {
     FractionPerDay,
     /// A multiple of a reference (of the value when new, of the expected value).
     Ratio,
-    /// Degrees C.
     Celsius,
-    /// Equivalent full cycles.
     Cycles,
 }
 

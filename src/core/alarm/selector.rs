@@ -9,9 +9,7 @@ use crate::quantity::CellIndex;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Selector {
-    /// The rule.
     pub rule: Option<Rule>,
-    /// The severity.
     pub severity: Option<Severity>,
     /// The cell, counted from 0. The pack's own alarms match only if this is not set.
     pub cell: Option<CellIndex>,

@@ -39,7 +39,6 @@ pub struct Database {
     pub nodes: Vec<String>,
     /// `CM_` of the database.
     pub comment: Option<String>,
-    /// The messages.
     pub messages: Vec<Message>,
 }
 

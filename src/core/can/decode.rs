@@ -34,13 +34,10 @@ impl MuxTest {
 /// One configured signal: its position, its conversion and its channel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Binding {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
     /// Payload length in the DBC, bytes. Used to encode frames, not to decode them.
     pub len_bytes: u16,
-    /// The signal.
     pub plan: SignalPlan,
     /// Conditions that must all hold; empty = always present.
     pub mux: Vec<MuxTest>,

@@ -33,9 +33,7 @@ impl Default for FloodConfig {
 /// Reports that dropping started or ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodChange {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
     /// Whether dropping started.
     pub active: bool,
@@ -47,11 +45,8 @@ pub struct FloodChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FloodCount {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
-    /// Dropped frames.
     pub dropped: u64,
 }
 

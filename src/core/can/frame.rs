@@ -140,7 +140,6 @@ impl Frame {
         Self { id, kind, len: bytes.len() as u8, data: Data(data) }
     }
 
-    /// The identifier.
     pub const fn id(&self) -> CanId {
         self.id
     }

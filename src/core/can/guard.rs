@@ -24,9 +24,7 @@ const MISSED_AFTER_PERIODS: f64 = 1.5;
 /// Configuration of one protected message.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GuardConfig {
-    /// Interface.
     pub bus: BusIndex,
-    /// Identifier.
     pub id: CanId,
     /// Settings of the check.
     pub check: CheckConfig,
@@ -37,9 +35,7 @@ pub struct GuardConfig {
 /// Reports that a message turned from usable to failing, or back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardChange {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
     /// The status that caused the change.
     pub status: Status,
@@ -54,9 +50,7 @@ pub struct GuardChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GuardCounts {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
     /// Number of checks by status.
     pub counts: StatusCounts,

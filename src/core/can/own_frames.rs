@@ -22,7 +22,6 @@ const GONE_S: f64 = 10.0;
 /// Reports that another sender started or stopped using packwatch's identifiers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OwnIdChange {
-    /// Interface.
     pub bus: BusIndex,
     /// Identifier of its latest frame.
     pub id: CanId,

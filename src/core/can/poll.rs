@@ -88,17 +88,13 @@ impl PollSilence {
 #[serde(rename_all = "snake_case", tag = "poll")]
 pub enum PollChange {
     /// Polling stopped.
-    Silent {
-        /// The reason.
-        reason: PollSilence,
-    },
+    Silent { reason: PollSilence },
     /// Polling started again.
     Asking,
     /// A controller rejected a request permanently; it is never sent again.
     Refused {
         /// The controller, by the identifier of its responses.
         id: CanId,
-        /// Service.
         service: u8,
         /// Identifier of the requested value.
         identifier: u16,

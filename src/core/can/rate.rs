@@ -48,9 +48,7 @@ const CHANCE_SHORT: f64 = 0.02;
 /// Reports that a second sender was found or is gone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SenderChange {
-    /// Interface.
     pub bus: BusIndex,
-    /// Message.
     pub id: CanId,
     /// Whether a second sender was found.
     pub active: bool,

@@ -54,7 +54,6 @@ pub enum Profile {
 }
 
 impl Profile {
-    /// All profiles.
     pub const ALL: [Self; 4] = [Self::P1, Self::P3, Self::Fd, Self::Announcement];
 
     /// Name in the configuration.
@@ -109,7 +108,6 @@ pub struct MacInput {
 }
 
 impl MacInput {
-    /// The bytes.
     pub fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }

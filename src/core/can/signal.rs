@@ -25,7 +25,6 @@ pub enum ByteOrder {
 /// Number format of a signal's bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ValueType {
-    /// Unsigned integer.
     Unsigned,
     /// Two's complement.
     Signed,

@@ -48,7 +48,6 @@ impl Service {
 /// A controller on a bus, with the identifiers of its requests and responses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Controller {
-    /// Interface.
     pub bus: BusIndex,
     /// Identifier of its responses.
     pub response: CanId,
@@ -63,9 +62,7 @@ pub struct Controller {
 /// A diagnostic request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Question {
-    /// The controller.
     pub controller: Controller,
-    /// Service.
     pub service: Service,
     /// Identifier of the requested value.
     pub identifier: u16,
@@ -102,7 +99,6 @@ pub struct AnswerSignal {
 pub struct Answer {
     /// The request that it answers.
     pub question: Question,
-    /// Its signals.
     pub signals: Vec<AnswerSignal>,
 }
 
@@ -170,7 +166,6 @@ impl ControllerCounts {
 /// Reports that messages of a controller were lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MessageLoss {
-    /// Interface.
     pub bus: BusIndex,
     /// Identifier of the controller's responses.
     pub id: CanId,
@@ -208,7 +203,6 @@ pub enum Heard<'a> {
     Refused {
         /// Index in [`Listener::counts`].
         controller: usize,
-        /// The refusal.
         refusal: Refusal,
     },
     /// A complete response.

@@ -24,7 +24,6 @@ impl Quantity {
 /// A known unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalUnit {
-    /// Its quantity.
     pub quantity: Quantity,
     /// Factor to the program's unit: value x factor + offset; 1 for a quantity without such a unit.
     pub factor: f64,

@@ -9,9 +9,7 @@ use super::InvalidState;
 /// A closed range, with a description that includes the unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
-    /// Smallest value.
     pub low: f64,
-    /// Largest value.
     pub high: f64,
     /// The range in words, with the unit.
     pub allowed: &'static str,

@@ -14,7 +14,6 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 /// A value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// Mean.
     pub mean: f64,
     /// Standard deviation; `None` = the value has none.
     pub std: Option<f64>,
@@ -51,9 +50,7 @@ impl From<f64> for Estimate {
 /// Which number of an [`Estimate`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
-    /// Its mean.
     Mean,
-    /// Its standard deviation.
     Std,
 }
 
@@ -66,17 +63,12 @@ pub enum Unit {
     Fraction,
     /// Multiple of the value when new.
     Ratio,
-    /// V.
     Volts,
     /// A, positive = discharge.
     Amperes,
-    /// Degrees C.
     Celsius,
-    /// Ah.
     AmpereHours,
-    /// s.
     Seconds,
-    /// Days.
     Days,
     /// Equivalent full cycles.
     Cycles,
@@ -117,20 +109,17 @@ pub struct Presentation {
     pub mqtt_key: Option<&'static str>,
     /// Name of its entity in Home Assistant; empty for a cell, which has no entity.
     pub mqtt_name: &'static str,
-    /// VSS signal.
     pub vss: VssPath,
 }
 
 /// A row of the catalogue.
 #[derive(Debug, Clone, Copy)]
 pub struct QuantityRow {
-    /// The quantity.
     pub quantity: Quantity,
     /// JSON key and column name of its mean.
     pub key: &'static str,
     /// JSON key and column name of its standard deviation; `None` = it has none.
     pub std_key: Option<&'static str>,
-    /// Unit.
     pub unit: Unit,
     /// Name of its metric, without prefix and unit.
     pub metric: &'static str,
@@ -351,7 +340,6 @@ pub static TABLE: [QuantityRow; 23] =
     ];
 
 impl Quantity {
-    /// Its row.
     pub fn row(self) -> &'static QuantityRow {
         &TABLE[self as usize]
     }
@@ -361,9 +349,7 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Values<const IS_PACK: bool>([Option<Estimate>; TABLE.len()]);
 
-/// The values of the pack.
 pub type PackValues = Values<true>;
-/// The values of one cell.
 pub type CellValues = Values<false>;
 
 impl<const IS_PACK: bool> Default for Values<IS_PACK> {
@@ -378,17 +364,14 @@ impl<const IS_PACK: bool> Values<IS_PACK> {
         TABLE.iter().filter_map(|row| Some((row, if IS_PACK { row.pack.as_ref() } else { row.cell.as_ref() }?)))
     }
 
-    /// The value of a quantity.
     pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
         self.0[quantity as usize]
     }
 
-    /// The mean of a quantity.
     pub fn mean(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity).map(|estimate| estimate.mean)
     }
 
-    /// The standard deviation of a quantity.
     pub fn std(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity)?.std
     }
@@ -436,12 +419,10 @@ impl RecordedValues {
         RECORDED.iter().zip(self.0).find(|(recorded, _)| **recorded == quantity)?.1
     }
 
-    /// The mean of a quantity.
     pub fn mean(&self, quantity: Quantity) -> Option<f64> {
         self.get(quantity).map(|estimate| estimate.mean)
     }
 
-    /// Mean and standard deviation of a quantity.
     pub fn pair(&self, quantity: Quantity) -> Option<(f64, f64)> {
         self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
     }

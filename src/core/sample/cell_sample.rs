@@ -15,7 +15,6 @@ use crate::quantity::{CellIndex, InvalidState, Timestamp};
 pub struct CellSample {
     /// Time of the voltage reading.
     pub time: Timestamp,
-    /// The cell.
     pub cell: CellIndex,
     /// Cell voltage, V.
     pub voltage_v: f64,

@@ -25,7 +25,6 @@ pub const FLOW_SHARE: f64 = 0.01;
 /// A signal that turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
-    /// The channel of the signal.
     pub channel: Channel,
     /// Its new state.
     pub state: Result<u64, Fault>,
@@ -136,7 +135,6 @@ impl Sampler {
         }
     }
 
-    /// Returns the settings.
     pub fn config(&self) -> &SampleConfig {
         &self.config
     }

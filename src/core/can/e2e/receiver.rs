@@ -99,7 +99,6 @@ impl Status {
 pub struct StatusCounts([u64; Status::ALL.len()]);
 
 impl StatusCounts {
-    /// Count of `status`.
     pub const fn get(&self, status: Status) -> u64 {
         self.0[status as usize]
     }
@@ -109,7 +108,6 @@ impl StatusCounts {
         Status::ALL.into_iter().map(|status| (status, self.get(status)))
     }
 
-    /// Sum over all statuses.
     pub fn total(&self) -> u64 {
         self.0.iter().fold(0, |sum, count| sum.saturating_add(*count))
     }
@@ -176,7 +174,6 @@ impl Receiver {
         self.last_valid.map(|last| profile.next_counter(last))
     }
 
-    /// Count of each status.
     pub const fn counts(&self) -> &StatusCounts {
         &self.counts
     }

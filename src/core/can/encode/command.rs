@@ -13,10 +13,8 @@ use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{CellIndex, MAX_CELLS};
 
-/// Kind of command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
-    /// Acknowledges alarms.
     Acknowledge,
     /// Clears latched alarms whose cause has ended.
     Clear,
@@ -27,13 +25,11 @@ pub enum Command {
 /// A command and the alarms it selects; `None` = all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
-    /// Kind.
     pub command: Command,
     /// Number of the rule.
     pub rule: Option<u8>,
     /// 1 info, 2 warning, 3 severe.
     pub severity: Option<u8>,
-    /// The cell.
     pub cell: Option<CellIndex>,
 }
 
@@ -90,7 +86,6 @@ impl CommandPlan {
         }
     }
 
-    /// Identifier of the message.
     pub fn id(&self) -> CanId {
         self.id
     }

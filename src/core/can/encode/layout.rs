@@ -59,11 +59,8 @@ fn shipped() -> &'static Database {
 /// A message of the layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LayoutMessage {
-    /// Status frame.
     Status,
-    /// Health frame.
     Health,
-    /// Alarm frame.
     Alarm,
     /// Command frame, received.
     Command,
@@ -140,7 +137,6 @@ pub enum E2eSetting {
 /// Settings of one message; `None` = as in the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MessageSettings {
-    /// Identifier.
     pub id: Option<CanId>,
     /// Whether it is sent in FD frames.
     pub fd: Option<bool>,
@@ -148,7 +144,6 @@ pub struct MessageSettings {
     pub brs: Option<bool>,
     /// Cycle time, ms.
     pub period_ms: Option<u32>,
-    /// Protection.
     pub e2e: E2eSetting,
     /// Authentication; `None` = not authenticated.
     pub secoc: Option<Authentication>,
@@ -169,11 +164,8 @@ pub enum LayoutBase<'d> {
 /// Settings of all messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LayoutSettings {
-    /// Status frame.
     pub status: MessageSettings,
-    /// Health frame.
     pub health: MessageSettings,
-    /// Alarm frame.
     pub alarm: MessageSettings,
     /// Command frame; `None` = commands are not accepted.
     pub command: Option<MessageSettings>,
@@ -203,7 +195,6 @@ impl LayoutSettings {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {what}", .message.message())]
 pub struct SettingFault {
-    /// Message.
     pub message: LayoutMessage,
     /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`, `secoc`.
     pub key: &'static str,

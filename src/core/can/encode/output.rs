@@ -169,15 +169,11 @@ pub struct OutputPlan {
 /// Properties of one sent message in a layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SentMessage {
-    /// The message.
     pub message: LayoutMessage,
-    /// Identifier.
     pub id: CanId,
     /// Kind of its frames.
     pub format: FrameFormat,
-    /// End-to-end protection.
     pub protection: Option<Protection>,
-    /// Authentication.
     pub secoc: Option<Authentication>,
     /// Cycle time, ms; `None` = sent only on an event.
     pub cycle_time_ms: Option<u32>,

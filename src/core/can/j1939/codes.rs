@@ -19,9 +19,7 @@ const MAX_FOLLOWED: usize = 64;
 /// An active code and its lamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ActiveCode {
-    /// The code.
     pub code: TroubleCode,
-    /// Its lamp.
     pub lamp: Lamp,
 }
 

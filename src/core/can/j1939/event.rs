@@ -9,10 +9,7 @@ use super::name::Name;
 #[serde(rename_all = "snake_case", tag = "node_event")]
 pub enum NodeEvent {
     /// The node has its address; codes are sent from now on.
-    Claimed {
-        /// The address.
-        address: u8,
-    },
+    Claimed { address: u8 },
     /// Another node took the address; codes are no longer sent.
     AddressLost {
         /// Its NAME; this node's own NAME if two nodes have the same configuration.

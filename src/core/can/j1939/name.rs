@@ -38,7 +38,6 @@ pub struct NameFields {
 pub struct OutOfRange {
     /// Name of the number.
     pub field: &'static str,
-    /// Its value.
     pub found: u64,
     /// Smallest allowed.
     pub lowest: u64,

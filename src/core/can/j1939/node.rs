@@ -34,7 +34,6 @@ const MAX_WAITING_ANSWERS: usize = 4;
 /// Identity of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NodeConfig {
-    /// NAME.
     pub name: Name,
     /// Claimed address, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
     pub address: u8,

@@ -87,7 +87,6 @@ impl TroubleCode {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lamp {
-    /// None.
     None,
     /// Protect: a fault outside the electronics.
     Protect,
@@ -153,7 +152,6 @@ pub struct DmPayload {
 }
 
 impl DmPayload {
-    /// The bytes.
     pub fn as_slice(&self) -> &[u8] {
         self.bytes.get(..self.len).unwrap_or(&self.bytes)
     }

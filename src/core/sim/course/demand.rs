@@ -6,7 +6,8 @@ pub(crate) enum Demand {
     /// This cell current flows until the next sample, A, positive = discharge.
     Current(f64),
     /// The vehicle sleeps: no current, no measurements.
-    Asleep { duration_s: f64 },
-    /// The scenario is over.
+    Asleep {
+        duration_s: f64,
+    },
     Finished,
 }
