@@ -155,7 +155,7 @@ impl SensorIndex {
     }
 }
 
-/// Input that a configured signal feeds.
+/// The input that a configured signal provides.
 ///
 /// The order is the order in which readings of one frame are processed: a voltage triggers the estimator, so current
 /// and temperature of the same frame come first.

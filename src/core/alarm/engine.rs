@@ -71,7 +71,7 @@ pub struct StoredAlarm {
 }
 
 impl StoredAlarm {
-    /// Whether it was raised.
+    /// Whether the alarm is raised.
     pub fn is_raised(&self) -> bool {
         self.machine.state.is_raised()
     }

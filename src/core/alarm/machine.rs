@@ -196,7 +196,7 @@ impl Machine {
         self.judge(now, rule)
     }
 
-    /// The time up to the next observation does not count.
+    /// Stops counting time until the next observation.
     pub(super) fn handle_gap(&mut self) {
         self.counted_to = None;
     }

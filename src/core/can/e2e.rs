@@ -14,7 +14,7 @@
 //! The CRC of profile 1 equals the AUTOSAR library's CRC-8 with its start value and final XOR (0xFF) cancelled.
 //!
 //! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
-//! Library" as implemented by two peers and four open receivers; vectors in the tests.
+//! Library", as implemented by two test peers and four open-source receivers; vectors in the tests.
 //!
 //! Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
 //! provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles

@@ -1,4 +1,4 @@
-//! Sends diagnostic requests to controllers, and stops at every sign that it could disturb.
+//! Sends diagnostic requests to controllers, and stops when they could disturb the vehicle or another tester.
 //!
 //! In: frames, responses, the state of the car, the supply voltage, the time. Out: request and flow control frames, and
 //! a [`PollChange`] each time that polling stops or starts. One request is outstanding at a time. Polling stops while
@@ -412,7 +412,7 @@ impl Poller {
         self.progress.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
         self.progress.latest = Some(index);
         self.progress.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
-        // A request without a period in this state is sent only for the sake of another one.
+        // A request without a period in this state is sent only before a request for voltages.
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);

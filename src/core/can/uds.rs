@@ -186,7 +186,7 @@ pub struct Refusal {
 
 /// Result of a received frame.
 #[derive(Debug, PartialEq)]
-pub enum Heard<'a> {
+pub enum FrameOutcome<'a> {
     /// Nothing to decode.
     Nothing,
     /// The first frame of a response. Its values were measured now.
@@ -213,7 +213,7 @@ pub enum Heard<'a> {
         answer: &'a Answer,
         /// Its data, after the echoed service and identifier.
         data: &'a [u8],
-        /// Whether it arrived in a single frame, without a preceding [`Heard::Begun`].
+        /// Whether it arrived in a single frame, without a preceding [`FrameOutcome::Begun`].
         is_single: bool,
     },
 }
@@ -343,18 +343,18 @@ impl Listener {
 
     /// Handles a received frame.
     #[inline]
-    pub fn handle(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Heard<'_> {
+    pub fn handle(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> FrameOutcome<'_> {
         if self.links.is_empty() || self.ids.number(bus, frame.id()) >= self.id_count {
-            return Heard::Nothing;
+            return FrameOutcome::Nothing;
         }
         self.handle_wanted(now, bus, frame)
     }
 
-    fn handle_wanted(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Heard<'_> {
+    fn handle_wanted(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> FrameOutcome<'_> {
         if frame.kind() == FrameKind::Remote {
-            return Heard::Nothing;
+            return FrameOutcome::Nothing;
         }
-        let mut heard = None;
+        let mut outcome = None;
         for (index, link) in self.links.iter_mut().enumerate().filter(|(_, link)| link.controller.bus == bus) {
             if link.controller.request == frame.id() {
                 let fault = link.handle_request(now, frame.data());
@@ -365,26 +365,26 @@ impl Listener {
                 let received = link.receiver.handle(now, frame.data());
                 link.note(now, received.fault, &mut self.losses);
                 match received.progress {
-                    Progress::Begun => heard = Some((index, Progress::Begun, false)),
+                    Progress::Begun => outcome = Some((index, Progress::Begun, false)),
                     Progress::Complete => {
-                        heard = Some((index, Progress::Complete, !was_receiving || received.fault.is_some()))
+                        outcome = Some((index, Progress::Complete, !was_receiving || received.fault.is_some()))
                     }
-                    Progress::Continued => heard = Some((index, Progress::Continued, false)),
+                    Progress::Continued => outcome = Some((index, Progress::Continued, false)),
                     Progress::None => {}
                 }
             }
         }
-        match heard {
-            Some((controller, Progress::Begun, _)) => Heard::Begun { controller },
-            Some((controller, Progress::Continued, _)) => Heard::Continued { controller },
+        match outcome {
+            Some((controller, Progress::Begun, _)) => FrameOutcome::Begun { controller },
+            Some((controller, Progress::Continued, _)) => FrameOutcome::Continued { controller },
             Some((controller, Progress::Complete, is_single)) => self.whole(now, controller, is_single),
-            Some((_, Progress::None, _)) | None => Heard::Nothing,
+            Some((_, Progress::None, _)) | None => FrameOutcome::Nothing,
         }
     }
 
-    fn whole(&mut self, now: Timestamp, controller: usize, is_single: bool) -> Heard<'_> {
+    fn whole(&mut self, now: Timestamp, controller: usize, is_single: bool) -> FrameOutcome<'_> {
         let Self { answers, links, .. } = self;
-        let Some(link) = links.get_mut(controller) else { return Heard::Nothing };
+        let Some(link) = links.get_mut(controller) else { return FrameOutcome::Nothing };
         let message = link.receiver.message();
         // 0x7F is the first byte of a negative response (ISO 14229-1, table A.1).
         if let &[0x7F, service, code, ..] = message {
@@ -395,14 +395,14 @@ impl Listener {
                 link.counts.refused = link.counts.refused.saturating_add(1);
                 link.counts.latest_refusal = Some(code);
             }
-            return Heard::Refused { controller, refusal: Refusal { service, code } };
+            return FrameOutcome::Refused { controller, refusal: Refusal { service, code } };
         }
         let is_own = |answer: &&Answer| {
             answer.question.controller == link.controller && message.starts_with(&answer.question.answer_head())
         };
         let Some(answer) = answers.iter().find(is_own) else {
             link.counts.other = link.counts.other.saturating_add(1);
-            return Heard::Nothing;
+            return FrameOutcome::Nothing;
         };
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
@@ -411,7 +411,7 @@ impl Listener {
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
-        Heard::Whole { controller, answer, data: &link.receiver.message()[head.len()..], is_single }
+        FrameOutcome::Whole { controller, answer, data: &link.receiver.message()[head.len()..], is_single }
     }
 }
 

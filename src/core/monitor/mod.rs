@@ -34,7 +34,7 @@ use crate::can::Frame;
 use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::can::secoc::MacCheck;
-use crate::can::uds::Heard;
+use crate::can::uds::FrameOutcome;
 use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::quantity::{BusIndex, Channel, Reading, Timestamp, bounds};
 
@@ -192,21 +192,21 @@ impl Monitor {
         let Self { clock, intake, stages, .. } = self;
         let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
         match listener.handle(now, bus, frame) {
-            Heard::Nothing => {}
-            Heard::Begun { controller } => {
+            FrameOutcome::Nothing => {}
+            FrameOutcome::Begun { controller } => {
                 moments[controller] = Some(stages.sampling.sampler.moment(now));
                 let begun = |poller: &mut Poller, out: &mut _| poller.handle_begun(now, &controllers[controller], out);
                 stages.sending.poll_with(now, out, begun);
             }
-            Heard::Continued { controller } => {
+            FrameOutcome::Continued { controller } => {
                 stages.sending.poll_with(now, out, |poller, _| poller.handle_continued(now, &controllers[controller]));
             }
-            Heard::Refused { controller, refusal } => {
+            FrameOutcome::Refused { controller, refusal } => {
                 stages.sending.poll_with(now, out, |poller, out| {
                     poller.handle_refusal(now, &controllers[controller], refusal, out);
                 });
             }
-            Heard::Whole { controller, answer, data, is_single } => {
+            FrameOutcome::Whole { controller, answer, data, is_single } => {
                 stages.end_bus_sleep(now, out);
                 let began = moments[controller].take();
                 // Of an answer with the current everything is of one time anyway: that of its end.

@@ -6,9 +6,9 @@
 //!
 //! | scenario | nominal | source | course |
 //! | --- | --- | --- | --- |
-//! | `paper` | 2.6 Ah | the paper's own run | 1.325 A both ways between SOC 0.3 and 0.9, 0.05 Ah lost per cycle, until 0.25 Ah: 48 cycles, 2.23e5 s |
+//! | `paper` | 2.6 Ah | the paper's own run | 1.325 A in both directions between SOC 0.3 and 0.9, 0.05 Ah lost per cycle, until 0.25 Ah: 48 cycles, 2.23e5 s |
 //! | `reference` | 30 Ah | the published example | discharge by random pulses (15 A mean), charge by 15 A, 0.3 to 0.9, 1 Ah lost per cycle |
-//! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | 5 min loads of -4.5 to 4.5 A within 3.2 to 4.2 V; two reference cycles after every 1,500 of them |
+//! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | 5 min loads of -4.5 to 4.5 A within 3.2 to 4.2 V; two reference cycles after every 1,500 loads |
 //! | `ev-day` | 50 Ah | packwatch | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
 
 use super::sensor::{SensorError, Sensors};
@@ -124,8 +124,7 @@ impl Settings {
         s
     }
 
-    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV noise, capacities within 1
-    /// %.
+    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV noise, 1 % capacity spread.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;

@@ -72,7 +72,7 @@ pub struct PackSettings {
     pub hysteresis: Hysteresis,
     /// Self-discharge, A.
     pub leakage_a: f64,
-    /// Temperature of the surroundings and of the cells at the start, degrees C.
+    /// Ambient temperature, and temperature of the cells at the start, degrees C.
     pub ambient_c: f64,
 }
 

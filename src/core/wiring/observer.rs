@@ -10,7 +10,7 @@ use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan};
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
-use crate::can::uds::{Answer, Heard, Listener, Question};
+use crate::can::uds::{Answer, FrameOutcome, Listener, Question};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
@@ -205,7 +205,7 @@ impl WiringObserver {
     /// Reads the signals of an answer that the frame completes.
     fn read_answer(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.listener.losses.clear();
-        let Heard::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
+        let FrameOutcome::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
         let (question, data) = (answer.question, data.to_vec());
         let Some(signals) = self.by_question.remove(&question) else { return };
         self.read_signals(time, &signals, &data);

@@ -16,7 +16,7 @@ fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_e
     RuleConfig { rule, severity, threshold, clear, when, debounce_s, debounce_events, is_latching: false }
 }
 
-fn see(
+fn observe(
     engine: &mut AlarmEngine,
     now: Timestamp,
     rule: Rule,
@@ -46,7 +46,7 @@ fn noise_at_threshold_raises_and_clears_once() {
         let value = mean + rng.random_range(-0.4..0.4);
         crossings += u32::from((value > 3.0) != was_beyond);
         was_beyond = value > 3.0;
-        see(&mut engine, at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), &mut changes);
+        observe(&mut engine, at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), &mut changes);
     }
     assert!(crossings > 10_000, "the noise must cross the threshold often, but did so only {crossings} times");
     assert_eq!(changes.iter().map(|change| change.change).collect::<Vec<_>>(), [Change::Raised, Change::Cleared]);
@@ -57,9 +57,9 @@ fn noise_at_threshold_raises_and_clears_once() {
 fn lost_input_keeps_active_alarm_without_value() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.05, 0.0, 1)], 2);
     let mut changes = Vec::new();
-    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     assert_eq!(changes.len(), 1);
-    see(&mut engine, at(10.0), Rule::CapacityLow, CELL, None, &mut changes);
+    observe(&mut engine, at(10.0), Rule::CapacityLow, CELL, None, &mut changes);
     engine.poll(at(1e6), &mut changes);
     let heard: Vec<_> = changes.iter().map(|change| change.change).collect();
     assert_eq!(heard, [Change::Raised, Change::Suppressed], "expected neither a clear nor another raise");
@@ -74,8 +74,8 @@ fn unknown_values_raise_no_alarm() {
     let mut changes = Vec::new();
     for r in Rule::ALL {
         for cell in [None, CELL] {
-            see(&mut engine, at(0.0), r, cell, None, &mut changes);
-            see(&mut engine, at(1.0), r, cell, Some(f64::NAN), &mut changes);
+            observe(&mut engine, at(0.0), r, cell, None, &mut changes);
+            observe(&mut engine, at(1.0), r, cell, Some(f64::NAN), &mut changes);
         }
     }
     engine.poll(at(100.0), &mut changes);
@@ -87,8 +87,8 @@ fn only_learned_values_debounce_without_new_observation() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 30.0, 1), rule(Rule::EstimateUntrusted, 3.0, 0.0, 30.0, 1)];
     let mut engine = AlarmEngine::new(rules, 1);
     let mut changes = Vec::new();
-    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
-    see(&mut engine, at(0.0), Rule::EstimateUntrusted, CELL, Some(9.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
+    observe(&mut engine, at(0.0), Rule::EstimateUntrusted, CELL, Some(9.0), &mut changes);
     engine.poll(at(29.9), &mut changes);
     assert_eq!(changes, []);
     engine.poll(at(30.0), &mut changes);
@@ -100,11 +100,11 @@ fn only_learned_values_debounce_without_new_observation() {
 fn gap_does_not_debounce_measured_values() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::InputMissing, 5.0, 0.0, 10.0, 1)], 1);
     let mut changes = Vec::new();
-    see(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     engine.handle_gap();
-    see(&mut engine, at(1000.0), Rule::InputMissing, None, Some(6.0), &mut changes);
+    observe(&mut engine, at(1000.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(changes, []);
-    see(&mut engine, at(1010.0), Rule::InputMissing, None, Some(6.0), &mut changes);
+    observe(&mut engine, at(1010.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(changes.len(), 1);
 }
 
@@ -113,7 +113,7 @@ fn poll_raises_all_due_alarms_at_once() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 1.0, 1)], 5);
     let mut changes = Vec::new();
     for cell in 0..5 {
-        see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut changes);
+        observe(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut changes);
     }
     engine.poll(at(1.0), &mut changes);
     let cells: Vec<_> = changes.iter().map(|change| change.alarm.cell.map(|cell| cell.0)).collect();
@@ -131,11 +131,11 @@ fn raised_alarms_are_sorted_by_rule_and_cell() {
         3,
     );
     let mut changes = Vec::new();
-    see(&mut engine, at(0.0), Rule::InputMissing, Some(CellIndex(1)), Some(6.0), &mut changes);
-    see(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::InputMissing, Some(CellIndex(1)), Some(6.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(engine.highest_severity(), Some(Severity::Warning));
-    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(1.3), &mut changes);
-    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(0)), Some(1.1), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(1.3), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(0)), Some(1.1), &mut changes);
     let listed: Vec<_> = engine.raised().map(|a| (a.rule, a.severity, a.cell.map(|cell| cell.0))).collect();
     assert_eq!(
         listed,
@@ -154,9 +154,9 @@ fn raised_alarms_are_sorted_by_rule_and_cell() {
 fn values_of_unwatched_rules_and_cells_are_ignored() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 2);
     let mut changes = Vec::new();
-    see(&mut engine, at(0.0), Rule::CapacityLow, None, Some(0.0), &mut changes);
-    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), &mut changes);
-    see(&mut engine, at(0.0), Rule::RechargePeriodLow, None, Some(0.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, None, Some(0.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), &mut changes);
+    observe(&mut engine, at(0.0), Rule::RechargePeriodLow, None, Some(0.0), &mut changes);
     assert_eq!(changes, []);
     assert_eq!(engine.get(Rule::CapacityLow, Some(CellIndex(1))).map(|alarm| alarm.state), Some(AlarmState::Unknown));
     assert_eq!(engine.get(Rule::RechargePeriodLow, None), None);
@@ -167,8 +167,8 @@ fn restored_engine_behaves_like_stored_engine() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 10.0, 2), rule(Rule::RechargePeriodLow, 900.0, 0.0, 0.0, 1)];
     let mut first = AlarmEngine::new(rules.clone(), 2);
     let mut changes = Vec::new();
-    see(&mut first, at(0.0), Rule::RechargePeriodLow, None, Some(800.0), &mut changes);
-    see(&mut first, at(5.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
+    observe(&mut first, at(0.0), Rule::RechargePeriodLow, None, Some(800.0), &mut changes);
+    observe(&mut first, at(5.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     let text = serde_json::to_string(&first.snapshot()).expect("serialises");
     let mut state: AlarmSnapshot = serde_json::from_str(&text).expect("reads back");
     assert_eq!(text, serde_json::to_string(&state).expect("serialises"));
@@ -177,7 +177,7 @@ fn restored_engine_behaves_like_stored_engine() {
     assert_eq!(second.restore(&state), []);
     assert_eq!(second.raised().next().and_then(|a| a.last_raised), Some(at(1000.0)));
     changes.clear();
-    see(&mut second, at(1014.9), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
+    observe(&mut second, at(1014.9), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     assert_eq!(changes, []);
     second.poll(at(1015.0), &mut changes);
     assert_eq!(changes.len(), 1);
@@ -187,7 +187,7 @@ fn restored_engine_behaves_like_stored_engine() {
 fn restore_returns_alarms_of_removed_rules() {
     let mut first = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 4);
     for cell in 0..4 {
-        see(&mut first, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut Vec::new());
+        observe(&mut first, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut Vec::new());
     }
     let mut fewer_cells = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 3);
     assert_eq!(fewer_cells.restore(&first.snapshot()).len(), 1);
@@ -204,10 +204,10 @@ fn unknown_thresholds_are_counted_and_rotated() {
     assert_eq!(named(&engine, 0), Some((Rule::CapacityLow, CELL)));
     assert_eq!(named(&engine, 1), Some((Rule::SocLow, None)));
     assert_eq!(named(&engine, 2), named(&engine, 0));
-    see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.5), &mut changes);
-    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.6), &mut changes);
+    observe(&mut engine, at(0.0), Rule::SocLow, None, Some(0.5), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.6), &mut changes);
     assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 1), Some((Rule::CapacityLow, Some(CellIndex(1))))));
-    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(1)), Some(1.6), &mut changes);
+    observe(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(1)), Some(1.6), &mut changes);
     assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 0), None));
     let lost = |rule, cell| AlarmInput::InputsValid { rule, cell, valid: false };
     engine.apply(at(1.0), &lost(Rule::CapacityLow, CELL), &mut changes);
@@ -224,10 +224,10 @@ fn commands_change_selected_alarms_and_refuse_unhealthy_ones() {
     let mut changes = Vec::new();
     for (cell, last) in [(0, 1.6), (1, 1.3)] {
         let cell = Some(CellIndex(cell));
-        see(&mut engine, at(0.0), Rule::CapacityLow, cell, Some(1.3), &mut changes);
-        see(&mut engine, at(1.0), Rule::CapacityLow, cell, Some(last), &mut changes);
+        observe(&mut engine, at(0.0), Rule::CapacityLow, cell, Some(1.3), &mut changes);
+        observe(&mut engine, at(1.0), Rule::CapacityLow, cell, Some(last), &mut changes);
     }
-    see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.05), &mut changes);
+    observe(&mut engine, at(0.0), Rule::SocLow, None, Some(0.05), &mut changes);
     changes.clear();
     let cell_1 = Selector { cell: Some(CellIndex(1)), ..Selector::default() };
     assert_eq!(
@@ -272,7 +272,7 @@ fn show_equals_observe_for_quiet_values() {
         let is_quiet = observation.is_quiet(r, value);
         assert!(!is_quiet || r != Rule::CellImbalance);
         let before = changes.len();
-        see(&mut observation, now, r, cell, Some(value), &mut changes);
+        observe(&mut observation, now, r, cell, Some(value), &mut changes);
         if is_quiet {
             shown.show(r, cell, value);
             assert_eq!(format!("{shown:?}"), format!("{observation:?}"), "{r:?} {cell:?} {value}");

@@ -47,7 +47,7 @@ fn at(seconds: f64) -> Timestamp {
     Timestamp::from_secs(seconds)
 }
 
-fn look(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitCheck) -> Option<Change> {
+fn observe(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitCheck) -> Option<Change> {
     let value = match check {
         LimitCheck::Beyond => Some(1.3),
         LimitCheck::Between => Some(1.45),
@@ -72,7 +72,7 @@ fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
     };
     let mut machine = Machine::default();
     for &(seconds, check) in looks {
-        look(&mut machine, &rule, seconds, check);
+        observe(&mut machine, &rule, seconds, check);
     }
     assert_eq!(machine.state, state);
     (machine, rule)
@@ -115,7 +115,7 @@ fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, 
 
 fn apply(machine: &mut Machine, rule: &RuleConfig, seconds: f64, input: MachineInput) -> Option<Change> {
     match input {
-        MachineInput::Check(check) => look(machine, rule, seconds, check),
+        MachineInput::Check(check) => observe(machine, rule, seconds, check),
         MachineInput::Acknowledge => machine.acknowledge().ok(),
         MachineInput::Clear => machine.clear().ok(),
     }
@@ -183,19 +183,19 @@ fn commands_without_effect_return_reason() {
 fn latched_alarm_beyond_again_is_new_occurrence() {
     let (mut machine, rule) = machine_in(AlarmState::Latched);
     assert_eq!(machine.occurrences, 1);
-    assert_eq!(look(&mut machine, &rule, 50.0, LimitCheck::Beyond), None);
+    assert_eq!(observe(&mut machine, &rule, 50.0, LimitCheck::Beyond), None);
     // A healthy value in between resets the count.
-    look(&mut machine, &rule, 55.0, LimitCheck::Healthy);
-    assert_eq!(look(&mut machine, &rule, 56.0, LimitCheck::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 65.9, LimitCheck::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 66.0, LimitCheck::Beyond), Some(Change::Raised));
+    observe(&mut machine, &rule, 55.0, LimitCheck::Healthy);
+    assert_eq!(observe(&mut machine, &rule, 56.0, LimitCheck::Beyond), None);
+    assert_eq!(observe(&mut machine, &rule, 65.9, LimitCheck::Beyond), None);
+    assert_eq!(observe(&mut machine, &rule, 66.0, LimitCheck::Beyond), Some(Change::Raised));
     assert_eq!((machine.occurrences, machine.first_raised, machine.last_raised), (2, at(10.0), at(66.0)));
 }
 
 #[test]
 fn latched_alarm_cleared_without_value_is_unknown() {
     let (mut machine, rule) = machine_in(AlarmState::Latched);
-    look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
+    observe(&mut machine, &rule, 50.0, LimitCheck::Unknown);
     assert_eq!(machine.clear(), Ok(Change::Cleared));
     assert_eq!((machine.state, machine.occurrences), (AlarmState::Unknown, 1));
 }
@@ -204,20 +204,20 @@ fn latched_alarm_cleared_without_value_is_unknown() {
 fn raising_again_resets_acknowledgement() {
     let (mut machine, rule) = machine_in(AlarmState::Active);
     machine.acknowledge().expect("raised");
-    look(&mut machine, &rule, 200.0, LimitCheck::Healthy);
-    assert_eq!(look(&mut machine, &rule, 210.0, LimitCheck::Healthy), Some(Change::Cleared));
+    observe(&mut machine, &rule, 200.0, LimitCheck::Healthy);
+    assert_eq!(observe(&mut machine, &rule, 210.0, LimitCheck::Healthy), Some(Change::Cleared));
     assert_eq!(machine.state, AlarmState::Inactive);
-    look(&mut machine, &rule, 300.0, LimitCheck::Beyond);
-    look(&mut machine, &rule, 310.0, LimitCheck::Beyond);
+    observe(&mut machine, &rule, 300.0, LimitCheck::Beyond);
+    observe(&mut machine, &rule, 310.0, LimitCheck::Beyond);
     assert_eq!((machine.state, machine.is_acknowledged, machine.occurrences), (AlarmState::Active, false, 2));
 }
 
 #[test]
 fn past_alarm_is_cleared_when_value_returns() {
     let (mut machine, rule) = machine_in(AlarmState::Cleared);
-    look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
+    observe(&mut machine, &rule, 50.0, LimitCheck::Unknown);
     assert_eq!(machine.state, AlarmState::Unknown);
-    look(&mut machine, &rule, 60.0, LimitCheck::Healthy);
+    observe(&mut machine, &rule, 60.0, LimitCheck::Healthy);
     assert_eq!(machine.state, AlarmState::Cleared);
     assert_eq!((machine.raised_value, machine.value()), (Some(1.3), Some(1.6)));
 }
@@ -228,7 +228,7 @@ fn raising_needs_both_time_and_values() {
     assert_eq!(by_time.poll(at(1e6), &rule), None, "one value for a long time");
     let (mut by_values, rule) = machine_in(AlarmState::Pending);
     for _ in 0..1000 {
-        assert_eq!(look(&mut by_values, &rule, 109.9, LimitCheck::Beyond), None, "many values, 9.9 s");
+        assert_eq!(observe(&mut by_values, &rule, 109.9, LimitCheck::Beyond), None, "many values, 9.9 s");
     }
     assert_eq!(by_values.poll(at(110.0), &rule), Some(Change::Raised), "after another 0.1 s both conditions hold");
 }
@@ -240,10 +240,10 @@ fn unknown_value_pauses_debounce_without_reset() {
         (AlarmState::Clearing, LimitCheck::Healthy, Change::Cleared),
     ] {
         let (mut machine, rule) = machine_in(state);
-        look(&mut machine, &rule, 104.0, check);
-        look(&mut machine, &rule, 105.0, LimitCheck::Unknown);
+        observe(&mut machine, &rule, 104.0, check);
+        observe(&mut machine, &rule, 105.0, LimitCheck::Unknown);
         assert_eq!(machine.poll(at(190.0), &rule), None);
-        look(&mut machine, &rule, 200.0, check);
+        observe(&mut machine, &rule, 200.0, check);
         assert_eq!(machine.poll(at(205.9), &rule), None, "4 s before the unknown value count, 1 s next to it does not");
         assert_eq!(machine.poll(at(206.0), &rule), Some(change));
     }
@@ -253,15 +253,15 @@ fn unknown_value_pauses_debounce_without_reset() {
 fn gap_does_not_count_towards_debounce() {
     let (mut machine, rule) = machine_in(AlarmState::Pending);
     machine.handle_gap();
-    assert_eq!(look(&mut machine, &rule, 500.0, LimitCheck::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 510.0, LimitCheck::Beyond), Some(Change::Raised));
+    assert_eq!(observe(&mut machine, &rule, 500.0, LimitCheck::Beyond), None);
+    assert_eq!(observe(&mut machine, &rule, 510.0, LimitCheck::Beyond), Some(Change::Raised));
 }
 
 #[test]
 fn backward_clock_keeps_counted_time() {
     let (mut machine, rule) = machine_in(AlarmState::Pending);
-    assert_eq!(look(&mut machine, &rule, -50.0, LimitCheck::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, -40.0, LimitCheck::Beyond), Some(Change::Raised));
+    assert_eq!(observe(&mut machine, &rule, -50.0, LimitCheck::Beyond), None);
+    assert_eq!(observe(&mut machine, &rule, -40.0, LimitCheck::Beyond), Some(Change::Raised));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! | state | started | lower or equal NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
 //! | idle | claim | - | - | - | - |
-//! | claiming | claim | lost | claim, wait again | claim | claimed |
+//! | claiming | claim | lost | claim | claim | claimed |
 //! | claimed | claim | lost | claim | claim | - |
 //! | lost | claim | - | - | cannot claim | - |
 //!

@@ -80,7 +80,7 @@ impl Bench {
     fn hear(&mut self, id: CanId, payload: &[u8]) {
         self.now_ms += 10;
         let frame = Frame::classic(id, payload).unwrap();
-        if let Heard::Whole { answer, data, .. } = self.listener.handle(at(self.now_ms), BUS, &frame) {
+        if let FrameOutcome::Whole { answer, data, .. } = self.listener.handle(at(self.now_ms), BUS, &frame) {
             for reading in answer.readings(data) {
                 let Channel::CellVoltage(cell) = reading.channel else { panic!("{reading:?}") };
                 self.readings.push((cell.0, reading.value));

@@ -37,7 +37,7 @@ fn read(name: &str, frame: &Frame) -> (u64, Result<f64, Fault>) {
 }
 
 /// Asserts that a signal decodes to a value within half a bit, in the DBC's unit.
-fn says(name: &str, frame: &Frame, wanted: f64) {
+fn assert_decodes(name: &str, frame: &Frame, wanted: f64) {
     let dbc = default_database().unwrap();
     let half = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout.factor / 2.0 + 1e-9;
     let (_, found) = read(name, frame);
@@ -45,7 +45,7 @@ fn says(name: &str, frame: &Frame, wanted: f64) {
 }
 
 /// Asserts that a signal is "not available" and that this code is outside its range.
-fn says_nothing(name: &str, frame: &Frame) {
+fn assert_not_available(name: &str, frame: &Frame) {
     let dbc = default_database().unwrap();
     let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();
     let (code, value) = read(name, frame);
@@ -94,11 +94,11 @@ fn status_decodes_within_half_a_bit() {
         ("LimitingCell", 1023.0),
         ("UnknownRules", 2.0),
     ] {
-        says(&format!("Status.{name}"), &frame, wanted);
+        assert_decodes(&format!("Status.{name}"), &frame, wanted);
     }
     assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]), "reserved for end-to-end protection");
     for (mode, code) in [(Mode::Unknown, 0.0), (Mode::Charge, 1.0), (Mode::Rest, 2.0)] {
-        says("Status.Mode", &plan().status(&StatusFields { mode: Some(mode), ..fields }), code);
+        assert_decodes("Status.Mode", &plan().status(&StatusFields { mode: Some(mode), ..fields }), code);
     }
 }
 
@@ -149,7 +149,7 @@ fn health_pages_decode_within_half_a_bit() {
     let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
     for (page, name, _, wanted) in HEALTH_VALUES {
         let frame = plan().health(page, &fields);
-        says(&format!("Health.{name}"), &frame, wanted);
+        assert_decodes(&format!("Health.{name}"), &frame, wanted);
         assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
         assert_eq!(plan().health(page + 5, &fields), frame, "the first page follows the last");
@@ -163,9 +163,9 @@ fn single_health_value_leaves_others_not_available() {
         for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
             let frame = plan().health(page, &fields);
             if n == known {
-                says(&format!("Health.{name}"), &frame, wanted);
+                assert_decodes(&format!("Health.{name}"), &frame, wanted);
             } else {
-                says_nothing(&format!("Health.{name}"), &frame);
+                assert_not_available(&format!("Health.{name}"), &frame);
             }
         }
     }
@@ -175,19 +175,19 @@ fn single_health_value_leaves_others_not_available() {
 fn unknown_values_are_not_available_in_every_frame() {
     let status = plan().status(&StatusFields::default());
     for name in STATUS.map(|(name, _)| name).into_iter().filter(|name| *name != "Validity") {
-        says_nothing(&format!("Status.{name}"), &status);
+        assert_not_available(&format!("Status.{name}"), &status);
     }
-    says("Status.Validity", &status, 0.0);
+    assert_decodes("Status.Validity", &status, 0.0);
     for (page, name, _, _) in HEALTH_VALUES {
-        says_nothing(&format!("Health.{name}"), &plan().health(page, &HealthFields::default()));
+        assert_not_available(&format!("Health.{name}"), &plan().health(page, &HealthFields::default()));
     }
     for (number, rule) in (1..).zip(RULES) {
         let frame = plan().alarm(&AlarmFields { rule: number, ..Default::default() });
         for name in ["State", "Severity", "Cell"] {
-            says_nothing(&format!("Alarm.{name}"), &frame);
+            assert_not_available(&format!("Alarm.{name}"), &frame);
         }
-        says_nothing(&format!("Alarm.Value_{rule}"), &frame);
-        says_nothing(&format!("Alarm.Threshold_{rule}"), &frame);
+        assert_not_available(&format!("Alarm.Value_{rule}"), &frame);
+        assert_not_available(&format!("Alarm.Threshold_{rule}"), &frame);
     }
     let nan = StatusFields { soc: Some(f64::NAN), soc_std: Some(f64::NAN), ..Default::default() };
     assert_eq!(plan().status(&nan), status, "NaN is unknown");
@@ -203,18 +203,18 @@ fn extremes_saturate_and_never_become_not_available() {
         };
         let status = plan().status(&StatusFields { soc: Some(extreme), soc_std: Some(extreme), ..Default::default() });
         for name in ["Status.Soc", "Status.SocStd"] {
-            says(name, &status, end(name));
+            assert_decodes(name, &status, end(name));
         }
         let fields = health_fields(|_| Some(extreme));
         for (page, name, _, _) in HEALTH_VALUES {
             let name = format!("Health.{name}");
-            says(&name, &plan().health(page, &fields), end(&name));
+            assert_decodes(&name, &plan().health(page, &fields), end(&name));
         }
         for (number, rule) in (1..).zip(RULES) {
             let value = Some(extreme);
             let frame = plan().alarm(&AlarmFields { rule: number, value, threshold: value, ..Default::default() });
             for name in [format!("Alarm.Value_{rule}"), format!("Alarm.Threshold_{rule}")] {
-                says(&name, &frame, end(&name));
+                assert_decodes(&name, &frame, end(&name));
             }
         }
     }
@@ -235,7 +235,7 @@ fn extremes_saturate_and_never_become_not_available() {
         ("UnknownRules", 2.0),
     ];
     for (name, end) in ends {
-        says(&format!("Status.{name}"), &frame, end);
+        assert_decodes(&format!("Status.{name}"), &frame, end);
     }
 }
 
@@ -273,21 +273,21 @@ fn every_rule_has_its_own_value_and_threshold() {
             threshold: Some(inside * 1.1),
         };
         let frame = plan().alarm(&fields);
-        says("Alarm.Rule", &frame, f64::from(number));
-        says("Alarm.State", &frame, 1.0);
-        says("Alarm.Severity", &frame, 3.0);
-        says("Alarm.Test", &frame, 0.0);
-        says("Alarm.Acknowledged", &frame, 1.0);
-        says("Alarm.Cell", &frame, 96.0);
-        says(&format!("Alarm.Value_{rule}"), &frame, wire);
-        says(&format!("Alarm.Threshold_{rule}"), &frame, wire * 1.1);
+        assert_decodes("Alarm.Rule", &frame, f64::from(number));
+        assert_decodes("Alarm.State", &frame, 1.0);
+        assert_decodes("Alarm.Severity", &frame, 3.0);
+        assert_decodes("Alarm.Test", &frame, 0.0);
+        assert_decodes("Alarm.Acknowledged", &frame, 1.0);
+        assert_decodes("Alarm.Cell", &frame, 96.0);
+        assert_decodes(&format!("Alarm.Value_{rule}"), &frame, wire);
+        assert_decodes(&format!("Alarm.Threshold_{rule}"), &frame, wire * 1.1);
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
         let other = plan().alarm(&AlarmFields { value: None, cell: None, test: true, acknowledged: false, ..fields });
-        says_nothing(&format!("Alarm.Value_{rule}"), &other);
-        says(&format!("Alarm.Threshold_{rule}"), &other, wire * 1.1);
-        says_nothing("Alarm.Cell", &other);
-        says("Alarm.Test", &other, 1.0);
-        says("Alarm.Acknowledged", &other, 0.0);
+        assert_not_available(&format!("Alarm.Value_{rule}"), &other);
+        assert_decodes(&format!("Alarm.Threshold_{rule}"), &other, wire * 1.1);
+        assert_not_available("Alarm.Cell", &other);
+        assert_decodes("Alarm.Test", &other, 1.0);
+        assert_decodes("Alarm.Acknowledged", &other, 0.0);
     }
 }
 
