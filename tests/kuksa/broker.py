@@ -1,6 +1,6 @@
-"""Databrokers for the test: a strict one, made of kuksa-client's published stubs, and the real one, where its program is named.
+"""Databrokers for the test: a strict one built from kuksa-client's published stubs, and the real one if its program is named.
 
-Both are given the same VSS files, and both are read by kuksa-client. The strict one keeps a list of what a provider does wrong.
+Both serve the same VSS files, and kuksa-client reads both. The strict one records violations by the provider.
 """
 
 import concurrent.futures
@@ -33,7 +33,7 @@ def type_number(name: str) -> int:
 
 
 def leaves(files: list[Path]) -> dict[str, dict]:
-    """Every signal of VSS files, by its path; the first file that has it wins, as in the databroker."""
+    """Every signal of VSS files, by path. If several files contain a signal, the first one counts, as in the databroker."""
     found: dict[str, dict] = {}
 
     def walk(path: str, node: dict) -> None:
@@ -71,10 +71,10 @@ class StrictBroker:
         self.changed = threading.Condition()
         self.provider: "queue.Queue | None" = None
         self.answers: queue.Queue = queue.Queue()
-        # The databroker 0.7 takes no values while a question waits for its answer.
+        # The databroker 0.7 accepts no values while a request waits for its answer.
         self.lock = threading.Lock()
         self.pool = concurrent.futures.ThreadPoolExecutor(max_workers=16)
-        # A fixed window of 64 KiB: what a provider can send to a broker that does not read.
+        # A fixed window of 64 KiB limits what a provider can send to a broker that does not read.
         options = [("grpc.so_reuseport", 0), ("grpc.http2.bdp_probe", 0), ("grpc.http2.lookahead_bytes", 65_536)]
         self.server = grpc.server(self.pool, options=options)
         rpc_v2.add_VALServicer_to_server(V2(self), self.server)
@@ -110,10 +110,10 @@ class StrictBroker:
         return entry
 
     def fault(self, path: str, point: types_v2.Datapoint) -> str | None:
-        """What is wrong with a data point for this path."""
+        """The fault of a data point for this path, or None."""
         node = self.nodes[path]
         if not point.HasField("timestamp") or abs(point.timestamp.seconds - time.time()) > 60:
-            return f"{path}: no time stamp of now"
+            return f"{path}: no current time stamp"
         field = point.value.WhichOneof("typed_value")
         if field is None:
             return None
@@ -192,14 +192,14 @@ class V2(rpc_v2.VALServicer):
                     broker.answers.put(answer)
                 else:
                     broker.violate(context, f"unexpected {action}")
-        except Exception:  # the call has ended, or was aborted above
+        except Exception:  # the call ended or was aborted above
             pass
         outgoing.put(None)
 
     def GetValue(self, request, context):
-        """As the databroker 0.7 does it: the provider's answer is the value, and without one within a second, the value it has.
+        """Like the databroker 0.7: returns the provider's answer or, if there is none within a second, the stored value.
 
-        An answer that comes later is taken for that to the next question.
+        A late answer is mistaken for the answer to the next request.
         """
         broker = self.broker
         broker.check_token(context)
@@ -255,7 +255,7 @@ class V1(rpc_v1.VALServicer):
 
 
 class RealBroker:
-    """The databroker's own program."""
+    """The databroker's program."""
 
     violations: list[str] = []
 

@@ -1,4 +1,5 @@
-"""What each output must be, from the status document: written apart from the program, as a second opinion on signs, units and names."""
+"""Expected value of each output, from the status document. Written independently of the program, to check signs, units and
+names."""
 
 import struct
 
@@ -19,7 +20,7 @@ NOT_PROVIDED = ("NetCapacity", "StateOfCharge.Displayed", "Charging.IsCharging",
 
 
 def single(number):
-    """The number as a float of 32 bits."""
+    """The number rounded to a 32-bit float."""
     return None if number is None else struct.unpack("f", struct.pack("f", number))[0]
 
 
@@ -132,6 +133,6 @@ CELL_PERCENT = {
 
 
 def outputs(document):
-    """Value of every output by its path; None = no value. Without a document none has one."""
+    """Value of every output by path; None = no value. Without a document no output has a value."""
     names = {STANDARD + name: value for name, value in standard(document).items()}
     return names | {OVERLAY + name: value for name, value in overlay(document).items()}

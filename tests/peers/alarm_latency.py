@@ -1,13 +1,13 @@
-"""Time from one frame on vcan0 to the frame that answers it, both as the kernel stamped them on one listening socket.
+"""Measures the time from a frame on vcan0 to the answering frame. The kernel stamps both on one listening socket.
 
 usage: alarm_latency.py alarm FILE COUNT   half-cycles for a daemon with the configuration of alarm_latency.test: from the
                                            frame that completes one to the alarm frame it causes
-       alarm_latency.py loop FILE COUNT    frames 0x123 for somebody who answers each with the same data under 0x321
-       alarm_latency.py echo               is such a somebody: the least a program can do
-       alarm_latency.py report FOLDER      what was measured, and whether it is good; needs the daemon's files too
+       alarm_latency.py loop FILE COUNT    frames 0x123 for a program that answers each with the same data under 0x321
+       alarm_latency.py echo               runs such a program, as the lower bound of the time
+       alarm_latency.py report FOLDER      prints and judges the results; also needs the daemon's files
 
-FILE gets {"late_ns": [...], ...}. After a frame is sent this program sleeps before it looks for the answer: with one CPU
-it would otherwise stand in the way of the program that answers.
+FILE gets {"late_ns": [...], ...}. After sending a frame this program sleeps before it looks for the answer, because with one
+CPU it would otherwise delay the answering program.
 """
 import json
 import random
@@ -21,17 +21,17 @@ from pathlib import Path
 SO_TIMESTAMPNS = 35  # linux/socket.h; not in Python's module
 TIMESPEC, FRAME = struct.Struct("@ll"), struct.Struct("=IB3x8s")
 CELL, ALARM, ASK, ANSWER = 0x100, 0x6B2, 0x123, 0x321
-# Bits of the alarm frame as config/packwatch.dbc has them, start and length.
+# Start and length of the alarm frame's bit fields, as in config/packwatch.dbc.
 RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
-# A new mode counts after 10 ms (min_duration_s of the configuration); the frame after that decides.
+# A new mode counts after 10 ms (min_duration_s of the configuration); the next frame decides.
 MODE_S = 0.012
-# A half-cycle flows at little more than nothing; its pulse makes it weak or strong: with the configuration's swing 0.25 Ah or 2.1 Ah.
+# A half-cycle has almost no current; its pulse makes it weak or strong: 0.25 Ah or 2.1 Ah with the configuration's swing.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
-# What the frames' stamps say that it gave, Ah. A busy machine makes pulses and pauses longer: what is neither far below the alarm's
-# thresholds nor far above them and possible for a cell of 2.6 Ah is not judged.
+# Charge according to the frames' time stamps, Ah. A busy machine lengthens pulses and pauses: half-cycles that are not clearly
+# below or above the alarm's thresholds, or impossible for a cell of 2.6 Ah, are not judged.
 SWING, WEAK_AH, STRONG_AH = 1.2e-5, (0.0, 0.8), (1.4, 4.0)
-# The first half-cycles have no whole one before them.
+# The first half-cycles have no complete predecessor.
 WARM_UP = 4
 PEERS = {
     "daemon": "packwatch, half-cycle to alarm",
@@ -39,7 +39,7 @@ PEERS = {
     "player": "candump | sed | canplayer",
     "cansend": "candump | cansend for each frame",
 }
-# First look for the answer, and how long to look.
+# Delay of the first look for the answer, and maximum wait.
 LOOK_S, PATIENCE_S = 0.003, 2.0
 
 
@@ -66,8 +66,9 @@ def current_of(data):
 
 
 def last_half_cycle(cells, sign):
-    """What the half-cycle before the latest change of sign gave, Ah, and the stamp of the frame that ended it: the second of the new sign;
-    None while a busy machine has not delivered that one."""
+    """Charge of the half-cycle before the latest change of sign, Ah, and the stamp of the frame that ended it (the second one
+    with the
+    new sign). None if a busy machine has not delivered that frame yet."""
     end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
     begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
     frames = cells[begin : end + 1]
@@ -80,7 +81,7 @@ def bits(data, start, length):
 
 
 class Listener:
-    """Frames of these identifiers with the kernel's stamps."""
+    """Frames with these identifiers, with the kernel's stamps."""
 
     def __init__(self, *ids):
         self.socket = raw(*ids)
@@ -88,7 +89,7 @@ class Listener:
         self.socket.setblocking(False)
 
     def read(self):
-        """What has come: [(ns, id, data)]."""
+        """All received frames: [(ns, id, data)]."""
         seen = []
         while True:
             try:
@@ -100,7 +101,7 @@ class Listener:
             seen.append((seconds * 10**9 + nanoseconds, can_id, payload[:length]))
 
     def stamp_of(self, is_answer):
-        """The stamp of the first such frame, None when there is none for too long; and all that came."""
+        """The stamp of the first matching frame, or None after the maximum wait; and all received frames."""
         seen, deadline = [], time.monotonic() + PATIENCE_S
         time.sleep(LOOK_S)
         while True:
@@ -112,33 +113,34 @@ class Listener:
 
 
 def pause():
-    """Somewhere else in the other's periods each time."""
+    """Waits for a random time, to vary the phase relative to the other program's periods."""
     time.sleep(random.uniform(0.001, 0.011))
 
 
 def measure_alarm(count):
-    """Strong and weak half-cycles in turn: each one's end clears or raises the alarm."""
+    """Alternates strong and weak half-cycles: the end of each clears or raises the alarm."""
     listener, sender = Listener(CELL, ALARM), raw()
     late_ns, without, stalled, strong, sign = [], 0, 0, True, 1
-    # Half-cycles left until one is judged: one that was not as meant may change nothing, and then the next one has nothing to change back.
+    # Half-cycles until the next one is judged. A half-cycle with a wrong charge may change nothing, and then the next one
+    # cannot change it back.
     wait, cells = WARM_UP, []
     while len(late_ns) + without < count:
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
-        # The half-cycle that is complete now is the one before: a weak one before a strong one.
+        # The half-cycle that is complete now is the previous one: a weak one before a strong one.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
         def is_answer(i, data, change=change):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change
 
         answered, seen = (None, listener.read()) if wait else listener.stamp_of(is_answer)
-        # Enough for two half-cycles of six frames.
+        # Enough for two half-cycles of six frames each.
         cells = cells[-12:] + [(stamp, current_of(data)) for stamp, i, data in seen if i == CELL]
         low, high = WEAK_AH if strong else STRONG_AH
         given_ah, asked = last_half_cycle(cells, sign)
         if not low <= given_ah <= high:
             wait, stalled = 2, stalled + 1
-            assert stalled < count, f"{stalled} half-cycles had another charge than meant: this machine is too busy"
+            assert stalled < count, f"{stalled} half-cycles had a wrong charge: this machine is too busy"
         elif wait:
             wait -= 1
         elif answered is None or asked is None:
@@ -146,7 +148,7 @@ def measure_alarm(count):
             print(f"no answer after {len(late_ns)}: {given_ah:.2f} Ah in {cells}", file=sys.stderr, flush=True)
         else:
             late_ns.append(answered - asked)
-        # Between two frames the daemon joins their currents by a line: a pulse's edges are two frames each.
+        # Between two frames the daemon interpolates the current linearly, so each edge of a pulse takes two frames.
         pulse_a = STRONG_A if strong else WEAK_A
         for current_a in (IDLE_A, pulse_a):
             sender.send(cell(sign * current_a))
@@ -187,8 +189,9 @@ def at(late_ns, share):
 
 
 def decided_by_frame(folder, late_ns):
-    """Those that a frame has decided. The daemon looks at the clock too, ten times a second, and where that look falls
-    between the two frames it has confirmed the mode; its events say at which input's time each alarm changed."""
+    """Results decided by a frame. The daemon also checks the clock ten times a second; a check between the two frames confirms
+    the
+    mode. The daemon's events state at which input's time each alarm changed."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}
     events = map(json.loads, (folder / "watched.events").read_text().splitlines())
@@ -211,7 +214,7 @@ def report(folder):
     print(f"decided by the clock between two frames, not counted: {len(measured) - len(daemon['late_ns'])}")
     lost = {peer: row["without"] for peer, row in found.items() if row["without"]}
     assert not lost, f"frames without an answer: {lost}"
-    assert len(daemon["late_ns"]) >= 1000 and min(daemon["late_ns"]) > 0, "too few, or before the frame"
+    assert len(daemon["late_ns"]) >= 1000 and min(daemon["late_ns"]) > 0, "too few results, or an answer before its frame"
     slowest, usual = at(daemon["late_ns"], 99), at(found["cansend"]["late_ns"], 50)
     assert slowest < usual, f"p99 of the daemon, {slowest} ms, is not below the median of cansend per frame, {usual} ms"
 

@@ -1,4 +1,4 @@
-"""The Python peer of parse and decode: python-can's log reader and cantools.
+"""The Python peer of parsing and decoding: python-can's log reader and cantools.
 
 parse.py LOG DBC [FRAMES]      prints: frames sum seconds
 """

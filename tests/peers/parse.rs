@@ -1,9 +1,9 @@
-//! Our side of parse and decode beside `parse.c` and `parse.py`: blocks of the file, lines, frames, signals of a DBC.
+//! Packwatch's part of the parsing comparison with `parse.c` and `parse.py`: blocks of the file, lines, frames, DBC signals.
 //!
-//! `cargo run --release --example parse -- LOG DBC [FRAMES]` prints: frames, sum of all values, seconds. It goes the way
-//! `packwatch replay` goes up to the sample stage: the same readers, and an [`InputMap`] with every signal of the DBC.
+//! `cargo run --release --example parse -- LOG DBC [FRAMES]` prints: frames, sum of all values, seconds. It uses the same
+//! readers as `packwatch replay` up to the sample stage, and an [`InputMap`] with every signal of the DBC.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/peers/run")]
-#![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
+#![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
 use std::path::Path;
 use std::time::Instant;
@@ -25,7 +25,7 @@ fn main() {
     println!("{frames} {sum:.6} {:.6}", start.elapsed().as_secs_f64());
 }
 
-/// Each signal feeds a channel of its own: which one does not matter here.
+/// Binds every signal to a separate channel; the kind of channel does not matter here.
 fn every_signal(dbc: &str) -> InputMap {
     let database = Database::parse(dbc).unwrap();
     let signals =

@@ -1,10 +1,11 @@
-"""The Python peer of the whole replay: python-can reads, cantools decodes, filterpy's UKF steps each cell at each voltage.
+"""The Python peer of the whole replay: python-can reads, cantools decodes, and filterpy's UKF steps each cell at each voltage.
 
-replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number a line
+replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number per line
 
-The filter is the one of src/cell/estimator.rs: states [SOC, U1, ln rho, C], the same tables, circuit, process and measurement noises
-(defaults of docs/src/reference/keys.md), sigma points by filterpy's own class, redrawn before the update. Left out, to the peer's
-advantage: gate, consistency, gaps in the current (an error here), learning at transitions, alarms, frames to send.
+The filter is the one of src/cell/estimator.rs: states [SOC, U1, ln rho, C], the same tables, circuit, process and measurement
+noises (defaults of docs/src/reference/keys.md), and sigma points by filterpy's own class, redrawn before the update. The peer
+omits, to its advantage: gate, consistency check, gaps in the current (an error here), learning at transitions, alarms, sent
+frames.
 """
 import bisect
 import math
@@ -33,7 +34,7 @@ def arrhenius(temperature_c):
 
 
 class Model:
-    """Tables over SOC at one temperature at a time."""
+    """Tables over SOC for one temperature at a time."""
 
     def __init__(self, path):
         raw = tomllib.loads(path.read_text())
@@ -48,7 +49,7 @@ class Model:
         self.rows = {}
 
     def at(self, temperature_c):
-        """(OCV, R0, R1, tau) over SOC at a temperature; kept, as sensors repeat themselves."""
+        """(OCV, R0, R1, tau) over SOC at a temperature; cached, because sensor values repeat."""
         if temperature_c not in self.rows:
             t = min(max(bisect.bisect_right(self.temperature_c, temperature_c) - 1, 0), len(self.temperature_c) - 2)
             low_c, high_c = self.temperature_c[t:t + 2]
@@ -62,7 +63,7 @@ class Model:
         return self.rows[temperature_c]
 
     def place(self, soc):
-        """Interval, position in it, and the same held at the ends of the curve."""
+        """Interval and position in it, and the same limited to the ends of the curve."""
         grid = self.soc
         s = min(max(bisect.bisect_right(grid, soc) - 1, 0), len(grid) - 2)
         beyond = (soc - grid[s]) / (grid[s + 1] - grid[s])
@@ -178,7 +179,7 @@ class Pack:
                     self.temperature_c[cell] = value
 
     def flow(self, time_s, current_a):
-        """Charge by the trapezoid between two readings."""
+        """Integrates the charge by the trapezoidal rule between two readings."""
         if self.current_at is not None:
             dt_s = time_s - self.current_at
             if dt_s > self.max_age_s:

@@ -1,4 +1,4 @@
-"""What run, scaling and profile have in common: where things are, the peers' Python, tables, the figures in tests/speed.md."""
+"""Shared by run, scaling and profile: paths, the peers' Python, tables, the results in tests/speed.md."""
 import os
 import re
 import subprocess
@@ -16,14 +16,14 @@ INSTALL = "tests/peers/run --install"
 
 
 def install():
-    """The peers' Python packages, in a folder of their own."""
+    """Installs the peers' Python packages into a separate folder."""
     subprocess.run([sys.executable, "-m", "venv", "--clear", str(VENV)], check=True)
     subprocess.run([str(VENV / "bin/python3"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-r",
                     str(HERE / "requirements.txt")], check=True)
 
 
 def python(*modules):
-    """An interpreter that has the modules: that of `--install`, or PACKWATCH_PYTHON or the one that runs this; None when neither does."""
+    """An interpreter with the modules: that of `--install`, of PACKWATCH_PYTHON, or the current one; None if none has them."""
     for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:
@@ -35,7 +35,7 @@ def python(*modules):
 
 
 def output(*command, **options):
-    """What a command prints; its error output when it fails."""
+    """Standard output of a command. If the command fails, exits with its error output."""
     run = subprocess.run([str(part) for part in command], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
     if run.returncode != 0:
         sys.exit(f"{' '.join(map(str, command))}\nfailed, status {run.returncode}: {run.stderr.strip()[-2000:]}")
@@ -47,7 +47,7 @@ def simulate(log, *options, binary=BINARY, config=CONFIG):
 
 
 def machine():
-    """The machine, its compiler and what else it was doing."""
+    """The machine, its compiler and its load."""
     info = Path("/proc/cpuinfo").read_text()
     name = re.search(r"model name\s*: (.*)", info)
     rustc = output("rustc", "--version", cwd=REPOSITORY).split()[1]
@@ -60,17 +60,17 @@ def machine():
 
 
 def table(header, rows):
-    """Markdown; columns after the first are numbers."""
+    """A Markdown table; columns after the first are numbers."""
     lines = [header, ["---"] + ["---:"] * (len(header) - 1)] + rows
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
 
 
 def publish(name, command, text):
-    """Puts a block of figures into tests/speed.md, in place of the one of that name."""
+    """Replaces the block of that name in tests/speed.md."""
     begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
     block = f"{begin}`{command}` ({machine()})\n\n{text.strip()}\n{end}"
     before = SPEED.read_text()
     start, stop = before.find(begin), before.find(end)
     if start < 0 or stop < 0:
-        sys.exit(f"{SPEED} has no place for {name}")
+        sys.exit(f"{SPEED} has no block named {name}")
     SPEED.write_text(before[:start] + block + before[stop + len(end):])

@@ -1,6 +1,7 @@
-"""What the tests share: the program, its configurations, a simulated record, measured data where they are.
+"""Shared by the tests: the program, its configurations, a simulated record, and measured data if available.
 
-PACKWATCH_BIN: the program, default target/release/packwatch. PACKWATCH_DATA: measured data; tests that need them are skipped without.
+PACKWATCH_BIN: the program, default target/release/packwatch. PACKWATCH_DATA: measured data; without it, tests that need it are
+skipped.
 """
 
 import os
@@ -35,7 +36,7 @@ class Record:
 
 
 def packwatch(*arguments, code: int = 0) -> str:
-    """Output of the program; of a failure, what it prints on standard error."""
+    """Standard output of the program or, if it is expected to fail, its standard error."""
     done = subprocess.run([BINARY, *map(str, arguments)], capture_output=True, text=True, timeout=120)
     assert done.returncode == code, done.stderr
     return done.stdout if code == 0 else done.stderr
@@ -65,11 +66,12 @@ def data() -> Path:
 
 
 class Interrupt(Exception):
-    """What the signal handler of :func:`interrupted` raises."""
+    """Raised by the signal handler of :func:`interrupted`."""
 
 
 def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
-    """Calls, with a signal whose handler raises, as Ctrl-C's does; seconds from the signal to the end of the call."""
+    """Calls, and interrupts with a signal whose handler raises, as Ctrl-C does. Returns the seconds from the signal to the end
+    of the call."""
 
     def handle(*_):
         raise Interrupt
@@ -87,7 +89,7 @@ def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
 
 
 def read_csv(path: Path) -> dict[str, list]:
-    """Columns of a CSV of estimates as written; an empty field is NaN."""
+    """Columns of a CSV of estimates as the program writes it; an empty field is NaN."""
     lines = path.read_text().splitlines()
     rows = [line.split(",") for line in lines[1:]]
     value = lambda text: {"": float("nan"), "true": True, "false": False}.get(text) if text in ("", "true", "false") else float(text)  # noqa: E731
@@ -95,7 +97,7 @@ def read_csv(path: Path) -> dict[str, list]:
 
 
 def assert_same_estimates(table, path: Path) -> None:
-    """The table has the columns and every bit of a CSV that the program wrote."""
+    """Checks that the table has the columns and every bit of a CSV that the program wrote."""
     expected = read_csv(path)
     assert table.column_names == list(expected)
     assert len(table) == len(expected["time_s"]) > 0

@@ -1,4 +1,4 @@
-"""The Python functions of the commands: the same bytes, the same files, and exceptions with the same text."""
+"""The Python functions of the commands give the same bytes and files as the commands, and exceptions with the same text."""
 
 import json
 import subprocess
@@ -13,14 +13,14 @@ import packwatch as pw
 PAPER = CONFIG / "paper.toml"
 
 
-def test_score_gives_the_bytes_of_the_command(record):
+def test_score_equals_command(record):
     score = pw.score(record.csv, cell=CELL, settle_s=60)
     assert score.json() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60", "--json")
     assert score.table() == packwatch("score", record.csv, "--cell", CELL, "--settle", "60")
     assert score.scores[0]["soc"]["samples"] == 8940
 
 
-def test_every_case_of_score_has_a_plot(record, tmp_path):
+def test_every_score_case_has_a_plot(record, tmp_path):
     score = pw.score(
         record.csv, cell=CELL, start=["full", "middle"], soc_error_points=[None, -5.0], capacity_error_percent=[0.0, 5.0],
         plots=tmp_path / "plots",
@@ -31,7 +31,7 @@ def test_every_case_of_score_has_a_plot(record, tmp_path):
 
 
 def assert_last_argument_counts(file, given, options, **known):
-    """The call gives what the command gives with these options, and something else without the last argument."""
+    """The call equals the command with these options, and differs without the last argument."""
     files = [word for option, path in known.items() for word in (f"--{option}", path)]
     score = pw.score(file, **known, **given)
     assert score.json() == packwatch("score", file, *files, *options.split(), "--json")
@@ -55,7 +55,7 @@ def assert_last_argument_counts(file, given, options, **known):
         ({"learn": ["cell.csv"]}, "--learn cell.csv"),
     ],
 )
-def test_every_argument_of_score_changes_it_as_the_option_does(record, tmp_path, monkeypatch, given, options):
+def test_score_arguments_equal_options(record, tmp_path, monkeypatch, given, options):
     monkeypatch.chdir(tmp_path)
     rows = record.csv.read_text().splitlines(keepends=True)
     (tmp_path / "cell.csv").write_text("".join(rows[:3000] + rows[3200:]))  # a gap of 200 s
@@ -71,12 +71,12 @@ def test_every_argument_of_score_changes_it_as_the_option_does(record, tmp_path,
         ({"load": (2.0, 24.0, 2.7), "window": (0.4, 0.7), "seeds": [5]}, "--load 2,24,2.7 --window 0.4,0.7 --seed 5"),
     ],
 )
-def test_every_argument_of_a_life_changes_it_as_the_option_does(data, given, options):
+def test_life_arguments_equal_options(data, given, options):
     life, cycles = (data / "nasa_pcoe_aging" / name for name in ("B0005.csv.gz", "B0005_cycles.csv"))
     assert_last_argument_counts(life, given, options, cell=CONFIG / "cells/nasa_b0005.toml", cycles=cycles)
 
 
-def test_score_of_a_panasonic_drive_gives_the_bytes_of_the_command(data):
+def test_score_of_panasonic_drive_equals_command(data):
     drive = sorted((data / "panasonic_18650pf/25C").glob("HWFTa*"))[0]
     model = CONFIG / "cells/panasonic_18650pf.toml"
     score = pw.score([drive], cell=model)
@@ -84,7 +84,7 @@ def test_score_of_a_panasonic_drive_gives_the_bytes_of_the_command(data):
     assert score.scores[0]["soc"]["rmse_points"] < 2.0
 
 
-def test_replay_gives_the_files_of_the_command(record, tmp_path):
+def test_replay_equals_command_files(record, tmp_path):
     csv, events, frames = (tmp_path / name for name in ("estimates.csv", "events.jsonl", "frames.log"))
     told = packwatch("replay", "-c", PAPER, record.log, "--estimates", csv, "--events", events, "--frames", frames, "--json")
     replay = pw.replay(PAPER, [record.log])
@@ -99,7 +99,7 @@ def test_replay_gives_the_files_of_the_command(record, tmp_path):
     assert without(replay.summary) == without(json.loads(told))
 
 
-def test_replay_reads_columns_of_other_names(record, tmp_path):
+def test_replay_maps_column_names(record, tmp_path):
     csv = tmp_path / "other.csv"
     np.savetxt(csv, np.column_stack([record.time_s, -record.current_a, record.voltage_v]), fmt="%.6f", delimiter=",",
                header="t,I,U", comments="")  # fmt: skip
@@ -107,7 +107,7 @@ def test_replay_reads_columns_of_other_names(record, tmp_path):
     assert abs(replay.estimates["soc"][-1] - record.soc[-1]) < 0.03
 
 
-def test_fit_writes_the_model_of_the_command(tmp_path, data):
+def test_fit_model_equals_command(tmp_path, data):
     drives = sorted((data / "panasonic_18650pf/25C").glob("HWFT*"))
     packwatch("fit", *drives, "--name", "cell", "--capacity", "2.9", "--out", tmp_path / "command.toml")
     fit = pw.fit(drives, "cell", capacity_ah=2.9)
@@ -124,7 +124,7 @@ def histories(folder):
     return path
 
 
-def test_rul_gives_the_document_of_the_command(tmp_path):
+def test_rul_equals_command(tmp_path):
     life = histories(tmp_path)
     assert pw.rul(life, "70 %") == json.loads(packwatch("rul", life, "--end-of-life", "70 %", "--json"))
     judged = pw.rul([life], [1.6, "85%"], at=[0.5, 0.7], alpha=0.1)
@@ -132,7 +132,7 @@ def test_rul_gives_the_document_of_the_command(tmp_path):
     assert len(judged["files"]) == 2
 
 
-def test_gp_gives_the_model_of_the_command(tmp_path):
+def test_gp_model_equals_command(tmp_path):
     rows = np.random.default_rng(1).uniform(0.0, 6.0, (80, 1))
     output = np.sin(rows[:, 0]) + 0.5
     np.savetxt(tmp_path / "rows.csv", np.column_stack([rows, output]), delimiter=",", header="x,y", comments="", fmt="%.17g")
@@ -149,7 +149,7 @@ def test_gp_gives_the_model_of_the_command(tmp_path):
     np.testing.assert_array_equal(pw.gp.load(tmp_path / "again.json").predict(at)["mean"], process.predict(at)["mean"])
 
 
-def test_cell_models_are_read_asked_and_written(tmp_path):
+def test_cell_models_read_evaluate_and_write(tmp_path):
     model = pw.CellModel(CELL)
     table = model.table(np.linspace(0.0, 1.0, 11))
     assert (np.diff(table["ocv_v"]) > 0).all() and (table["r0_ohm"] > 0).all() and "tau1_s" in table
@@ -180,7 +180,7 @@ CSV_FAULT = "time_s,current_a,voltage_v,discharged_ah\n0,1,3.9,0\n1,x,3.9,0\n"
         (pw.ConfigError, ValueError, lambda f: pw.Monitor(f / "bad.toml"), ["replay", "-c", "bad.toml", "no.log"]),
     ],
 )
-def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases, call, command):
+def test_error_text_equals_command(tmp_path, monkeypatch, kind, bases, call, command):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.csv").write_text(CSV_FAULT)
     (tmp_path / "bad.toml").write_text("[pack]\ncells = 0\n")
@@ -196,7 +196,7 @@ def test_errors_have_the_text_of_the_command(tmp_path, monkeypatch, kind, bases,
         assert caught.value.faults == str(caught.value).splitlines()
 
 
-def test_the_text_of_an_error_does_not_say_whose_it_is(tmp_path):
+def test_error_text_omits_origin(tmp_path):
     path = tmp_path / "a (os error 2).csv"
     path.write_text(CSV_FAULT)
     with pytest.raises(pw.DataError, match=r"\(os error 2\).csv:3"):
@@ -254,18 +254,18 @@ def test_the_text_of_an_error_does_not_say_whose_it_is(tmp_path):
         (lambda: pw.CellModel(CELL).table([1.5]), "soc contains 1.5, must be fractions from 0 to 1"),
     ],
 )
-def test_bad_arguments_are_named(call, text):
+def test_bad_arguments_name_their_fault(call, text):
     with pytest.raises(pw.DataError) as caught:
         call()
     assert text in str(caught.value)
 
 
-def test_a_signal_ends_a_score_that_still_learns(record):
+def test_signal_ends_learning_score(record):
     learn = [record.csv] * 3000
     assert interrupted(lambda: pw.score(record.csv, cell=CELL, learn=learn)) < 3.0
 
 
-def test_a_signal_ends_the_forecasts(tmp_path):
+def test_signal_ends_forecasts(tmp_path):
     rows = "".join(f"{86400 * n},{2.0 - 0.0002 * n:.6f}\n" for n in range(3000))
     (tmp_path / "life.csv").write_text(f"date,capacity_ah\n{rows}")
     parts = np.linspace(0.01, 0.99, 99)

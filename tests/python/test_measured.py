@@ -1,4 +1,5 @@
-"""Measured files: our CSV, and the Battery Data Format as its own package writes it, whose positive current is charge."""
+"""Measured files: packwatch's CSV, and the Battery Data Format as its own package writes it, in which a positive current is
+charge."""
 
 import bdf
 import numpy as np
@@ -19,7 +20,7 @@ def as_bdf(record) -> pd.DataFrame:
     })  # fmt: skip
 
 
-def test_our_csv_is_a_table(record):
+def test_own_csv_reads_as_table(record):
     table = pw.read(record.csv)
     assert table.column_names == ["time_s", "current_a", "voltage_v", "temperature_c", "discharged_ah", "part", "type"]
     np.testing.assert_array_equal(table["current_a"], record.current_a)
@@ -27,7 +28,7 @@ def test_our_csv_is_a_table(record):
 
 
 @pytest.mark.parametrize("ending", ["bdf.csv", "bdf", "bdf.gz"])
-def test_a_file_of_the_formats_own_package_gives_the_same_estimates(record, tmp_path, ending):
+def test_bdf_file_gives_same_estimates(record, tmp_path, ending):
     path = tmp_path / f"cell.{ending}"
     bdf.validate(as_bdf(record))
     if ending == "bdf.gz":
@@ -42,7 +43,7 @@ def test_a_file_of_the_formats_own_package_gives_the_same_estimates(record, tmp_
     assert abs(soc[-1] - record.soc[-1]) < 0.05
 
 
-def test_a_table_in_memory_has_our_names_and_signs(record):
+def test_table_in_memory_has_own_names_and_signs(record):
     frame = as_bdf(record)
     for form in (frame, pa.table(frame), frame.to_dict("list")):
         columns = pw.from_bdf(form)
@@ -51,7 +52,7 @@ def test_a_table_in_memory_has_our_names_and_signs(record):
     np.testing.assert_array_equal(pw.from_bdf(frame, positive="discharge")["current_a"], -record.current_a)
 
 
-def test_a_masked_column_in_memory_is_unknown_and_a_text_is_refused():
+def test_masked_column_is_unknown_and_text_is_rejected():
     table = {"Test Time / s": [0.0, 1.0], "Voltage / V": np.ma.array([3.9, 9.9], mask=[False, True]), "Current / A": [1, 2]}
     columns = pw.from_bdf(table)
     np.testing.assert_array_equal(columns["voltage_v"], [3.9, np.nan])
@@ -59,14 +60,14 @@ def test_a_masked_column_in_memory_is_unknown_and_a_text_is_refused():
         pw.from_bdf(table | {"Current / A": ["1", "2"]})
 
 
-def test_the_sign_is_the_callers_where_a_file_differs(record, tmp_path):
+def test_caller_overrides_sign_of_file(record, tmp_path):
     as_bdf(record).to_csv(tmp_path / "cell.bdf", index=False)
     np.testing.assert_allclose(pw.read(tmp_path / "cell.bdf", bdf_positive="discharge")["current_a"], -record.current_a, atol=1e-12)
     with pytest.raises(pw.DataError, match='bdf_positive "in", must be charge or discharge'):
         pw.read(tmp_path / "cell.bdf", bdf_positive="in")
 
 
-def test_a_missing_column_is_named(record, tmp_path):
+def test_missing_column_is_named(record, tmp_path):
     with pytest.raises(pw.DataError, match="no column Voltage / V, found Test Time / s,Current / A"):
         pw.from_bdf(as_bdf(record)[["Test Time / s", "Current / A"]])
     (tmp_path / "x.bdf").write_text("Test Time / s,Voltage / V\n0,3.9\n")

@@ -1,4 +1,5 @@
-"""Rows and frames through the monitor: as a replay of the same, in any portions; bad input is an exception that says what is wrong."""
+"""Rows and frames through the monitor give the results of a replay, in any portions; bad input raises an exception that names
+the fault."""
 
 import os
 import signal
@@ -62,7 +63,7 @@ def together(tables, name):
     return np.concatenate([np.asarray(table[name], dtype="float64") for table in tables])
 
 
-def test_rows_give_every_bit_that_a_replay_of_the_same_file_gives(record, tmp_path):
+def test_rows_equal_replay_bit_for_bit(record, tmp_path):
     csv = tmp_path / "estimates.csv"
     packwatch("replay", "-c", PAPER, record.csv, "--estimates", csv)
     monitor = pw.Monitor(PAPER)
@@ -75,14 +76,14 @@ def test_rows_give_every_bit_that_a_replay_of_the_same_file_gives(record, tmp_pa
         np.testing.assert_array_equal(together(tables, name), np.asarray(whole[name], dtype="float64"), err_msg=name)
 
 
-def test_rows_in_portions_give_what_they_give_at_once(record):
+def test_rows_in_portions_equal_one_call(record):
     at_once, portions = pw.Monitor(PAPER), pw.Monitor(PAPER)
     whole = at_once.rows(*columns(record)).estimates
     parts = [portions.rows(*(column[start : start + 700] for column in columns(record))).estimates for start in range(0, 9000, 700)]
     np.testing.assert_array_equal(together(parts, "soc"), whole["soc"])
 
 
-def test_frames_give_what_a_replay_of_their_log_gives(record, tmp_path):
+def test_frames_equal_replay_of_their_log(record, tmp_path):
     csv = tmp_path / "estimates.csv"
     packwatch("replay", "-c", PAPER, record.log, "--estimates", csv)
     frames = [line.split() for line in record.log.read_text().splitlines()]
@@ -98,7 +99,7 @@ def test_frames_give_what_a_replay_of_their_log_gives(record, tmp_path):
     np.testing.assert_array_equal(soc, expected.estimates["soc"])
 
 
-def test_a_configuration_is_a_text_and_cells_are_columns(tmp_path):
+def test_text_configuration_takes_cells_as_columns(tmp_path):
     (tmp_path / "pack.dbc").write_text(PACK_DBC)
     monitor = pw.Monitor(text=PACK.replace("cells/", f"{CONFIG}/cells/"), folder=tmp_path)
     assert (monitor.cells, monitor.interfaces) == (3, ["can0"])
@@ -106,17 +107,17 @@ def test_a_configuration_is_a_text_and_cells_are_columns(tmp_path):
     voltage_v = np.full((600, 3), [3.9, 3.8, 3.7])
     voltage_v[:, 1] = np.nan
     out = monitor.rows(time_s, np.full(600, 1.0), voltage_v, np.full(600, 25.0)).estimates
-    assert set(out["cell"]) == {0, 2}, "no estimate without a voltage"
+    assert set(out["cell"]) == {0, 2}, "a cell without a voltage must have no estimate"
     last = {cell: out["soc"][out["cell"] == cell][-1] for cell in (0, 2)}
     assert last[0] > last[2] > 0.0
     with pytest.raises(pw.DataError, match=r"voltage_v has 1 columns, must have 3 as in the configuration"):
         monitor.rows(time_s, time_s, time_s)
 
 
-def test_unknown_is_null_and_never_a_number(record):
+def test_unknown_value_is_null(record):
     out = pw.Monitor(PAPER).rows(record.time_s[:600], np.full(600, np.nan), record.voltage_v[:600]).estimates
     table = pa.table(out)
-    assert table["current_a"].null_count == len(table), "no current was read"
+    assert table["current_a"].null_count == len(table), "no current was given"
     assert np.isnan(out["current_a"]).all() and out["soc_std"][-1] > 0.01
     assert pa.table(out)["u3_v"].null_count == len(table), "the model has fewer branches"
 
@@ -129,7 +130,7 @@ def test_at_most_one_estimate_per_period(record):
     np.testing.assert_array_equal(thin["soc"], every["soc"][::60])
 
 
-def test_after_the_clock_went_back_periods_begin_again(record):
+def test_clock_step_back_restarts_periods(record):
     time_s = np.concatenate([record.time_s[:3000] + 5000.0, record.time_s[:3000]])
     columns = [np.concatenate([column[:3000]] * 2) for column in (record.current_a, record.voltage_v, record.temperature_c)]
     every = pw.Monitor(PAPER).rows(time_s, *columns).estimates
@@ -138,7 +139,7 @@ def test_after_the_clock_went_back_periods_begin_again(record):
     assert earlier > 2000 and abs(kept - earlier / 60) < 2
 
 
-def test_tables_are_arrow_without_a_copy(record):
+def test_tables_are_zero_copy_arrow(record):
     out = pw.Monitor(cell=CELL).rows(*columns(record)).estimates
     table = pa.table(out)
     assert table.schema.field("soc").type == pa.float64()
@@ -148,7 +149,7 @@ def test_tables_are_arrow_without_a_copy(record):
         out["charge"]
 
 
-def test_arrays_lists_and_arrow_columns_are_the_same(record):
+def test_arrays_lists_and_arrow_columns_are_equivalent(record):
     few = [column[:300] for column in columns(record)]
     expected = pw.Monitor(PAPER).rows(*few).estimates["soc"]
     objects = [lambda column: np.asarray(column, dtype=object), lambda column: pd.Series(column, dtype="Float64")]
@@ -167,7 +168,7 @@ def test_masked_readings_are_unknown(record):
         np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
 
 
-def test_an_unaligned_array_is_copied(record):
+def test_unaligned_array_is_copied(record):
     few = [column[:300] for column in columns(record)]
     shifted = [np.frombuffer(b"x" + column.tobytes(), offset=1) for column in few]
     assert not shifted[0].flags.aligned
@@ -175,7 +176,7 @@ def test_an_unaligned_array_is_copied(record):
 
 
 @pytest.mark.parametrize("dtype", ["uint16", "int64", "float64", "object"])
-def test_frames_are_whole_numbers_of_any_type(dtype):
+def test_frames_accept_any_integer_type(dtype):
     time_s, can_id, data = np.arange(100.0), np.full(100, 0x100), np.full((100, 8), 0x42)
     frames = [pw.Monitor(PAPER).frames(time_s, can_id.astype(of), data.astype(of)) for of in ("uint32", dtype)]
     for name in frames[0].frames.column_names:
@@ -183,7 +184,7 @@ def test_frames_are_whole_numbers_of_any_type(dtype):
     assert len(frames[0].frames) > 0
 
 
-def test_a_label_is_enough(record):
+def test_label_alone_is_sufficient(record):
     out = pw.Monitor(chemistry="nmc-graphite", rated_ah=2.6).rows(*columns(record)).estimates
     error, std = abs(out["soc"][-1] - record.soc[-1]), out["soc_std"][-1]
     assert error < 0.15 and error < 4.0 * std, f"{error}, {std}"
@@ -224,13 +225,13 @@ def test_a_label_is_enough(record):
         (lambda m: pw.Monitor(PAPER, estimates_period_s=-1), "estimates_period_s = -1, must be 0 to 1e9, or None"),
     ],
 )
-def test_bad_input_is_named(call, text):
+def test_bad_input_names_its_fault(call, text):
     with pytest.raises(pw.DataError) as caught:
         call(pw.Monitor(PAPER))
     assert text in str(caught.value) and isinstance(caught.value, ValueError)
 
 
-def test_after_a_fault_the_monitor_goes_on_as_if_it_had_not_been(record):
+def test_monitor_continues_unchanged_after_fault(record):
     monitor = pw.Monitor(PAPER)
     with pytest.raises(pw.DataError):
         monitor.rows(record.time_s, record.current_a[1:], record.voltage_v)
@@ -238,7 +239,7 @@ def test_after_a_fault_the_monitor_goes_on_as_if_it_had_not_been(record):
     np.testing.assert_array_equal(soc, pw.Monitor(PAPER).rows(*columns(record)).estimates["soc"])
 
 
-def test_right_arrays_are_not_copied():
+def test_matching_arrays_are_not_copied():
     reals = np.arange(6.0).reshape(3, 2)
     assert np.shares_memory(float64("x", reals), reals)
     for other in (reals[:, ::-1], reals.astype("float32"), reals.astype(">f8"), np.ma.array(reals)):
@@ -250,7 +251,7 @@ def test_right_arrays_are_not_copied():
         np.testing.assert_array_equal(float64("x", missing), [np.nan, 1.0])
 
 
-def test_no_rows_give_empty_tables():
+def test_empty_input_gives_empty_tables():
     out = pw.Monitor(PAPER).rows([], [], [])
     assert len(out.estimates) == len(out.estimates["soc"]) == len(out.events["event"]) == 0
     assert pa.table(out.frames).num_rows == 0
@@ -260,17 +261,17 @@ def long(rows):
     return np.arange(rows, dtype=float), np.full(rows, 0.1), np.full(rows, 3.7)
 
 
-def test_other_threads_run_during_the_work():
+def test_other_threads_run_during_call():
     monitor, times = pw.Monitor(PAPER, estimates_period_s=None), []
     work = threading.Thread(target=lambda: monitor.rows(*long(400_000)))
     work.start()
     while work.is_alive():
         times.append(time.perf_counter())
         time.sleep(0.001)
-    assert len(times) > 20 and max(np.diff(times)) < 0.5 * (times[-1] - times[0]), "the interpreter was not blocked"
+    assert len(times) > 20 and max(np.diff(times)) < 0.5 * (times[-1] - times[0]), "the interpreter was blocked"
 
 
-def test_a_call_that_waits_for_another_blocks_no_thread():
+def test_waiting_call_blocks_no_thread():
     monitor, times = pw.Monitor(PAPER, estimates_period_s=None), []
     work = threading.Thread(target=lambda: monitor.rows(*long(150_000)))
     waits = threading.Thread(target=lambda: monitor.gap(2e5))
@@ -281,10 +282,10 @@ def test_a_call_that_waits_for_another_blocks_no_thread():
         times.append(time.perf_counter())
         time.sleep(0.001)
     work.join()
-    assert len(times) > 20 and max(np.diff(times)) < 0.5 * (times[-1] - times[0]), "the interpreter was not blocked"
+    assert len(times) > 20 and max(np.diff(times)) < 0.5 * (times[-1] - times[0]), "the interpreter was blocked"
 
 
-def test_a_signal_ends_the_wait_for_another_call():
+def test_signal_ends_wait_for_other_call():
     monitor = pw.Monitor(PAPER, estimates_period_s=None)
     work = threading.Thread(target=lambda: monitor.rows(*long(200_000)))
     work.start()
@@ -295,7 +296,7 @@ def test_a_signal_ends_the_wait_for_another_call():
     monitor.gap(3e5)
 
 
-def test_a_signal_handler_cannot_use_the_monitor_that_it_interrupts():
+def test_signal_handler_cannot_use_interrupted_monitor():
     monitor, rows = pw.Monitor(PAPER, estimates_period_s=None), long(10_000_000)
     before = signal.signal(signal.SIGALRM, lambda *_: monitor.uncarried_values)
     signal.setitimer(signal.ITIMER_REAL, 0.2)
@@ -307,7 +308,7 @@ def test_a_signal_handler_cannot_use_the_monitor_that_it_interrupts():
     assert monitor.uncarried_values == 0
 
 
-def test_what_was_taken_before_a_signal_comes_with_the_next_call():
+def test_results_before_signal_come_with_next_call():
     time_s, current_a, voltage_v = long(20_000_000)
     monitor = pw.Monitor(PAPER, estimates_period_s=60.0)
     interrupted(lambda: monitor.rows(time_s, current_a, voltage_v))
@@ -319,7 +320,7 @@ def test_what_was_taken_before_a_signal_comes_with_the_next_call():
     np.testing.assert_array_equal(out["soc"], whole["soc"][: len(out)])
 
 
-def test_after_a_failure_inside_the_monitor_is_not_used_again():
+def test_monitor_is_unusable_after_internal_failure():
     script = textwrap.dedent(f"""
         import packwatch as pw
         monitor = pw.Monitor({str(PAPER)!r})
@@ -333,7 +334,7 @@ def test_after_a_failure_inside_the_monitor_is_not_used_again():
             except pw.DataError as error:
                 print(error)
     """)
-    # No thread has so much stack: its start panics.
+    # No thread can have such a stack, so starting it panics.
     environment = os.environ | {"RUST_MIN_STACK": str(2**62)}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, env=environment)
     text = "an earlier call failed inside packwatch; create a new Monitor"
@@ -345,7 +346,7 @@ def test_progress_is_shown_with_tqdm(capsys):
     assert "50.0k" in capsys.readouterr().err.split("\r")[-1]
 
 
-def test_control_c_ends_the_work(tmp_path):
+def test_ctrl_c_ends_call(tmp_path):
     script = textwrap.dedent(f"""
         import numpy as np, packwatch as pw
         monitor = pw.Monitor({str(PAPER)!r}, estimates_period_s=None)

@@ -1,4 +1,4 @@
-"""What people read runs: the Python blocks of the manual's page, and the notebook with its picture."""
+"""Runs the published examples: the Python blocks of the manual's page, and the notebook with its picture."""
 
 import base64
 import os
@@ -13,7 +13,7 @@ PAGE = ROOT / "docs/src/lab/python.md"
 NOTEBOOK = ROOT / "docs/notebooks/soc.ipynb"
 
 
-def test_the_blocks_of_the_page_run_in_order(tmp_path, monkeypatch):
+def test_page_blocks_run_in_order(tmp_path, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert len(blocks) >= 6
     shutil.copytree(CONFIG, tmp_path / "config")
@@ -24,11 +24,11 @@ def test_the_blocks_of_the_page_run_in_order(tmp_path, monkeypatch):
         exec(compile(block, f"{PAGE.name}, block {number}", "exec"), names)  # noqa: S102
 
 
-def test_the_notebook_draws_the_soc_with_its_interval(tmp_path, monkeypatch):
+def test_notebook_draws_soc_with_interval(tmp_path, monkeypatch):
     monkeypatch.setenv("PACKWATCH_BIN", str(BINARY.resolve()))
     monkeypatch.delenv("PACKWATCH_FILE", raising=False)
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    assert all(not cell.get("outputs") for cell in notebook.cells), "no output is kept in the repository"
+    assert all(not cell.get("outputs") for cell in notebook.cells), "the notebook in the repository must have no output"
     (tmp_path / "docs").mkdir()
     shutil.copytree(CONFIG, tmp_path / "config")
     nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path / "docs")}}).execute()
@@ -41,6 +41,6 @@ def test_the_notebook_draws_the_soc_with_its_interval(tmp_path, monkeypatch):
     assert len(pictures) == 1
     picture = base64.b64decode(pictures[0])
     assert picture.startswith(b"\x89PNG") and len(picture) > 10_000
-    if "PACKWATCH_PICTURE" in os.environ:  # to look at it
+    if "PACKWATCH_PICTURE" in os.environ:  # for inspection
         with open(os.environ["PACKWATCH_PICTURE"], "wb") as file:
             file.write(picture)

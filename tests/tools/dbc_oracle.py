@@ -1,13 +1,13 @@
-"""What cantools, and a DBC's own bit positions, say.
+"""Decoding by cantools, and bit positions read directly from a DBC.
 
-usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answers one line each of
-                                                `signal=repr(value)` pairs, or `!what` when cantools refuses;
-                                                signals that reach past their message are left out
-       dbc_oracle.py FILE.dbc short             answers `message.signal` for each signal that reaches past its
-                                                message, walked bit by bit from the file's text, without cantools
+usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answers with one line each of
+                                                `signal=repr(value)` pairs, or `!reason` if cantools rejects the payload;
+                                                omits signals that extend past their message
+       dbc_oracle.py FILE.dbc short             answers `message.signal` for each signal that extends past its
+                                                message, found bit by bit from the file's text, without cantools
        dbc_oracle.py FILE.dbc count             answers `messages signals`, as cantools counts them
-       dbc_oracle.py FILE.dbc encode [strict]   reads `message signal=value ...` lines, a value being a number or a
-                                                word of the value table, answers the payload in hex
+       dbc_oracle.py FILE.dbc encode [strict]   reads `message signal=value ...` lines, where a value is a number or a
+                                                word of the value table; answers the payload in hex
        dbc_oracle.py FILE.dbc about [strict]    answers `message id extended fd brs length cycle_ms profile data_id`
 """
 import re
@@ -15,7 +15,7 @@ import sys
 
 
 def last_byte(start, length, big_endian):
-    """The highest byte that one of the signal's bits lies in, walking from its start bit."""
+    """The highest byte that contains one of the signal's bits, counted from its start bit."""
     bit, highest = start, start // 8
     for _ in range(length - 1):
         if not big_endian:
@@ -44,8 +44,9 @@ def reaches_past(path):
 def load(path, strict):
     """The DBC as cantools reads it, with the file's own names.
 
-    Where a file gives long names (over 32 characters), cantools renames a multiplexor but not in the signals that
-    depend on it, and then decodes none of them: those attributes are left out.
+    If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it in the
+    dependent
+    signals, and then cannot decode them. These attributes are therefore removed.
     """
     import cantools
 
@@ -58,7 +59,7 @@ def decode(path, strict):
     messages = {m.name: m for m in load(path, strict).messages}
     past = list(reaches_past(path))
     for name, _, _, needed in past:
-        # cantools cannot decode such a message at all: let it have the bytes, zeros, and leave the signals out.
+        # cantools cannot decode such a message at all. Give it zero bytes and omit the signals.
         message = messages[name]
         message.length = max(message.length, needed)
         message.refresh(strict=False)
@@ -70,7 +71,7 @@ def decode(path, strict):
             data = bytes.fromhex(payload).ljust(message.length, b"\0")
             values = message.decode(data, decode_choices=False, scaling=True)
             print("\t".join(f"{k}={v!r}" for k, v in values.items() if (name, k) not in left_out))
-        except Exception as error:  # an unknown page, say
+        except Exception as error:  # for example an unknown page
             print(f"!{type(error).__name__}: {error}".replace("\n", " "))
 
 
@@ -93,7 +94,7 @@ def about(path, strict):
         attributes = m.dbc.attributes
 
         def value(name):
-            """The attribute's word or number; its default is a dash."""
+            """The attribute's word or number; a dash if it has the default."""
             found = attributes.get(name)
             if found is None:
                 return "-"

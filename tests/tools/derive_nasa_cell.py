@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
 
-Reads cycles 0..LAST only (five discharges, five charges; the rest of the life stays unseen by the model).
+Reads cycles 0..LAST only (five discharges, five charges); the model does not use the rest of the life.
 One RC branch at a fixed time constant makes the voltage linear in the table values:
 
     V(t) = sum_j OCV_j h_j(s) - sum_j R0_j h_j(s) I - sum_j R1_j u_j(t),   tau du_j/dt = h_j(s) I - u_j
@@ -23,16 +23,16 @@ LAST_CYCLE = 10           # cycle 9 is the fifth discharge, cycle 10 the charge 
 TAU_S = 60.0              # 30 to 120 s fit alike, 10 and 300 s worse; a second branch gains nothing here
 SOC_LEFT = 0.045          # SOC left at 2.7 V under 2 A when new: the data end there, OCV(0) = 2.7 V is extrapolated
 KNEE_V = 3.0
-MIN_SLOPE, TOP_SLOPE = 0.2, 1.0   # V per unit SOC, the second above SOC 0.9: slow relaxation would bend the top down
+MIN_SLOPE, TOP_SLOPE = 0.2, 1.0   # V per unit SOC, the second above SOC 0.9: otherwise slow relaxation would bend the top down
 VOLTAGE_MIN, VOLTAGE_MAX = 2.7, 4.2
 SOC = np.array([0, .03, .045, .06, .075, .09, .105, .12, .14, .17, .2, .25, .3, .4, .5, .6, .7, .75, .8, .85, .9, .93, .96, .98, 1])
-AGEING_SHIFT = 0.5        # not fitted (a new cell does not show it): between even shrinking (0) and pure loss of lithium (1)
+AGEING_SHIFT = 0.5        # not fitted, because a new cell does not show it; between uniform shrinking (0) and pure lithium loss (1)
 CHARGE_WEIGHT = 0.6       # per second, relative to discharge
 SMOOTH_OCV, SMOOTH_R0, SMOOTH_R1 = 0.0005, 0.5, 0.02
 
 
 def read_cycles(path):
-    """[(type, time, current, voltage, temperature)] with time running on inside each cycle only."""
+    """[(type, time, current, voltage, temperature)], with time counted within each cycle only."""
     rows = {}
     with gzip.open(path, "rt") as f:
         for r in csv.DictReader(f):
@@ -49,7 +49,7 @@ def ampere_hours(t, i):
 
 
 def with_soc(cycles):
-    """SOC for every sample; the first charge (partial, unknown start) is only used to begin from a full cell."""
+    """SOC for every sample. The first charge (partial, with unknown start) serves only to reach a full cell."""
     def knee(t, i, v):
         n = np.flatnonzero((v <= KNEE_V) & (i > 1))[0]
         q = ampere_hours(t, i)
@@ -67,7 +67,7 @@ def with_soc(cycles):
             s = 1 - ampere_hours(t, i) * (1 - soc_knee) / knees[n]
             left, n = s[-1], n + 1
         else:
-            i = np.where(i > 0.5, 0, i)       # the charger's self test: one load pulse of 3 A for about 0.1 s
+            i = np.where(i > 0.5, 0, i)       # the charger's self test: a load pulse of 3 A for about 0.1 s
             q = -ampere_hours(t, i)
             s = left + (1 - left) * q / q[-1]
         out.append((kind, t, i, v, temp, s))
@@ -110,7 +110,7 @@ def fit(records):
     smooth = np.zeros((3 * (n - 2), 3 * n))
     for b, weight in enumerate((SMOOTH_OCV, SMOOTH_R0, SMOOTH_R1)):
         smooth[b * (n - 2):(b + 1) * (n - 2), b * n:(b + 1) * n] = second_difference(weight * scale)
-    smooth[0] = 0                             # OCV is free to bend at the empty end
+    smooth[0] = 0                             # OCV may bend at the empty end
     low = np.r_[VOLTAGE_MIN - 1e-6, np.where(SOC[1:] > 0.9, TOP_SLOPE, MIN_SLOPE) * np.diff(SOC), np.full(2 * n, 0.005)]
     high = np.r_[VOLTAGE_MIN + 1e-6, np.full(n - 1, 1.0), np.full(2 * n, 1.0)]
     x = lsq_linear(np.vstack([a * w[:, None], smooth]) @ steps, np.r_[y * w, np.zeros(len(smooth))],
@@ -124,7 +124,7 @@ def fit(records):
 
 def fit_thermal(records, r_total):
     """(heat capacity, thermal resistance) from dT/dt = (I^2 R - (T - T_start)/Rth)/Cth over the discharges, integrated.
-    Reversible heat is left out, so these are effective values of this duty."""
+    Reversible heat is neglected, so these are effective values for this load."""
     rows, rhs = [], []
     for kind, t, i, v, temp, s in records:
         if kind != "discharge":

@@ -1,10 +1,10 @@
-"""What autosar-e2e, and for profile 5 cantools, make of end-to-end protected payloads.
+"""End-to-end protection by autosar-e2e and, for profile 5, by cantools.
 
-usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped`, payloads in hex: `raw` as the sender had it, with
-                       its previous counter; `ours` as our side protected it with the next; `flipped` with one bit wrong.
-                       Answers one line each: `peer ours? flipped? [peer ours? flipped?]`: `raw` as the peer protects it,
-                       its counter moved on by itself; whether it accepts `ours` and `flipped` (1, 0); the same by cantools
-                       in profile 5, from 4 bytes on (`raw` then with our counter: cantools moves none).
+usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with payloads in hex: `raw` before protection, with the
+                       previous counter; `ours` as packwatch protects it, with the next counter; `flipped` with one bit wrong.
+                       Answers with one line each: `peer ours? flipped? [peer ours? flipped?]`: `raw` as the peer protects it,
+                       which advances the counter itself; whether it accepts `ours` and `flipped` (1, 0); the same by cantools
+                       in profile 5, from 4 bytes on (with our counter in `raw`, because cantools does not advance it).
 """
 import sys
 
@@ -16,7 +16,7 @@ MODES = {"1A": E2E_P01_DATAID_BOTH, "1C": E2E_P01_DATAID_NIBBLE}
 
 
 def answer(profile, data_id, raw, ours, flipped):
-    peer = bytearray(raw)  # changed in place; the check of profile 1 wants what can be changed too
+    peer = bytearray(raw)  # changed in place; the check of profile 1 also needs a mutable object
     if profile == "5":
         e2e_p05_protect(peer, data_id)
         accepted = [e2e_p05_check(payload, data_id) for payload in (ours, flipped)]

@@ -1,10 +1,11 @@
-"""scikit-learn's Gaussian process regression, exponential kernel, fixed hyperparameters: the second opinion of tests/integration/gp_peer.rs.
+"""scikit-learn's Gaussian process regression, exponential kernel, fixed hyperparameters: the reference for
+tests/integration/gp_peer.rs.
 
-Standard input, a line each; every answer is one line on standard output:
+Reads one command per line from standard input; each answer is one line on standard output:
   make N DIR   draws N rows of 3 inputs and 2000 queries, writes DIR/rows.f64 (inputs, targets, queries; little endian)
-  fit          fits; answers seconds of wall clock and of processor time
-  predict      predicts; writes DIR/mean.f64 and DIR/std.f64; answers as fit
-Exit status 77 when scikit-learn is not installed. OPENBLAS_NUM_THREADS sets the threads.
+  fit          fits; answers wall-clock and processor time, s
+  predict      predicts; writes DIR/mean.f64 and DIR/std.f64; answers like fit
+Exit status 77 if scikit-learn is not installed. OPENBLAS_NUM_THREADS sets the number of threads.
 """
 import sys
 import time

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """ISO-TP by PyPI `can-isotp`, for tests/integration/isotp_peer.rs.
 
-    isotp_oracle.py send       standard input: a message a line, hex; output: its frames, hex, with blanks between, a line each
-    isotp_oracle.py receive    the other way round
+        isotp_oracle.py send       reads one message per line (hex); prints its frames on one line (hex, separated by blanks)
+        isotp_oracle.py receive    the reverse: reads frames, prints the message
 """
 
 import sys
@@ -21,7 +21,7 @@ def layer(address: isotp.Address, inbox: deque, outbox: deque) -> isotp.Transpor
 
 
 def frames_of(message: bytes) -> list[bytes]:
-    """The sender's frames, with a receiver that gives flow control."""
+    """The sender's frames, with a receiver that sends flow control."""
     to_receiver, to_sender, frames = deque(), deque(), []
     sender, receiver = layer(SENDER, to_sender, to_receiver), layer(RECEIVER, to_receiver, to_sender)
     sender.send(message)

@@ -1,12 +1,12 @@
-"""Decodes every frame of a replayed life with cantools and compares it with what the replay reports beside.
+"""Decodes every frame of a replayed life with cantools and compares it with the replay's reports.
 
 usage: life_decodes.py FILE.dbc FRAMES.log ESTIMATES.csv EVENTS.jsonl RATED_AH
 
-FRAMES, ESTIMATES and EVENTS are those of `packwatch replay`, FILE.dbc is what `packwatch dbc` wrote for the same
-configuration. The status frame's values are worked out again from the estimates (pack rule, mode, validity) and the
-alarm events, the health frame's from estimates and capacity and recharge events, the alarm frames' from the alarm
-events. Every value must agree within one bit; what is not known must be said to be. The last line is a JSON document
-with what was compared; exit status 0 only when all agrees.
+FRAMES, ESTIMATES and EVENTS come from `packwatch replay`, FILE.dbc from `packwatch dbc` with the same configuration. The
+expected values are computed independently: those of the status frame from the estimates (pack rule, mode, validity) and the
+alarm events, those of the health frame from estimates and from capacity and recharge events, those of alarm frames from alarm
+events. Every value must agree within one bit; unknown values must be sent as unknown. The last line is a JSON document with the
+comparison; the exit status is 0 only if all values agree.
 """
 import csv
 import json
@@ -25,7 +25,7 @@ LOSS_SIGNALS = ("Lli", "LliStd", "LamNe", "LamNeStd", "LamPe", "LamPeStd")
 
 
 class Reader:
-    """The frames as cantools decodes them."""
+    """Decodes frames with cantools."""
 
     def __init__(self, path):
         self.database = cantools.database.load_file(path, strict=True)
@@ -53,13 +53,13 @@ class Reader:
         return self.signals["PACKWATCH_" + message, signal].scale
 
     def clip(self, message, signal, value):
-        """What the signal can say of a value that is too large or too small for it."""
+        """The value limited to the signal's range."""
         found = self.signals["PACKWATCH_" + message, signal]
         return min(max(value, float(found.minimum)), float(found.maximum))
 
 
 class Life:
-    """What the replay's reports say, up to a moment."""
+    """The replay's reports up to a given time."""
 
     def __init__(self, cells, rated_ah):
         self.cells, self.rated_ah = cells, rated_ah
@@ -72,12 +72,12 @@ class Life:
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
         self.changed = {}  # the same key: the last event, raised or not
-        self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
-        self.recharge = None  # the last reported
+        self.alarms = {}  # raised alarms by (rule, cell, severity): the last event
+        self.recharge = None  # the last reported period
         self.normalised = None
         self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
-        self.losses = {}  # cell: signals of its loss modes
-        self.moved = set()  # cells whose state a change of mode has moved since their last row
+        self.losses = {}  # by cell: signals of its loss modes
+        self.moved = set()  # cells whose state changed at a mode change after their last row
 
     def take_estimate(self, row):
         cell = int(row["cell"])
@@ -186,7 +186,7 @@ def frames(path):
         for line in lines:
             stamp, _, frame = line.split()
             number, data = frame.split("#", 1)
-            # FD: a second # and a digit of flags.
+            # CAN FD: a second # and a digit of flags.
             yield nanos(stamp[1:-1]), int(number, 16), bytes.fromhex(data[2:] if data.startswith("#") else data)
 
 
@@ -196,8 +196,8 @@ class Comparison:
         self.frames, self.values = Counter(), Counter()
         self.faults, self.told = 0, []
         self.counters = {}
-        self.untold = 0  # recharge periods whose event is not in the log
-        # Resistances between a change of mode, where the current's offset is learned, and the next rows: no report has them.
+        self.untold = 0  # recharge periods without an event in the log
+        # Resistances between a mode change, where the current's offset is learned, and the next rows: not in any report.
         self.restated = 0
 
     def fault(self, time, message, what):
@@ -215,7 +215,7 @@ class Comparison:
                 self.fault(time, message, f"{signal} is {found}, must be {wanted}")
 
     def counter(self, time, message, values):
-        """A protected message counts its frames, to 14 (profile 1) or 255 (profile 5)."""
+        """Checks that a protected message counts its frames, to 14 (profile 1) or 255 (profile 5)."""
         if "E2eCounter" not in values:
             return
         last = self.counters.get(message)
@@ -237,7 +237,7 @@ def compare(reader, life, estimates, events, frame_list):
     done = 0
     estimate, event = 0, 0
     for time, frame_id, data in frame_list:
-        # What has the frame's own time was taken in before it.
+        # Reports with the frame's own time were processed before it.
         while estimate < len(estimates) and estimates[estimate][0] <= time:
             life.take_estimate(estimates[estimate][1])
             estimate += 1
@@ -255,8 +255,8 @@ def compare(reader, life, estimates, events, frame_list):
             for signal, wanted in life.health().items():
                 if signal in values:
                     if signal == "RechargePeriod" and values[signal] is not None:
-                        # Sent as soon as the charge leaves the window; the event comes at the charge's end, if the
-                        # log has it.
+                        # Sent as soon as the charge leaves the window. The event comes at the end of the charge, if the log
+                        # contains that.
                         coming = periods[done] if done < len(periods) else None
                         if coming is not None and abs(values[signal] - coming) <= 1:
                             wanted = coming
@@ -273,26 +273,27 @@ def compare(reader, life, estimates, events, frame_list):
             compare_alarm(result, life, time, values, told)
     for time, left in told.items():
         for alarm in left:
-            result.fault(time, "Alarm", f"no frame at once for {alarm}")
+            result.fault(time, "Alarm", f"no immediate frame for {alarm}")
     return result
 
 
 def compare_digest(result, life, time, values):
-    """The digest's count and worst severity are those of the events."""
+    """The digest's count and worst severity must match the events."""
     if "Raised" in values:
         result.value(time, "Digest", "Raised", values["Raised"], len(life.alarms))
         result.value(time, "Digest", "Worst", values["Worst"], max((SEVERITIES[of] for _, _, of in life.alarms), default=0))
 
 
 def compare_alarm(result, life, time, values, told):
-    """The first frame after an alarm event is that event's; the others repeat what is raised, unknown, or changed before."""
+    """The first frame after an alarm event must match that event. The others repeat alarms that are raised, unknown, or changed
+    before."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
     severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
     name = next(signal for signal in values if signal.startswith("Value_"))
     threshold = name.replace("Value_", "Threshold_")
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
-    # More changes than the budget of frames are sent one after the other, each alarm as it is then.
+    # If there are more changes than the frame budget allows, they are sent one after another, each alarm in its current state.
     waiting = [(at, e) for at in told if time - WAIT_NS <= at <= time for e in told[at] if (e["rule"], e["cell"], e["severity"]) == key]
     at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)
@@ -314,14 +315,14 @@ def compare_alarm(result, life, time, values, told):
         result.value(time, "Alarm", name, values[name], None)
         result.frames["Alarm unknown"] += 1
     elif key in life.changed:
-        # A repetition: it is over.
+        # A repetition of a cleared alarm.
         result.value(time, "Alarm", "State", values["State"], STATES[life.changed[key]["state"]])
         result.frames["Alarm repeated"] += 1
     elif values["State"] == STATES["inactive"]:
-        # It was announced as unknown, and is known again.
+        # Was announced as unknown and is known again.
         result.frames["Alarm known again"] += 1
     else:
-        result.fault(time, "Alarm", f"{key} is sent and is not raised")
+        result.fault(time, "Alarm", f"{key} was sent but is not raised")
 
 
 def main():

@@ -3,8 +3,8 @@
 
 usage: look_at_page.py CHROMIUM PAGE.html WIDTH HEIGHT light|dark [SHOT.png] [PRINT.pdf]
 
-Prints one JSON document: requests (besides the page itself), messages, overflow_px (how far the page is wider than the
-window). Speaks the DevTools protocol over a pipe; needs nothing but Python's own library.
+Prints one JSON document: requests (other than the page itself), messages, overflow_px (excess width of the page over the
+window). Speaks the DevTools protocol over a pipe; needs only Python's standard library.
 """
 import base64
 import json
@@ -52,7 +52,7 @@ class Browser:
                 if wanted(message):
                     return message
             time.sleep(0.01)
-        raise SystemExit(f"Chromium does not answer within {LIMIT_S} s")
+        raise SystemExit(f"Chromium did not answer within {LIMIT_S} s")
 
     def read(self):
         try:
@@ -84,7 +84,7 @@ def look(browser, page, width, height, scheme, shot, print_to):
         data = browser.call("Page.printToPDF", printBackground=True, preferCSSPageSize=True)["data"]
         pathlib.Path(print_to).write_bytes(base64.b64decode(data))
     asked = [e["params"]["request"]["url"] for e in browser.events if e["method"] == "Network.requestWillBeSent"]
-    # `data:` is in the page itself: nothing is fetched.
+    # `data:` URLs are part of the page: nothing is fetched.
     asked = [address for address in asked if address != url and not address.startswith("data:")]
     kinds = ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
     said = [e["params"] for e in browser.events if e["method"] in kinds]

@@ -1,6 +1,6 @@
 """Reads exported Parquet tables with pyarrow or duckdb and compares them with the CSV export of the same log.
 
-usage: parquet_peer.py PARQUET_FOLDER CSV_FOLDER; prints that it skipped where neither reader is installed.
+usage: parquet_peer.py PARQUET_FOLDER CSV_FOLDER; prints "skipped" if neither reader is installed.
 """
 
 import csv
@@ -25,7 +25,7 @@ def read(path):
 
 
 def same(value, text):
-    """Whether a value is what the CSV says."""
+    """Whether a value equals the CSV's text."""
     if value is None:
         return text == ""
     if isinstance(value, bool):

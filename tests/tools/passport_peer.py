@@ -1,10 +1,10 @@
-"""What others say of a battery passport.
+"""Validates a battery passport with independent tools.
 
 usage: passport_peer.py schema SCHEMA.json PASSPORT.json   checks it with jsonschema against a published JSON schema
        passport_peer.py submodel PASSPORT.json             checks an IDTA Product Condition as a submodel of the Asset Administration Shell,
                                                            with aas-submodel-validate, which has IDTA's template (1.0.2)
 
-Prints a line for each fault; nothing = none.
+Prints one line per fault; no output means no fault.
 """
 import json
 import subprocess
