@@ -346,7 +346,8 @@ impl AlarmEngine {
     }
 
     /// Replaces the rules. An alarm whose rule, severity and cell are still watched is kept, and compared again if its
-    /// threshold changed. Other alarms that are or were raised are forgotten; returns their number.
+    /// threshold changed. Other alarms that are pending, raised or were raised are forgotten;
+    /// returns their number.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,

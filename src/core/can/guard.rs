@@ -3,9 +3,9 @@
 //! In: frames with their time and interface, in order of arrival, and the time alone ([`Guards::poll`]). Out: the
 //! [`Status`] of each frame, counts per message, and a [`GuardChange`] when a message turns from usable to failing or
 //! back; the checks in between are only counted. If a message's cycle time is known, each period without a frame counts
-//! as one NONEWDATA: the first one and a half periods after the last frame (half a period allows for jitter), then one
-//! per period. Missing frames up to the number that the check allows to be lost cause no change: the next frame will be
-//! usable, and a sender with jitter would otherwise fill the log.
+//! as one NONEWDATA. The first is counted one and a half periods after the last frame (half a period allows for
+//! jitter), then one per period. Missing frames up to the number that the check allows to be lost cause no change: the
+//! next frame will be usable, and a sender with jitter would otherwise fill the log.
 //!
 //! Time without listening is not the sender's fault: after sleep, a restart of the program or a clock step, the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the

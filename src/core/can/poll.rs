@@ -235,7 +235,7 @@ impl Poller {
         self.progress.is_standby = is_standby;
     }
 
-    /// Handles time without listening: no frame has been received.
+    /// Handles time without listening: forgets received frames and the outstanding request.
     pub fn restart(&mut self) {
         self.progress.outstanding = None;
         self.progress.heard.iter_mut().for_each(|(_, at)| *at = Timestamp::LONG_AGO);

@@ -8,13 +8,16 @@
 //! much shorter than the mean, because each frame of one sender falls between two frames of the other; or the currents
 //! alternate. A single sender that becomes faster, as many do when the vehicle wakes, shows neither. Short intervals
 //! that a message always has, such as those between the pages of a multiplexed message sent in a burst, are learned
-//! with its rate and do not count. The expected number is the highest steady rate so far, or the rate from the DBC's cycle
-//! time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
+//! with its rate and do not count. The expected number is the highest steady rate so far, or the rate from the DBC's
+//! cycle time if it is higher. The learned rate is stored, so that a second sender is also found after a restart.
 //!
-//! Limits: the following second senders are not found: one of a message with fewer than [`LEAST_PER_S`] frames a second
-//! that is as slow as the first sender; one of a message without a current that always arrives in bursts, or that sends
-//! more than twenty times as often; one that is present before the rate is known, if its currents do not differ. A
-//! message with end-to-end protection does not need this check: the counters of two senders do not fit.
+//! Second senders that are not found:
+//! * one of a message with fewer than [`LEAST_PER_S`] frames a second, if it is as slow as the first sender;
+//! * one of a message without a current, if the message always arrives in bursts or the second sender is more than
+//!   twenty times as fast;
+//! * one that is present before the rate is known, if its currents do not differ.
+//!
+//! A message with end-to-end protection does not need this check: the counters of two senders do not fit.
 
 use serde::{Deserialize, Serialize};
 

@@ -317,7 +317,7 @@ fn move_down(message: &mut Message) {
         // The header of end-to-end protection has two bytes.
         signal.layout.start_bit = signal.layout.start_bit.saturating_sub(16);
     }
-    // Length without that header and without the padding up to 8 bytes.
+    // Length without the header and with fewer unused bytes.
     message.len_bytes = 4;
     message.comment = Some("Authenticated command from another ECU: see PACKWATCH_Freshness.".to_owned());
 }

@@ -8,8 +8,8 @@
 //! receiver announces that value.
 //!
 //! The sender stores nothing across a restart: it waits for an announcement. The receiver stores its state. After a
-//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and not below the value for the time of
-//! its clock, so that no value of the previous run is used again, even if it was not stored.
+//! restart it begins [`RESTART_STEPS`] announcements beyond the stored state, and at least at the value that
+//! corresponds to its clock, so that no value of the previous run is used again, even if it was not stored.
 
 use serde::{Deserialize, Serialize};
 
