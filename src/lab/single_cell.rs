@@ -8,10 +8,8 @@ use std::path::{Path, PathBuf};
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 
 /// The configuration used when none is given, and what it names.
-const BUILT_IN: [(&str, &[u8]); 2] = [
-    ("score.toml", include_bytes!("../../config/score.toml")),
-    ("measured.dbc", include_bytes!("../../config/measured.dbc")),
-];
+const BUILT_IN: [(&str, &[u8]); 2] =
+    [("score.toml", include_bytes!("score.toml")), ("measured.dbc", include_bytes!("measured.dbc"))];
 
 /// What is on the label of a cell without a model, as in the keys of `[pack]`.
 #[derive(Debug, Clone, PartialEq)]

@@ -46,7 +46,7 @@ pub const DEFAULT_PERIOD_MS: u32 = 1000;
 /// # Errors
 /// Never for the shipped file, which a test parses.
 pub fn default_database() -> Result<Database, DbcError> {
-    Database::parse(include_str!("../../../../config/packwatch.dbc"))
+    Database::parse(include_str!("../../packwatch.dbc"))
 }
 
 /// The shipped DBC, parsed once: parsing takes longer than the rest of loading a configuration.
