@@ -71,7 +71,7 @@ pub struct MessageRate {
     learned_per_s: Option<f64>,
     /// Fraction of its frames that usually follow a short interval.
     usual_short: f64,
-    /// Rate of the latest windows, and the number of windows for which it has been steady.
+    /// Rate of the latest windows, and how many windows it has been steady.
     candidate: f64,
     steady: u32,
     /// Consecutive windows with too many frames, and consecutive normal windows.

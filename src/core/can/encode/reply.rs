@@ -84,7 +84,7 @@ pub struct ReplyFields {
 }
 
 impl ReplyFields {
-    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (besides those of [`CommandRefusal`]: 0 none, 6 not
+    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (in addition to [`CommandRefusal`]: 0 none, 6 not
     /// healthy, 7 nothing to do).
     fn result(&self) -> (u8, u8) {
         let replaces_pack = self.command.is_some_and(|fields| fields.command == Command::PackReplaced);

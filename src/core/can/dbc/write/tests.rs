@@ -94,7 +94,7 @@ prop_compose! {
     }
 }
 
-/// How a signal depends on an earlier one: by which multiplexor, for which codes, and whether the signal is a
+/// How a signal depends on an earlier one: by which multiplexor and codes, and whether the signal is a
 /// multiplexor itself.
 type MuxLink = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
 
