@@ -178,7 +178,7 @@ fn bad_input_error_names_place_and_range() {
         "cell.csv:1: no column \"pressure\", must be one of time_s, current_a, voltage_v, temperature_c, voltage_mv\n"
     );
     assert!(cv("voltage", "time").contains("\"voltage\" is ambiguous, found voltage_v, voltage_mv"));
-    assert!(cv("voltage_v", "time,voltage_v").contains("column voltage_v is named twice"));
+    assert!(cv("voltage_v", "time,voltage_v").contains("column voltage_v is given twice"));
     assert!(refused(place, 1, &[&["cv", "nowhere.csv"], &COLUMNS[..]].concat()).starts_with("nowhere.csv: "));
     // A row with a missing value is rejected with its line number, or skipped and counted.
     let text = std::fs::read_to_string(place.join("cell.csv")).unwrap();

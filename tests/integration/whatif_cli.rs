@@ -135,7 +135,7 @@ fn failed_log_is_reported_and_others_continue() {
     assert!(stderr.contains("holds no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
     let printed = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);
     let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
-    assert!(stderr.contains("-: is read once"), "{stderr}");
+    assert!(stderr.contains("-: standard input can be read only once"), "{stderr}");
     let printed = bench.run(&["whatif"], &["--set", "capacity_lo.warning=2.3", "a.log.gz"]).code(78);
     assert!(String::from_utf8_lossy(&printed.get_output().stderr).contains("did you mean capacity_low"));
 }
