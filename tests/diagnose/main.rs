@@ -25,7 +25,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use pack::{Case, PackBalancing, PackSize, Seen};
+use pack::{Case, FirstFinding, PackBalancing, PackSize};
 use packwatch::monitor::MonitorConfig;
 use packwatch::sim::{Fault, FaultKind, SensorQuality};
 use rand::{Rng, SeedableRng};
@@ -223,10 +223,10 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
 }
 
 /// Prints the findings that the fault does not explain.
-fn list((f, q, balancing): Row, case: &Case, seen: &[Seen]) {
+fn list((f, q, balancing): Row, case: &Case, seen: &[FirstFinding]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));
-    for Seen { at_s, found, .. } in seen.iter().filter(|it| it.at_s < from_s || Some(it.found.kind) != kind) {
+    for FirstFinding { at_s, found, .. } in seen.iter().filter(|it| it.at_s < from_s || Some(it.found.kind) != kind) {
         let (name, size, quality) = (FAULTS[f].0, SIZES[FAULTS[f].1].cells, QUALITIES[q].0);
         let (day, fault_day) = (at_s / 86_400.0, from_s / 86_400.0);
         eprintln!(

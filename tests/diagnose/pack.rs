@@ -70,7 +70,7 @@ pub(crate) struct Case {
 
 /// A finding at its first occurrence.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Seen {
+pub(crate) struct FirstFinding {
     /// Time since the start, s.
     pub(crate) at_s: f64,
     /// Drives since the start of the fault, including the one in which it began.
@@ -208,7 +208,7 @@ impl Case {
 
     /// Runs the pack. Returns the findings in the order of their first occurrence, without those that correctly
     /// describe the sensors' own errors.
-    pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<Seen> {
+    pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<FirstFinding> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
         let is_balanced = self.balancing != PackBalancing::Off;
@@ -216,7 +216,7 @@ impl Case {
         let mut monitor = Monitor::new(MonitorConfig { is_balanced, balancing, ..config.clone() });
         let (mut ticks, mut out, mut frames) =
             (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
-        let (mut seen, mut next_look) = (Looks::default(), Timestamp::ZERO);
+        let (mut seen, mut next_look) = (FindingHistory::default(), Timestamp::ZERO);
         let from_s = self.fault().map_or(f64::INFINITY, |fault| fault.from_s);
         let least_a = DRIVE_PER_H * self.size.capacity_ah;
         let mut drives = Drives::default();
@@ -263,16 +263,16 @@ fn median(values: &[f64]) -> f64 {
 
 /// Collects the first occurrence of each finding.
 #[derive(Debug, Default)]
-struct Looks {
-    first: Vec<Seen>,
+struct FindingHistory {
+    first: Vec<FirstFinding>,
     known: BTreeMap<(u8, Option<(CellIndex, CellIndex)>), ()>,
 }
 
-impl Looks {
+impl FindingHistory {
     fn note(&mut self, at_s: f64, drives: u32, found: &[CellFault]) {
         for &found in found {
             if self.known.insert((code(found.kind), found.cells), ()).is_none() {
-                self.first.push(Seen { at_s, drives, found });
+                self.first.push(FirstFinding { at_s, drives, found });
             }
         }
     }

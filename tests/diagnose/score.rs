@@ -4,7 +4,7 @@ use packwatch::quantity::CellIndex;
 use packwatch::sim::FaultKind;
 
 use crate::finding::kind_of;
-use crate::pack::{CELLS_PER_SENSOR, Case, Seen};
+use crate::pack::{CELLS_PER_SENSOR, Case, FirstFinding};
 
 const DAY_S: f64 = 86_400.0;
 /// Days of a month.
@@ -32,7 +32,7 @@ pub(crate) struct Score {
 }
 
 impl Score {
-    pub(crate) fn add(&mut self, case: &Case, seen: &[Seen]) {
+    pub(crate) fn add(&mut self, case: &Case, seen: &[FirstFinding]) {
         self.packs += 1;
         self.days += f64::from(case.days);
         let from_s = case.fault().map_or(f64::INFINITY, |fault| fault.from_s);
@@ -41,7 +41,7 @@ impl Score {
         let Some(fault) = case.fault() else { return };
         let after = || seen.iter().filter(|seen| seen.at_s >= from_s);
         let (kind, cells) = (kind_of(&fault.kind), places(&fault.kind));
-        let is_right = |seen: &&Seen| is_right_place(&cells, seen.found.cells);
+        let is_right = |seen: &&FirstFinding| is_right_place(&cells, seen.found.cells);
         let right = after().filter(|seen| Some(seen.found.kind) == kind).find(is_right);
         self.delays_days.extend(right.map(|seen| (seen.at_s - from_s) / DAY_S));
         self.in_one_drive += u32::from(right.is_some_and(|seen| seen.drives <= 1));

@@ -144,7 +144,7 @@ impl Noise {
 }
 
 /// Distance of the value from its threshold: 0 in the middle of the day, 1 at its ends.
-fn away(t: f64) -> f64 {
+fn distance_from_threshold(t: f64) -> f64 {
     let to_end = (f64::from(DAY_S) - t).min(t);
     (1.0 - to_end / HOUR_S).max(0.0)
 }
@@ -158,7 +158,7 @@ fn wander(t: f64) -> f64 {
 fn temperature_day(alarm: &str) -> Day {
     let mut noise = Noise::new(1);
     day(configuration(alarm), Rule::TemperatureHigh, |_, t| {
-        (0.0, 3.75, 50.0 - 10.0 * away(t) + wander(t) + 0.7 * noise.next())
+        (0.0, 3.75, 50.0 - 10.0 * distance_from_threshold(t) + wander(t) + 0.7 * noise.next())
     })
 }
 
@@ -168,7 +168,7 @@ fn soc_day(alarm: &str) -> Day {
     let (mut noise, mut soc) = (Noise::new(2), 0.3);
     day(configuration(alarm), Rule::SocLow, |config, t| {
         let model = &config.model;
-        let target = 0.1 + 0.2 * away(t) + 0.006 * (t / 40.0).sin();
+        let target = 0.1 + 0.2 * distance_from_threshold(t) + 0.006 * (t / 40.0).sin();
         // Current that reaches the target within this second.
         let current_a = (soc - target) * model.capacity_ah * 3600.0;
         soc = soc_after(soc, current_a, model.capacity_ah);

@@ -54,11 +54,11 @@ impl Attacker {
             }
             3 => {
                 // A guess: correct command, fresh value, random authenticator.
-                let mut payload = other.made(3, 2047, fresh).data().to_vec();
+                let mut payload = other.encode_command(3, 2047, fresh).data().to_vec();
                 other.authentication.write_mac(&mut payload, self.rng.random::<u128>().to_be_bytes());
                 frame_of(&payload)
             }
-            4 => other.made(3, 2047, fresh),
+            4 => other.encode_command(3, 2047, fresh),
             _ => {
                 // The data of one recorded frame with the authenticator of another.
                 let (a, b) = (old(&mut self.rng, &self.recorded), old(&mut self.rng, &self.recorded));
@@ -75,8 +75,8 @@ impl Attacker {
 }
 
 /// Delivers the daemon's sent frames to the ECU. Returns the last announcement, if there was one.
-fn hear(daemon: &Daemon, ecu: &mut Ecu) -> Option<Frame> {
-    daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+fn deliver_sent_frames(daemon: &Daemon, ecu: &mut Ecu) -> Option<Frame> {
+    daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     daemon.sent.iter().rev().find(|frame| frame.id() == CanId::standard(FRESHNESS).unwrap()).copied()
 }
 
@@ -97,7 +97,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
     while attacker.frames < frames {
         round += 1;
         daemon.pass(20);
-        announced = hear(&daemon, &mut ecu).or(announced);
+        announced = deliver_sent_frames(&daemon, &mut ecu).or(announced);
         let Some(latest) = announced else { continue };
         if attacker.rng.random_range(0..40) == 0
             && let Some(frame) = ecu.command(attacker.rng.random_range(1..=3), 2047)
@@ -139,7 +139,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
             daemon.restart(stored.clone(), downtime, away_ms);
             attacker.withheld.iter_mut().for_each(|(made, _)| *made = i64::MIN / 2);
             ecu = Ecu::new(profile, key(0xA0));
-            announced = hear(&daemon, &mut ecu);
+            announced = deliver_sent_frames(&daemon, &mut ecu);
         } else if round % 300 == 10 {
             stored = daemon.monitor.snapshot();
         }
@@ -172,7 +172,7 @@ fn manual_example_matches_computed_authenticator() {
     let key = CanKey::parse(b"2b7e151628aed2a6abf7158809cf4f3c").unwrap();
     let mut ecu = Ecu::new(Profile::P1, key);
     ecu.authentication = Authentication { profile: Profile::P1, data_id: 0x124 };
-    let frame = ecu.made(2, 2047, 28_800_000_000);
+    let frame = ecu.encode_command(2, 2047, 28_800_000_000);
     assert_eq!(format!("{frame:?}"), "Frame(6B3, Classic, [F2, F9, 3F, 00, 00, A2, 9B, 91])");
     let manual = include_str!("../../docs/src/ecu/commands.md");
     assert!(manual.contains("`F2F93F0000A29B91`"));
@@ -183,7 +183,7 @@ fn every_command_reply_carries_reason() {
     let mut daemon = Daemon::new(config("1", ""));
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
     daemon.pass(1000);
-    daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+    daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     let reply = |daemon: &Daemon| {
         let frame = daemon.sent.iter().rev().find(|frame| frame.id() == CanId::standard(REPLY).unwrap()).unwrap();
         let bits = u64::from_le_bytes(frame.data().try_into().unwrap());
@@ -202,7 +202,7 @@ fn every_command_reply_carries_reason() {
     assert_eq!(reply(&daemon), [2, 8, 15, 511], "not authentic");
     (0..11).for_each(|_| assert!(!daemon.receive(&frame_of(&forged))));
     daemon.pass(1000);
-    daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+    daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     assert!(!daemon.receive(&ecu.command(1, 2047).unwrap()));
     assert_eq!(reply(&daemon), [2, 10, 1, 511], "during an attack the sender must repeat the command");
     daemon.pass(200);
@@ -213,7 +213,7 @@ fn every_command_reply_carries_reason() {
         "another"
     );
     daemon.pass(200_000);
-    daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+    daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     assert!(daemon.receive(&ecu.command(2, 2047).unwrap()), "rejected after the end of the attack");
     let counts = daemon.counts();
     assert_eq!((counts.authentic, counts.unconfirmed), (3, 3));
@@ -229,7 +229,7 @@ fn journal_replay_without_key_equals_live_run() {
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
     for second in 0..60 {
         daemon.pass(1000);
-        daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+        daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
         let frame = ecu.command(1 + second % 3, 2047).unwrap();
         assert!(daemon.receive(&frame));
         assert!(!daemon.receive(&frame));
@@ -259,7 +259,7 @@ fn announcement_expires_after_two_seconds() {
         let mut daemon = Daemon::new(config("1", ""));
         let mut ecu = Ecu::new(Profile::P1, key(0xA0));
         daemon.pass(1000);
-        daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+        daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
         daemon.pass(20);
         // Stop the ticks (a hung loop or a suspended computer). The announcement was made 20 ms after a whole second.
         let frame = ecu.command(1, 2047).unwrap();
@@ -273,7 +273,7 @@ fn frame_with_unchecked_authenticator_is_ignored() {
     let mut daemon = Daemon::new(config("1", ""));
     let mut ecu = Ecu::new(Profile::P1, key(0xA0));
     daemon.pass(1000);
-    daemon.sent.iter().for_each(|frame| ecu.hear(frame));
+    daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     let (frame, mut out) = (ecu.command(3, 2047).unwrap(), Outputs::default());
     let time = Timestamp::from_nanos(daemon.ms * 1_000_000);
     daemon.monitor.handle(&Record::frame(time, BusIndex(0), &frame), &mut out);

@@ -17,7 +17,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// Payloads per page of a message. A message without pages counts as one page.
 const PAYLOADS: usize = 1000;
 
-fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
+fn is_present(message: &Message, signal: usize, payload: &[u8]) -> bool {
     message.signals[signal].conditions.iter().all(|condition| {
         let code = message.signals[condition.selector].layout.plan().unwrap().raw(payload).unwrap();
         condition.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code))
@@ -109,7 +109,7 @@ fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
 }
 
 fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<String, f64>, tally: &mut Tally) {
-    for (_, signal) in message.signals.iter().enumerate().filter(|(n, _)| is_there(message, *n, payload)) {
+    for (_, signal) in message.signals.iter().enumerate().filter(|(n, _)| is_present(message, *n, payload)) {
         let name = format!("{}.{}", message.name, signal.name);
         let found = signal.layout.plan().unwrap().physical(payload);
         let Some(wanted) = expected.remove(&signal.name) else {

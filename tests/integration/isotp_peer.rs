@@ -60,7 +60,7 @@ impl Chance {
 }
 
 /// A frame on the bus.
-struct Sent {
+struct SentFrame {
     ms: i64,
     sender: usize,
     message: usize,
@@ -76,7 +76,7 @@ fn peer_messages_are_reassembled_despite_loss() {
     let cut = ask(&python, "send", &lines);
     assert_eq!(cut.len(), MESSAGES);
     // Each sender sends its messages in order; the bus interleaves the frames of all senders.
-    let mut bus: Vec<Sent> = Vec::new();
+    let mut bus: Vec<SentFrame> = Vec::new();
     let mut intact = vec![true; MESSAGES];
     let mut clocks = [0_i64; SENDERS];
     for (message, frames) in cut.iter().enumerate() {
@@ -94,13 +94,13 @@ fn peer_messages_are_reassembled_despite_loss() {
                 intact[message] = false;
                 continue;
             }
-            bus.push(Sent { ms: clocks[sender], sender, message, payload: bytes(payload) });
+            bus.push(SentFrame { ms: clocks[sender], sender, message, payload: bytes(payload) });
         }
     }
     bus.sort_by_key(|sent| sent.ms);
     let mut receivers = vec![Receiver::new(None); SENDERS];
     let (mut received, mut faults) = (vec![0; MESSAGES], BTreeMap::new());
-    for Sent { ms, sender, message, payload } in &bus {
+    for SentFrame { ms, sender, message, payload } in &bus {
         let heard = receivers[*sender].handle(Timestamp::from_nanos(ms * 1_000_000), payload);
         if let Some(fault) = heard.fault {
             *faults.entry(fault).or_insert(0) += 1;

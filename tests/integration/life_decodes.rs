@@ -94,7 +94,7 @@ fn life_frames_decode_to_replay_values() {
     assert!(found["frames"]["Status"].as_u64().unwrap() > 200_000, "a life of 2.2e5 s, every second");
     assert_eq!(found["frames"]["Alarm at once"], 2, "capacity and recharge period");
     assert!(count(&found, "Alarm.Value_CapacityLow") > 50_000 && count(&found, "Health.RechargePeriod") > 200_000);
-    assert!(found["untold"].as_u64().unwrap() < 100, "only the unfinished charge at the log's end may be missing");
+    assert!(found["unreported"].as_u64().unwrap() < 100, "only the unfinished charge at the log's end may be missing");
 }
 
 /// The example's pack reduced to eight cells; each kind of frame is protected by a different profile.

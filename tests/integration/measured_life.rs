@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::support::measured;
-use crate::support::window::{By, windowed};
+use crate::support::window::{WindowUnit, windowed};
 use serde_json::Value;
 
 /// One discharge of the table: start time (s) and published capacity (Ah).
@@ -83,7 +83,7 @@ fn discharge_of(event: &Value, discharges: &[Discharge]) -> usize {
 }
 
 /// The usable capacity reported after a discharge.
-struct Stated {
+struct UsableCapacityReport {
     discharge: usize,
     usable_ah: f64,
     std_ah: f64,
@@ -92,7 +92,7 @@ struct Stated {
 }
 
 /// Usable capacities reported after each discharge from number 11 on.
-fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
+fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<UsableCapacityReport> {
     let mut stated = Vec::new();
     let mut mode = "";
     for event in events {
@@ -104,7 +104,7 @@ fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
                 let std_ah = event["usable_capacity_std_ah"].as_f64().unwrap();
                 if discharge > 10 {
                     let error_ah = usable_ah - discharges[discharge - 1].capacity_ah;
-                    stated.push(Stated { discharge, usable_ah, std_ah, error_ah });
+                    stated.push(UsableCapacityReport { discharge, usable_ah, std_ah, error_ah });
                 }
             }
             _ => {}
@@ -184,7 +184,8 @@ fn usable_capacity_converges_from_wrong_start() {
 }
 
 /// Seed and unit of the windows.
-const RUNS: [(u64, By); 4] = [(1, By::Duration), (2, By::Duration), (3, By::Charge), (4, By::Charge)];
+const RUNS: [(u64, WindowUnit); 4] =
+    [(1, WindowUnit::Duration), (2, WindowUnit::Duration), (3, WindowUnit::Charge), (4, WindowUnit::Charge)];
 
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]

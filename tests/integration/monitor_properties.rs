@@ -77,7 +77,7 @@ fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> [String
     ]
 }
 
-fn wanting_estimates() -> Outputs {
+fn outputs_with_estimates() -> Outputs {
     Outputs { want_estimates: true, ..Outputs::default() }
 }
 
@@ -99,7 +99,7 @@ const WHAT: [&str; 3] = ["estimates", "events", "frames"];
 fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Downtime) -> Vec<String> {
     let mut found = Vec::new();
     for &split in splits {
-        let (mut whole, mut out) = (Monitor::new(config.clone()), wanting_estimates());
+        let (mut whole, mut out) = (Monitor::new(config.clone()), outputs_with_estimates());
         for record in &records[..split] {
             out.clear();
             whole.handle(record, &mut out);
@@ -209,7 +209,7 @@ fn reload_differences(
     edit: impl Fn(&mut MonitorConfig),
 ) -> Vec<String> {
     let (mut whole, mut reloaded) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
-    let (mut out_whole, mut out_reloaded) = (wanting_estimates(), wanting_estimates());
+    let (mut out_whole, mut out_reloaded) = (outputs_with_estimates(), outputs_with_estimates());
     let (mut found, mut reported, mut is_edited) = (Vec::new(), [false; 3], false);
     for (nth, record) in records.iter().enumerate() {
         if splits.contains(&nth) {
@@ -261,7 +261,7 @@ fn reload_of_thresholds_changes_no_estimate() {
 /// Compares a run with all ticks and one with only those at `next_due`: frames and events must be equal, in order.
 fn assert_early_ticks_have_no_effect(config: &MonitorConfig, records: &[Record]) {
     let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
-    let (mut out_all, mut out_few) = (wanting_estimates(), wanting_estimates());
+    let (mut out_all, mut out_few) = (outputs_with_estimates(), outputs_with_estimates());
     let (mut given, mut skipped) = (0_u32, 0_u32);
     for (nth, record) in (0..).zip(records) {
         let expected = outputs(&mut all, record, &mut out_all);

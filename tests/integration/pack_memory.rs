@@ -28,7 +28,7 @@ fn learned(rig: &Rig) -> Vec<String> {
     rig.monitor.cell_views().map(cell).collect()
 }
 
-/// Resistances relative to new after the next voltages, each of which changes them slightly.
+/// Resistances relative to new after the next voltages, which change them slightly.
 fn resistances(rig: &mut Rig) -> Vec<f64> {
     rig.tick_with_frames();
     rig.monitor.cell_views().map(|view| view.values.mean(Quantity::ResistanceRatio).unwrap()).collect()

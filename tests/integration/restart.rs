@@ -320,7 +320,7 @@ fn interval_after_power_cut_covers_loss() {
 
 /// A drive, then `hours` of downtime in which `used` of the charge is removed, then a rest. Returns error and deviation
 /// of each cell after each reading.
-fn away(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f64)> {
+fn drive_after_downtime(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f64)> {
     let encoder = InputEncoder::new(&config.input);
     let (mut live, mut noise, mut frames) = (Live::new(config), Draw(seed), Vec::new());
     let mut pack = Pack::new(
@@ -369,7 +369,7 @@ fn charge_used_during_downtime_is_found_at_rest() {
     let config = configuration();
     for (hours, used, bar) in [(8.0, 0.2, 0.02), (8.0, -0.1, 0.05), (1.0, 0.2, 0.03), (1000.0, 0.2, 0.02)] {
         for seed in [3, 4] {
-            let seen = away(&config, hours, used, seed);
+            let seen = drive_after_downtime(&config, hours, used, seed);
             let covered = seen.iter().filter(|(error, std)| error.abs() <= SIGMAS * std).count();
             let worst = |reading: usize| {
                 let cells = usize::from(CELLS);
@@ -395,7 +395,7 @@ fn longer_downtime_never_reduces_deviation() {
     let config = configuration();
     let mut before = 0.0;
     for hours in [0.01, 0.1, 1.0, 8.0, 100.0, 1000.0, 10_000.0] {
-        let std = away(&config, hours, 0.0, 5)[0].1;
+        let std = drive_after_downtime(&config, hours, 0.0, 5)[0].1;
         println!("{hours} h off, nothing used: deviation {:.2} % after the first reading", 100.0 * std);
         assert!(std >= before, "{hours} h: {std} after {before}");
         before = std;

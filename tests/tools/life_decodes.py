@@ -196,7 +196,7 @@ class Comparison:
         self.frames, self.values = Counter(), Counter()
         self.faults, self.told = 0, []
         self.counters = {}
-        self.untold = 0  # recharge periods without an event in the log
+        self.unreported = 0  # recharge periods without an event in the log
         # Resistances between a mode change, where the current's offset is learned, and the next rows: not in any report.
         self.restated = 0
 
@@ -261,7 +261,7 @@ def compare(reader, life, estimates, events, frame_list):
                         if coming is not None and abs(values[signal] - coming) <= 1:
                             wanted = coming
                         elif done == len(periods) and abs(values[signal] - (wanted or 0)) > 1:
-                            result.untold += 1
+                            result.unreported += 1
                             continue
                     if signal == "ResistanceRatio" and wanted is not None and values[signal] is not None and life.moved:
                         result.restated += 1
@@ -336,7 +336,7 @@ def main():
     for line in result.told:
         print(line)
     print(json.dumps({"faults": result.faults, "cells": life.cells, "frames": dict(result.frames),
-                      "values": sum(result.values.values()), "untold": result.untold, "restated": result.restated, "per_signal": dict(result.values)}))
+                      "values": sum(result.values.values()), "unreported": result.unreported, "restated": result.restated, "per_signal": dict(result.values)}))
     sys.exit(result.faults != 0)
 
 

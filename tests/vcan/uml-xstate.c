@@ -2,10 +2,10 @@
  * Preloaded into linux.uml: lets the 6.1 user-mode kernel run on CPUs with a large register file (Intel AMX).
  *
  * That kernel saves and restores the extended registers of its processes with a fixed buffer of 2,696 bytes (up to
- * AVX-512 and PKRU). A host CPU with AMX has about 11,000 bytes; reading a shorter piece is allowed, but writing one
- * back fails with EFAULT, and the kernel dies before its first process runs ("ptrace set fp regs failed, errno = 14").
- * So a short write becomes: read everything, replace the piece the kernel knows, write everything. The rest (the AMX
- * tiles) keeps the value it has in the process. Every other request goes to libc unchanged.
+ * AVX-512 and PKRU). A host CPU with AMX has about 11,000 bytes. Reading fewer bytes is allowed, but writing fewer bytes
+ * fails with EFAULT, and the kernel dies before its first process runs ("ptrace set fp regs failed, errno = 14").
+ * This library turns a short write into: read all bytes, replace those that the kernel knows, write all bytes. The rest
+ * (the AMX tiles) keeps its value in the process. All other requests are passed to libc unchanged.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -19,7 +19,7 @@ typedef long (*ptrace_fn)(int, pid_t, void *, void *);
 
 static ptrace_fn next_ptrace;
 
-/* Not on the stack: kernel stacks in there are 16 KiB. One buffer is enough: that kernel has one CPU and no preemption. */
+/* Static, because kernel stacks there have 16 KiB. One buffer suffices, because that kernel has one CPU and no preemption. */
 static _Alignas(64) unsigned char whole[65536];
 
 /* Looked up at start, because the dynamic linker needs more stack than a kernel thread has. */

@@ -55,7 +55,7 @@ pub fn configuration(data: &[u8]) {
     let mut source = Source::new(data);
     let pack = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { drawn(&mut source) };
     if let Ok(config) = world::load(&pack, DBC, CELL.as_bytes()) {
-        use_it(&config);
+        run_and_restore(&config);
     }
 }
 
@@ -64,7 +64,7 @@ pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);
     let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };
     if let Ok(config) = world::load(PACK.as_bytes(), DBC, &model) {
-        use_it(&config);
+        run_and_restore(&config);
     }
 }
 
@@ -86,7 +86,7 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
 }
 
 /// Runs a short drive, then restores the resulting state.
-fn use_it(config: &Config) {
+fn run_and_restore(config: &Config) {
     const DRIVE: &[u8] = &[7, 0xE8, 3, 0, 20, 6, 20, 7, 0x18, 0xFC, 6, 20];
     let mut monitor = Monitor::new(config.monitor.clone());
     let mut out = Outputs { want_estimates: true, ..Outputs::default() };

@@ -41,7 +41,7 @@ pub(crate) const P95: usize = 6;
 
 /// Outcome of one rule for one life.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Judged {
+pub(crate) struct RuleOutcome {
     /// The look at which the alarm was first raised.
     pub(crate) first: Option<Look>,
     /// Raises while the truth was above the threshold: by any amount, and by more than 1 % of rated.
@@ -51,7 +51,7 @@ pub(crate) struct Judged {
     pub(crate) flickers: u32,
 }
 
-impl Judged {
+impl RuleOutcome {
     /// Whether the truth was above the threshold by more than `margin` of rated at the first raise.
     pub(crate) fn is_false(&self, margin: f64) -> bool {
         self.first.is_some_and(|look| look.true_ah > (THRESHOLD + margin) * RATED_AH)
@@ -89,8 +89,8 @@ pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
 }
 
 /// Judges a life by a rule.
-pub(crate) fn judge(rule: &Candidate, life: &Life) -> Judged {
-    let mut judged = Judged::default();
+pub(crate) fn judge(rule: &Candidate, life: &Life) -> RuleOutcome {
+    let mut judged = RuleOutcome::default();
     for (look, change) in life.looks.iter().zip(changes(rule, life)) {
         let margin = look.true_ah / RATED_AH - THRESHOLD;
         match change {

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::Fleet;
 use super::calibration::{EDGES, bins, errors};
-use super::judged::{CANDIDATES, Candidate, Judged, judge};
+use super::judged::{CANDIDATES, Candidate, RuleOutcome, judge};
 use super::life::Life;
 
 /// The 5 %, 50 % and 95 % quantiles of the values.
@@ -20,15 +20,15 @@ fn percent(count: usize, of: usize) -> String {
 }
 
 fn row(fleet: &Fleet, rule: &Candidate) -> String {
-    let judged: Vec<(&Life, Judged)> = fleet.ageing.iter().map(|life| (life, judge(rule, life))).collect();
-    let healthy: Vec<Judged> = fleet.healthy.iter().map(|life| judge(rule, life)).collect();
+    let judged: Vec<(&Life, RuleOutcome)> = fleet.ageing.iter().map(|life| (life, judge(rule, life))).collect();
+    let healthy: Vec<RuleOutcome> = fleet.healthy.iter().map(|life| judge(rule, life)).collect();
     let in_time = || judged.iter().filter_map(|(life, judged)| Some((*life, judged.in_time(life)?)));
     let lead = in_time().filter_map(|(life, look)| Some(life.end?.cycle - look.cycle)).collect();
     let full = in_time().filter_map(|(life, look)| Some(life.end?.full_cycles - look.full_cycles)).collect();
     let delay = in_time().filter_map(|(life, look)| Some(look.cycle - life.crossing?.cycle)).collect();
-    let count = |all: &[&Judged], wanted: &dyn Fn(&Judged) -> bool| all.iter().filter(|j| wanted(j)).count();
-    let ageing: Vec<&Judged> = judged.iter().map(|(_, judged)| judged).collect();
-    let healthy: Vec<&Judged> = healthy.iter().collect();
+    let count = |all: &[&RuleOutcome], wanted: &dyn Fn(&RuleOutcome) -> bool| all.iter().filter(|j| wanted(j)).count();
+    let ageing: Vec<&RuleOutcome> = judged.iter().map(|(_, judged)| judged).collect();
+    let healthy: Vec<&RuleOutcome> = healthy.iter().collect();
     let flickers = ageing.iter().map(|judged| judged.flickers).sum::<u32>();
     let (false_raises, far) = ageing.iter().fold((0, 0), |sum, j| (sum.0 + j.false_raises, sum.1 + j.far_false_raises));
     let first_true = count(&ageing, &|j| j.first.is_some() && !j.is_false(0.0));

@@ -52,7 +52,7 @@ impl Ecu {
     }
 
     /// Handles an announcement: ignores it if its authenticator is wrong or its freshness is not higher.
-    pub(crate) fn hear(&mut self, frame: &Frame) {
+    pub(crate) fn handle_frame(&mut self, frame: &Frame) {
         if frame.id() != CanId::standard(FRESHNESS).unwrap() {
             return;
         }
@@ -73,11 +73,11 @@ impl Ecu {
     pub(crate) fn command(&mut self, command: u8, cell: u16) -> Option<Frame> {
         let freshness = self.next.filter(|next| *next < self.announced + 16)?;
         self.next = Some(freshness + 1);
-        Some(self.made(command, cell, freshness))
+        Some(self.encode_command(command, cell, freshness))
     }
 
     /// Makes a command with the given freshness.
-    pub(crate) fn made(&self, command: u8, cell: u16, freshness: u64) -> Frame {
+    pub(crate) fn encode_command(&self, command: u8, cell: u16, freshness: u64) -> Frame {
         let codes = u32::from(command) | 31 << 4 | u32::from(cell) << 11;
         let mut payload = codes.to_le_bytes().to_vec();
         payload.resize(4 + self.authentication.profile.trailer_bytes(), 0);

@@ -14,10 +14,10 @@ use packwatch::monitor::MonitorConfig;
 use serde_json::Value;
 
 use super::least_squares::{Method, Swing};
-use super::swings::{Ends, Reading, Weighed, charge_variance, weigh};
+use super::swings::{Ends, Reading, VoltageSwing, charge_variance, weigh};
 use super::{PEERS, Score, Source, follow, score};
 use crate::support::measured;
-use crate::support::window::{By, windowed};
+use crate::support::window::{WindowUnit, windowed};
 
 /// Start (s) and published capacity (Ah) of each discharge.
 fn discharges(folder: &Path, cell: &str) -> Vec<(f64, f64)> {
@@ -98,7 +98,7 @@ fn live(config_path: &Path, rows: &Path, data: &Path, cell: &str) -> Life {
     let readings = readings(&estimates);
     let weighed = |ends| weigh(&config.model, &config.health.capacity, ends, &readings);
     let (outer, loaded) = (weighed(Ends::Outer), weighed(Ends::Loaded));
-    let of_filter = |swing: &Weighed| Source::Filter(swing.filter_swing(&config.health.capacity));
+    let of_filter = |swing: &VoltageSwing| Source::Filter(swing.filter_swing(&config.health.capacity));
     let filter_at_ends = loaded.iter().map(|swing| (swing.start_s, of_filter(swing))).collect();
     let [outer, loaded] =
         [outer, loaded].map(|swings| swings.into_iter().map(|s| (s.start_s, Source::Voltage(s))).collect());
@@ -173,7 +173,7 @@ impl Life {
 
     /// Usable capacity for a given capacity. Includes the uncertainty of the resistance; its correlation with a peer's
     /// capacity is unknown.
-    fn made_usable(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
+    fn to_usable_capacity(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
         };
@@ -189,7 +189,11 @@ impl Life {
         let start = ScalarGaussian::from_std(e.initial.capacity_ah, e.initial.capacity_std_ah);
         let times_s = self.reported.iter().map(|reported| reported.time_s);
         let capacities = follow(&self.config.model, &self.config.health.capacity, method, start, swings, times_s);
-        self.reported.iter().zip(capacities).map(|(reported, capacity)| self.made_usable(reported, capacity)).collect()
+        self.reported
+            .iter()
+            .zip(capacities)
+            .map(|(reported, capacity)| self.to_usable_capacity(reported, capacity))
+            .collect()
     }
 
     fn scored(&self, usable: &[ScalarGaussian]) -> (Score, Option<usize>) {
@@ -285,7 +289,7 @@ fn usable_capacity_from_windows_matches_best_peer() {
     heading();
     for (cell, seed) in [("B0005", 3), ("B0005", 4), ("B0006", 3), ("B0006", 4)] {
         let name = format!("{cell} in windows, seed {seed}");
-        windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, By::Charge);
+        windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, WindowUnit::Charge);
         let life = live(&configuration(folder.path(), cell, 1.0, false), &rows, &data, cell);
         ours.push(print_ours(&name, &life));
         peers.push(print_peers(&name, "voltage, loaded", &life, &life.loaded));

@@ -18,7 +18,7 @@ use packwatch::filter::ScalarGaussian;
 use packwatch::health::CapacityConfig;
 
 use least_squares::{Method, Peer, Swing};
-use swings::Weighed;
+use swings::VoltageSwing;
 
 /// The peers by name. None of these memory factors is best for every life, so several of each method are listed.
 const PEERS: [(&str, Method, f64); 11] = [
@@ -39,7 +39,7 @@ const PEERS: [(&str, Method, f64); 11] = [
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Filter(Swing),
-    Voltage(Weighed),
+    Voltage(VoltageSwing),
 }
 
 /// Each peer's capacity at each requested time, from the swings that began before that time.

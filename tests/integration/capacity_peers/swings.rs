@@ -58,13 +58,13 @@ struct Point {
 
 /// A swing with the data to weigh it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Weighed {
+pub(crate) struct VoltageSwing {
     pub(crate) start_s: f64,
     pub(crate) end_s: f64,
     ends: [Point; 2],
 }
 
-impl Weighed {
+impl VoltageSwing {
     /// Swing for a cell of assumed capacity `capacity_ah`, which determines the curve's shape.
     pub(crate) fn swing(&self, model: &CellModel, config: &CapacityConfig, capacity_ah: f64) -> Swing {
         let lost = 1.0 - capacity_ah / model.capacity_ah;
@@ -114,7 +114,7 @@ pub(crate) enum Ends {
 }
 
 /// All swings of a life.
-pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, readings: &[Reading]) -> Vec<Weighed> {
+pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, readings: &[Reading]) -> Vec<VoltageSwing> {
     let mut swings = Vec::new();
     let mut points: Vec<Point> = Vec::new();
     let mut circuit = Circuit::default();
@@ -152,7 +152,7 @@ fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     (back_ah > REVERSAL * model.capacity_ah && gone_ah > REVERSAL * model.capacity_ah && turn > 0).then_some(turn)
 }
 
-fn between_ends(model: &CellModel, points: &[Point]) -> Option<Weighed> {
+fn between_ends(model: &CellModel, points: &[Point]) -> Option<VoltageSwing> {
     let start_s = points.iter().find(|point| point.known)?.time_s;
     let end_s = points.iter().rfind(|point| point.known)?.time_s;
     if end_s - start_s < 2.0 * END_S {
@@ -161,7 +161,7 @@ fn between_ends(model: &CellModel, points: &[Point]) -> Option<Weighed> {
     let ends = [(start_s, start_s + END_S), (end_s - END_S, end_s)]
         .map(|(from, to)| mean(points.iter().filter(|p| p.known && (from..=to).contains(&p.time_s))));
     let moved_ah = (ends[1].charge_ah - ends[0].charge_ah).abs();
-    (moved_ah > MIN_SWING * model.capacity_ah).then_some(Weighed { start_s, end_s, ends })
+    (moved_ah > MIN_SWING * model.capacity_ah).then_some(VoltageSwing { start_s, end_s, ends })
 }
 
 /// Mean of points. The curve's errors are common to all points, so the variance does not fall with their number.

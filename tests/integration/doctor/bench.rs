@@ -140,7 +140,8 @@ fn log(bench: Bench, seed: u64) -> String {
     let mut logs = LOGS.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     let made = logs.entry((bench, seed)).or_insert_with(|| {
         let folder = tempfile::tempdir().unwrap();
-        let broken = Broken { bench, config: bench.config(), dbc: bench.dbc(), log: String::new(), extra: Vec::new() };
+        let broken =
+            BrokenPack { bench, config: bench.config(), dbc: bench.dbc(), log: String::new(), extra: Vec::new() };
         let config = broken.write(folder.path());
         let mut command = Command::cargo_bin("packwatch").unwrap();
         command.arg("simulate").args(bench.simulation()).arg("-c").arg(config).args([
@@ -156,7 +157,7 @@ fn log(bench: Bench, seed: u64) -> String {
 
 /// A pack to put a fault into.
 #[derive(Debug, Clone)]
-pub(crate) struct Broken {
+pub(crate) struct BrokenPack {
     pub(crate) bench: Bench,
     pub(crate) config: String,
     pub(crate) dbc: String,
@@ -165,7 +166,7 @@ pub(crate) struct Broken {
     pub(crate) extra: Vec<(&'static str, String)>,
 }
 
-impl Broken {
+impl BrokenPack {
     pub(crate) fn of(bench: Bench, seed: u64) -> Self {
         Self { bench, config: bench.config(), dbc: bench.dbc(), log: log(bench, seed), extra: Vec::new() }
     }

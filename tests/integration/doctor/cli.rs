@@ -2,9 +2,9 @@
 
 use assert_cmd::Command;
 
-use super::bench::{Bench, Broken};
+use super::bench::{Bench, BrokenPack};
 
-fn doctor(broken: &Broken, args: &[&str]) -> (i32, String, String) {
+fn doctor(broken: &BrokenPack, args: &[&str]) -> (i32, String, String) {
     let folder = tempfile::tempdir().unwrap();
     let config = broken.write(folder.path());
     let mut command = Command::cargo_bin("packwatch").unwrap();
@@ -16,7 +16,7 @@ fn doctor(broken: &Broken, args: &[&str]) -> (i32, String, String) {
 
 #[test]
 fn healthy_pack_exits_0_and_lists_checks() {
-    let (status, page, _) = doctor(&Broken::of(Bench::Pack12, 1), &[]);
+    let (status, page, _) = doctor(&BrokenPack::of(Bench::Pack12, 1), &[]);
     assert_eq!(status, 0, "{page}");
     for words in [
         "No faults found",
@@ -30,7 +30,7 @@ fn healthy_pack_exits_0_and_lists_checks() {
 
 #[test]
 fn finding_exits_1_and_shows_both_lines() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.config("positive = \"charge\"", "positive = \"discharge\"");
     let (status, page, _) = doctor(&broken, &[]);
     assert_eq!(status, 1, "{page}");
@@ -52,7 +52,7 @@ fn finding_exits_1_and_shows_both_lines() {
 
 #[test]
 fn unknown_signal_is_reported_and_others_diagnosed() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.config("PackStatus.Current\"", "PackStatus.Curent\"");
     broken.table("[input.cell_voltage]", "scale = 1000.0");
     let (status, page, _) = doctor(&broken, &[]);
@@ -64,7 +64,7 @@ fn unknown_signal_is_reported_and_others_diagnosed() {
 
 #[test]
 fn configuration_without_cell_model_is_rejected() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.config = "[pack]\ncells = 3\n".to_owned();
     let (status, page, faults) = doctor(&broken, &[]);
     assert_eq!((status, page.as_str()), (78, ""));
@@ -73,7 +73,7 @@ fn configuration_without_cell_model_is_rejected() {
 
 #[test]
 fn partial_log_is_judged_and_other_interface_named() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.frames(|stamp, _, id, data| Some(format!("{stamp} can9 {id}#{data}")));
     let (status, page, _) = doctor(&broken, &["-i", "can9", "--for", "20"]);
     assert_eq!(status, 0, "{page}");
@@ -82,7 +82,7 @@ fn partial_log_is_judged_and_other_interface_named() {
 
 #[test]
 fn wrong_byte_order_is_first_finding() {
-    let mut broken = Broken::of(Bench::Pack96, 1);
+    let mut broken = BrokenPack::of(Bench::Pack96, 1);
     broken.dbc("|16@1", "|16@0");
     let (status, page, _) = doctor(&broken, &[]);
     let first = page.lines().find(|line| line.starts_with("ERROR")).unwrap();

@@ -3,12 +3,12 @@
 use packwatch::wiring::Topic;
 
 use super::bench::Bench::{self, Charge, Day, Pack12, Pack96, Protected, Pulses, Steady, Total, Walk};
-use super::bench::Broken;
+use super::bench::BrokenPack;
 
 /// A fault to put into a pack.
 pub(crate) struct Fault {
     pub(crate) name: &'static str,
-    pub(crate) breaks: fn(&mut Broken),
+    pub(crate) breaks: fn(&mut BrokenPack),
     /// One of these topics must be the first finding.
     pub(crate) expected: &'static [Topic],
     /// Text that the proposed lines must contain; empty = no proposal required.
@@ -19,7 +19,7 @@ pub(crate) struct Fault {
 
 pub(crate) const fn fault(
     name: &'static str,
-    breaks: fn(&mut Broken),
+    breaks: fn(&mut BrokenPack),
     expected: &'static [Topic],
     proposed: &'static str,
     benches: &'static [Bench],
@@ -28,7 +28,7 @@ pub(crate) const fn fault(
     Fault { name, breaks, expected, proposed, benches, seeds }
 }
 
-fn invert(broken: &mut Broken) {
+fn invert(broken: &mut BrokenPack) {
     if broken.config.contains("positive = \"charge\"") {
         broken.config("positive = \"charge\"", "positive = \"discharge\"");
     } else {
@@ -36,33 +36,33 @@ fn invert(broken: &mut Broken) {
     }
 }
 
-fn voltage_table(broken: &Broken) -> &'static str {
+fn voltage_table(broken: &BrokenPack) -> &'static str {
     if broken.bench == Total { "[input.pack_voltage]" } else { "[input.cell_voltage]" }
 }
 
-fn voltage_scale(broken: &mut Broken, scale: &str) {
+fn voltage_scale(broken: &mut BrokenPack, scale: &str) {
     broken.table(voltage_table(broken), &format!("scale = {scale}"));
 }
 
-fn temperatures(broken: &mut Broken, keys: &str) {
+fn temperatures(broken: &mut BrokenPack, keys: &str) {
     broken.table("[[input.temperature]]", keys);
 }
 
 /// Swaps two signals' names in the configuration.
-fn exchange(broken: &mut Broken, a: &str, b: &str) {
+fn exchange(broken: &mut BrokenPack, a: &str, b: &str) {
     broken.config(&format!("\"{a}\""), "\"@\"");
     broken.config(&format!("\"{b}\""), &format!("\"{a}\""));
     broken.config("\"@\"", &format!("\"{b}\""));
 }
 
-fn without_units(broken: &mut Broken) {
+fn without_units(broken: &mut BrokenPack) {
     for unit in ["\"V\"", "\"A\"", "\"degC\""] {
         broken.dbc = broken.dbc.replace(unit, "\"\"");
     }
 }
 
 /// A second cell model: the example's with every number of some tables changed.
-fn other_cell(broken: &mut Broken, tables: &[&str], change: impl Fn(f64) -> f64) {
+fn other_cell(broken: &mut BrokenPack, tables: &[&str], change: impl Fn(f64) -> f64) {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("config/cells");
     let mut model: toml::Table =
         std::fs::read_to_string(folder.join("example_nmc_2600.toml")).unwrap().parse().unwrap();

@@ -3,18 +3,18 @@
 use packwatch::wiring::Topic;
 
 use super::bench::Bench::{Pack12, Pack96, Pulses, Steady, Total, Walk};
-use super::bench::Broken;
+use super::bench::BrokenPack;
 use super::faults::{Fault, fault};
 
 /// Swaps `@1` and `@0` but leaves the start bits of the cells unchanged, as a careless author would.
-fn byte_order_alone(broken: &mut Broken) {
+fn byte_order_alone(broken: &mut BrokenPack) {
     for start in [16, 32, 48] {
         broken.dbc(&format!("{start}|16@1+ (0.0001"), &format!("{start}|16@0+ (0.0001"));
     }
 }
 
 /// Drops one of every `of` frames with an identifier.
-fn lose(broken: &mut Broken, wanted: &str, of: u32) {
+fn lose(broken: &mut BrokenPack, wanted: &str, of: u32) {
     let mut n = 0;
     broken.frames(|stamp, interface, id, data| {
         n += u32::from(id == wanted);
@@ -31,7 +31,7 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
 
 /// Adds a second bus on which another sender uses identifier 100; its current is the first one's, inverted and delayed.
 /// The configured current is on interface `on`.
-fn second_bus(broken: &mut Broken, on: &str) {
+fn second_bus(broken: &mut BrokenPack, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
     broken.table("[input.cell_voltage]", "interface = \"can0\"");
     broken.table("[[input.temperature]]", "interface = \"can0\"");
@@ -49,7 +49,7 @@ fn second_bus(broken: &mut Broken, on: &str) {
 }
 
 /// Adds the pack's own voltage: `by` times the number of cells times the first cell's mean.
-fn pack_voltage(broken: &mut Broken, by: f64) {
+fn pack_voltage(broken: &mut BrokenPack, by: f64) {
     let cells = if broken.bench == Pack96 { 96.0 } else { 12.0 };
     let (mut sum, mut n) = (0.0, 0.0);
     broken.data("110", |data| {
@@ -62,7 +62,7 @@ fn pack_voltage(broken: &mut Broken, by: f64) {
 }
 
 /// Adds two states of charge: the pack's own of 80 %, and the dashboard's.
-pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
+pub(crate) fn two_socs(broken: &mut BrokenPack, dash: u8) {
     broken.dbc(
         "CM_ \"Example",
         "BO_ 768 Bms: 8 BMS\n SG_ PackSoc : 0|8@1+ (1,0) [0|100] \"%\" X\n\nBO_ 769 Dash: 8 BMS\n SG_ DisplaySoc : 0|8@1+ (1,0) \
@@ -83,7 +83,7 @@ pub(crate) fn two_socs(broken: &mut Broken, dash: u8) {
 }
 
 /// A name and the change of a healthy pack.
-type Change = (&'static str, fn(&mut Broken));
+type Change = (&'static str, fn(&mut BrokenPack));
 
 /// Further healthy packs, with the additional inputs that the doctor checks.
 pub(crate) const HEALTHY: &[Change] = &[

@@ -9,7 +9,7 @@ mod cli;
 mod faults;
 mod missed;
 
-use bench::{Bench, Broken};
+use bench::{Bench, BrokenPack};
 use faults::{FAULTS, Fault};
 use missed::MISSED;
 use packwatch::wiring::{Severity, Topic, WiringReport};
@@ -44,7 +44,7 @@ fn healthy_packs_have_no_finding() {
     let (mut logs, mut wrong) = (0, Vec::new());
     for (bench, seeds) in HEALTHY {
         for seed in first_seed()..first_seed() + seeds {
-            let report = Broken::of(*bench, seed).report();
+            let report = BrokenPack::of(*bench, seed).report();
             assert!(report.frames > 50, "{bench:?} {seed}: only {} frames", report.frames);
             logs += 1;
             let found = findings(&report);
@@ -54,7 +54,7 @@ fn healthy_packs_have_no_finding() {
         }
     }
     for (name, change) in missed::HEALTHY {
-        let mut broken = Broken::of(Bench::Pack12, first_seed());
+        let mut broken = BrokenPack::of(Bench::Pack12, first_seed());
         change(&mut broken);
         let found = findings(&broken.report());
         logs += 1;
@@ -69,7 +69,7 @@ fn healthy_packs_have_no_finding() {
 
 #[test]
 fn dead_last_module_is_only_a_warning() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.data("110", |data| {
         if data[0] > 2 {
             data[2..].fill(0xFF);
@@ -83,7 +83,7 @@ fn dead_last_module_is_only_a_warning() {
 
 #[test]
 fn silent_interface_reports_listening_time() {
-    let mut doctor = Broken::of(Bench::Pack12, 1).doctor();
+    let mut doctor = BrokenPack::of(Bench::Pack12, 1).doctor();
     doctor.handle_listened(60.0);
     let report = doctor.finish();
     let seen = &report.findings[0].seen;
@@ -101,7 +101,7 @@ struct Tally {
 }
 
 fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
-    let mut broken = Broken::of(bench, seed);
+    let mut broken = BrokenPack::of(bench, seed);
     (fault.breaks)(&mut broken);
     let report = broken.report();
     let is_it = |topic| fault.expected.contains(&topic);
@@ -149,7 +149,7 @@ fn injected_fault_is_first_finding() {
 
 #[test]
 fn missing_answers_are_found() {
-    let mut broken = Broken::of(Bench::Pack12, 1);
+    let mut broken = BrokenPack::of(Bench::Pack12, 1);
     broken.config("\"CellVoltages.CellVoltage{n}\"", "\"Car.Cell{n}\"");
     broken.config.push_str(
         "\n[[input.diagnostic]]\nname = \"Car\"\nrequest = 0x7E4\nresponse = 0x7EC\nservice = 0x22\nidentifier = 1\n\

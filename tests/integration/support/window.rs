@@ -4,7 +4,7 @@ use std::path::Path;
 
 /// Unit of a window's length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum By {
+pub(crate) enum WindowUnit {
     /// Time.
     Duration,
     /// Charge moved.
@@ -26,7 +26,7 @@ impl Uniform {
 
 /// Writes the life to `to`, keeping only a random window of 40 to 70 % of each record. Time stamps are unchanged, so
 /// the rest becomes a gap of known length and unknown current.
-pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: By) {
+pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: WindowUnit) {
     let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
     let mut reader = csv::Reader::from_reader(file);
     let mut writer = csv::Writer::from_path(to).unwrap();
@@ -48,14 +48,14 @@ pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: By) {
 }
 
 /// Position of each row within its record, 0 to 1.
-fn along(record: &[csv::StringRecord], by: By) -> Vec<f64> {
+fn along(record: &[csv::StringRecord], by: WindowUnit) -> Vec<f64> {
     let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
     let mut along = vec![0.0];
     for pair in record.windows(2) {
         let dt_s = number(&pair[1], 2) - number(&pair[0], 2);
         let step = match by {
-            By::Duration => dt_s,
-            By::Charge => 0.5 * (number(&pair[0], 3) + number(&pair[1], 3)).abs() * dt_s,
+            WindowUnit::Duration => dt_s,
+            WindowUnit::Charge => 0.5 * (number(&pair[0], 3) + number(&pair[1], 3)).abs() * dt_s,
         };
         along.push(along[along.len() - 1] + step);
     }
