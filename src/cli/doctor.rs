@@ -32,7 +32,7 @@ pub(crate) struct Args {
     #[arg(value_name = "LOG")]
     logs: Vec<PathBuf>,
     /// Time to listen, or time to read from the logs, s [default: 60; with logs, all of them]
-    #[arg(long = "for", value_name = "S", value_parser = above_0_to(86_400.0, "seconds, "))]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = above_0_to(86_400.0, "seconds, "))]
     seconds: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]

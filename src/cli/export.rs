@@ -44,7 +44,7 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "DIR", required_unless_present = "columns_page")]
     out: Option<PathBuf>,
     /// Export at most one estimate per cell in this period, the first; 0 exports all
-    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = period)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 1.0, value_parser = period)]
     period: f64,
     /// Print JSON
     #[arg(long)]

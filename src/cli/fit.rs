@@ -52,10 +52,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SHARE", value_parser = finite)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: where discharges end, pulses excluded]
-    #[arg(long, value_name = "V", value_parser = finite)]
+    #[arg(long, value_name = "VOLTS", value_parser = finite)]
     voltage_min: Option<f64>,
     /// Highest voltage under charge [default: where charges end, pulses excluded]
-    #[arg(long, value_name = "V", value_parser = finite)]
+    #[arg(long, value_name = "VOLTS", value_parser = finite)]
     voltage_max: Option<f64>,
     /// Slow discharge from full (about C/20), one per temperature. The OCV is its discharge branch with a smooth correction
     #[arg(long, value_name = "FILE")]
@@ -93,13 +93,13 @@ struct GridArgs {
     #[arg(long, value_name = "N")]
     branches: Option<usize>,
     /// Initial time constants, s, ascending
-    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = finite)]
+    #[arg(long, value_name = "SECONDS,..", value_delimiter = ',', value_parser = finite)]
     tau: Option<Vec<f64>>,
     /// Temperature nodes, degrees C, ascending [default: from the data]
-    #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_name = "CELSIUS,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
     /// SOC nodes: a number (evenly spaced) or an ascending list from 0 to 1 [default: 15 to 31 with a slow test, denser where its curve bends; 25 for an ageing cell; else 24, denser at both ends]
-    #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
+    #[arg(long, value_name = "N|SOC,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
 }
 

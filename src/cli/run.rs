@@ -26,8 +26,8 @@ pub(crate) struct Args {
     /// Record every input in this journal, for `packwatch replay`; rename an existing FILE to FILE.1
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Record in compressed segments FILE.000001.zst, FILE.000002.zst and so on. When the segments of this run and the
-    /// previous one exceed SIZE (for example 2GiB), delete the oldest
+    /// Limit the journal to SIZE, for example 2GiB: record in compressed segments FILE.000001.zst, FILE.000002.zst and so on,
+    /// and delete the oldest, including those of the previous run
     #[arg(long, value_name = "SIZE", requires = "record", value_parser = bytes)]
     record_limit: Option<u64>,
     /// Size of a segment [default: 64MiB]

@@ -41,16 +41,16 @@ pub(crate) struct Args {
     #[arg(long, value_name = "INTERFACE")]
     to: Option<String>,
     /// Play frames this many times faster than real time; 0 = as fast as the bus accepts them
-    #[arg(long, default_value_t = 1.0, value_parser = settings::non_negative, requires = "to")]
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = settings::non_negative, requires = "to")]
     speed: f64,
     /// Write the true state to this CSV, compressed if the name ends in .gz
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Time between rows of the truth, s
-    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = settings::positive)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 1.0, value_parser = settings::positive)]
     truth_period: f64,
     /// Unix time of the first frame, s
-    #[arg(long, value_name = "S", default_value_t = 1_700_000_000)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 1_700_000_000)]
     start: u32,
     #[command(flatten)]
     changes: settings::Changes,

@@ -16,10 +16,10 @@ pub(crate) struct LabelArgs {
     #[arg(long, value_name = "AH", value_parser = above_0, requires = "chemistry")]
     pub(crate) rated: Option<f64>,
     /// Lowest voltage [default: typical of the chemistry]
-    #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
+    #[arg(long, value_name = "VOLTS", value_parser = above_0, requires = "chemistry")]
     pub(crate) voltage_min: Option<f64>,
     /// Highest voltage [default: typical of the chemistry]
-    #[arg(long, value_name = "V", value_parser = above_0, requires = "chemistry")]
+    #[arg(long, value_name = "VOLTS", value_parser = above_0, requires = "chemistry")]
     pub(crate) voltage_max: Option<f64>,
 }
 

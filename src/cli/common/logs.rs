@@ -23,7 +23,7 @@ pub(crate) struct InputArgs {
     #[arg(long)]
     pub(crate) strict: bool,
     /// Treat a gap longer than this as sleep of the recorder: no ticks, no frames
-    #[arg(long, value_name = "S", default_value_t = SLEEP_GAP_S, value_parser = positive)]
+    #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
     pub(crate) sleep_gap: f64,
     /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section; an empty NAME
     /// means that the column does not exist. {n} in both stands for the number of the cell or sensor, from 1

@@ -28,7 +28,7 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "N", requires = "each", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(crate) jobs: Option<u16>,
     /// Replay this many times faster than real time [default: as fast as possible; with --to, 1]
-    #[arg(long, value_name = "X", value_parser = positive)]
+    #[arg(long, value_name = "FACTOR", value_parser = positive)]
     pub(crate) speed: Option<f64>,
     /// Send the frames on this CAN interface instead of replaying them through the core
     #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore", "state"])]

@@ -98,7 +98,7 @@ fn notes(out: &mut impl Write, files: &[HistoryScore]) -> io::Result<()> {
 }
 
 fn totals(out: &mut impl Write, total: &ScoreTotal) -> io::Result<()> {
-    writeln!(out, "\n{} forecasts, {} refused", total.forecasts, total.refused)?;
+    writeln!(out, "\n{} forecasts, {} not possible", total.forecasts, total.refused)?;
     writeln!(out, "interval holds the truth  {}", part(total.coverage))?;
     writeln!(out, "median passes alpha       {}", part(total.within_alpha))?;
     writeln!(out, "mean error                {:.1} %", 100.0 * total.mean_error)?;

@@ -75,7 +75,7 @@ pub(crate) struct StartArgs {
     #[arg(long, value_name = "PERCENT", value_parser = above_0_to(100.0, ""))]
     pub(crate) capacity_std: Option<f64>,
     /// Offset added to every current reading, A
-    #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = finite,
+    #[arg(long, value_name = "AMPERES", value_delimiter = ',', default_value = "0", value_parser = finite,
           allow_hyphen_values = true)]
     pub(crate) current_offset: Vec<f64>,
 }
@@ -91,7 +91,7 @@ pub(crate) struct StatisticsArgs {
     #[arg(long, value_name = "AH", value_parser = above_0)]
     pub(crate) truth_capacity: Option<f64>,
     /// Treat a gap longer than this as sleep of the recorder, s
-    #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 90.0, value_parser = above_0)]
     pub(crate) sleep_gap: f64,
 }
 

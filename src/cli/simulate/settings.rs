@@ -31,7 +31,7 @@ pub(super) struct Changes {
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
     cycles: Option<u32>,
     /// End after this time, s [default: ev-day 86400]
-    #[arg(long, value_name = "S", value_parser = positive)]
+    #[arg(long, value_name = "SECONDS", value_parser = positive)]
     duration: Option<f64>,
     #[command(flatten)]
     pub(super) pack: PackChanges,
@@ -40,10 +40,10 @@ pub(super) struct Changes {
     #[command(flatten)]
     pub(super) faults: FaultArgs,
     /// Time between current samples, ms [default: ev-day 10, others 1000]
-    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    #[arg(long, value_name = "MILLISECONDS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
     period: Option<u32>,
     /// Time between samples of the cells, ms, a multiple of --period [default: ev-day 100, others --period]
-    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    #[arg(long, value_name = "MILLISECONDS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
     cell_period: Option<u32>,
     /// Loads before each pair of reference cycles of random-walk [default: 1500]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
@@ -63,28 +63,28 @@ pub(super) struct PackChanges {
     #[arg(long, value_name = "SOC", value_parser = share)]
     initial_soc: Option<f64>,
     /// Ambient temperature, degrees C [default: from the configuration]
-    #[arg(long, value_name = "C", allow_negative_numbers = true, value_parser = between(-60.0, 100.0, ""))]
+    #[arg(long, value_name = "CELSIUS", allow_negative_numbers = true, value_parser = between(-60.0, 100.0, ""))]
     ambient: Option<f64>,
     /// Capacity lost per cycle, Ah
     #[arg(long, value_name = "AH", value_parser = non_negative)]
     loss_per_cycle: Option<f64>,
     /// Resistance gained per cycle, fraction of the new cell's
-    #[arg(long, value_name = "X", value_parser = non_negative)]
+    #[arg(long, value_name = "FRACTION", value_parser = non_negative)]
     resistance_per_cycle: Option<f64>,
     /// Spread of capacity between cells, relative standard deviation [default: ev-day 0.01, others 0]
-    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
+    #[arg(long, value_name = "FRACTION", value_parser = between(0.0, 0.3, ""))]
     spread_capacity: Option<f64>,
     /// Spread of resistance between cells, relative standard deviation [default: ev-day 0.03, others 0]
-    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
+    #[arg(long, value_name = "FRACTION", value_parser = between(0.0, 0.3, ""))]
     spread_resistance: Option<f64>,
     /// Spread of the initial SOC between cells, standard deviation [default: ev-day 0.005, others 0]
-    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
+    #[arg(long, value_name = "FRACTION", value_parser = between(0.0, 0.3, ""))]
     spread_soc: Option<f64>,
     /// Open-circuit hysteresis that the estimator does not model, V in each direction
-    #[arg(long, value_name = "V", value_parser = non_negative)]
+    #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     hysteresis: Option<f64>,
     /// Self-discharge current, A
-    #[arg(long, value_name = "A", value_parser = non_negative)]
+    #[arg(long, value_name = "AMPERES", value_parser = non_negative)]
     leakage: Option<f64>,
 }
 
@@ -141,28 +141,28 @@ struct SensorChanges {
     #[arg(long, value_name = "QUALITY", value_parser = one_of(&QUALITIES))]
     sensors: Option<SensorQuality>,
     /// White noise of cell voltages, V [default: paper 0.005]
-    #[arg(long, value_name = "V", value_parser = non_negative)]
+    #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     noise_voltage: Option<f64>,
     /// White noise of the current, A [default: paper 0.02]
-    #[arg(long, value_name = "A", value_parser = non_negative)]
+    #[arg(long, value_name = "AMPERES", value_parser = non_negative)]
     noise_current: Option<f64>,
     /// White noise of temperatures, K [default: paper 0.1, ev-day 0.02]
-    #[arg(long, value_name = "K", value_parser = non_negative)]
+    #[arg(long, value_name = "KELVIN", value_parser = non_negative)]
     noise_temperature: Option<f64>,
     /// Constant error of cell voltages, V
-    #[arg(long, value_name = "V", allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, value_name = "VOLTS", allow_negative_numbers = true, value_parser = finite)]
     offset_voltage: Option<f64>,
     /// Constant error of the current, A [default: paper 0.01]
-    #[arg(long, value_name = "A", allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, value_name = "AMPERES", allow_negative_numbers = true, value_parser = finite)]
     offset_current: Option<f64>,
     /// Relative error of the current [default: paper 0.005]
-    #[arg(long, value_name = "X", allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, value_name = "FRACTION", allow_negative_numbers = true, value_parser = finite)]
     gain_current: Option<f64>,
     /// Step of the voltage converter, V, in addition to the DBC's resolution
-    #[arg(long, value_name = "V", value_parser = non_negative)]
+    #[arg(long, value_name = "VOLTS", value_parser = non_negative)]
     resolution_voltage: Option<f64>,
     /// Probability that a reading is missing
-    #[arg(long, value_name = "P", value_parser = share)]
+    #[arg(long, value_name = "PROBABILITY", value_parser = share)]
     dropout: Option<f64>,
 }
 
