@@ -118,9 +118,7 @@ impl Routes {
 fn check(signal: &'static Signal, entry: &Metadata, uses: &HashMap<i32, usize>) -> Result<(i32, Route), String> {
     if entry.data_type != signal.data_type.code() {
         let (found, expected) = (type_name(entry.data_type), signal.data_type.name());
-        return Err(format!(
-            "datatype {found} in the broker, must be {expected}; load the overlay of this version (packwatch vss)"
-        ));
+        return Err(format!("datatype {found} in the broker, must be {expected}"));
     }
     if uses.get(&entry.id).is_some_and(|uses| *uses > 1) {
         return Err(format!("the broker uses id {} for another signal too", entry.id));
