@@ -586,7 +586,7 @@ fn value_from_unset_clock_is_undated() {
 }
 
 /// Output of a peer for a passport. Prints a note and returns `None` if the peer is missing.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
+#[expect(clippy::print_stdout, reason = "a skipped test prints the reason")]
 fn peer(arguments: &[&str]) -> Option<String> {
     let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
         println!("SKIPPED: PACKWATCH_PYTHON is not set, no peer was run");
@@ -599,7 +599,7 @@ fn peer(arguments: &[&str]) -> Option<String> {
 }
 
 /// Output of the published schema's check.
-#[expect(clippy::print_stdout, reason = "a skipped test says so")]
+#[expect(clippy::print_stdout, reason = "a skipped test prints the reason")]
 fn schema(name: &str, document: &str) -> Option<String> {
     let Some(folder) = std::env::var_os("PACKWATCH_SCHEMAS") else {
         println!("SKIPPED: PACKWATCH_SCHEMAS is not set, {name} was not checked");

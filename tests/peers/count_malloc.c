@@ -1,5 +1,5 @@
-/* Counts the heap allocations of a program, all threads: LD_PRELOAD this; the first 8 bytes of the file that COUNT_MALLOC names
- * (8 bytes long or longer) hold their number while it runs. For glibc.   cc -O2 -shared -fPIC -o count_malloc.so count_malloc.c */
+/* Counts the heap allocations of all threads of a program: use with LD_PRELOAD. The file named by COUNT_MALLOC must have at least
+ * 8 bytes; its first 8 bytes contain the count while the program runs. For glibc.   cc -O2 -shared -fPIC -o count_malloc.so count_malloc.c */
 #include <errno.h>
 #include <fcntl.h>
 #include <stdlib.h>

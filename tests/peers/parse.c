@@ -1,5 +1,5 @@
-/* The C peer of parse and decode: lines as canplayer reads them (fgets, then sscanf), the hex digits one by one, and the signals
- * of parse.dbc by shifts written out by hand, which is the fastest decoding C can have.
+/* The C peer of parsing and decoding. It reads lines as canplayer does (fgets, then sscanf), converts the hex digits one by one, and
+ * decodes the signals of parse.dbc with hand-written shifts, the fastest possible decoding in C.
  *   parse LOG [FRAMES]     prints: frames sum seconds
  */
 #include <stdint.h>

@@ -86,7 +86,7 @@ def test_score_of_panasonic_drive_equals_command(data):
 
 def test_replay_equals_command_files(record, tmp_path):
     csv, events, frames = (tmp_path / name for name in ("estimates.csv", "events.jsonl", "frames.log"))
-    told = packwatch("replay", "-c", PAPER, record.log, "--estimates", csv, "--events", events, "--frames", frames, "--json")
+    printed = packwatch("replay", "-c", PAPER, record.log, "--estimates", csv, "--events", events, "--frames", frames, "--json")
     replay = pw.replay(PAPER, [record.log])
     assert_same_estimates(replay.estimates, csv)
     assert list(replay.events["document"]) == events.read_text().splitlines()
@@ -96,7 +96,7 @@ def test_replay_equals_command_files(record, tmp_path):
     assert lines == [line.split(maxsplit=1)[1] for line in frames.read_text().splitlines()]
     timed = ("wall_s", "times_real_time", "frames_per_s", "cell_steps_per_s", "peak_memory_kib", "estimates")
     without = lambda summary: {key: value for key, value in summary.items() if key not in timed}  # noqa: E731
-    assert without(replay.summary) == without(json.loads(told))
+    assert without(replay.summary) == without(json.loads(printed))
 
 
 def test_replay_maps_column_names(record, tmp_path):

@@ -19,7 +19,7 @@ import cantools
 MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
-MAX_TOLD = 20
+MAX_PRINTED = 20
 WAIT_NS = 2 * 10**9  # longest wait of a first frame for the budget
 LOSS_SIGNALS = ("Lli", "LliStd", "LamNe", "LamNeStd", "LamPe", "LamPeStd")
 
@@ -194,7 +194,7 @@ class Comparison:
     def __init__(self, reader, rules):
         self.reader, self.rules = reader, rules
         self.frames, self.values = Counter(), Counter()
-        self.faults, self.told = 0, []
+        self.faults, self.printed = 0, []
         self.counters = {}
         self.unreported = 0  # recharge periods without an event in the log
         # Resistances between a mode change, where the current's offset is learned, and the next rows: not in any report.
@@ -202,8 +202,8 @@ class Comparison:
 
     def fault(self, time, message, what):
         self.faults += 1
-        if len(self.told) < MAX_TOLD:
-            self.told.append(f"{time / 1e9:.3f} {message}: {what}")
+        if len(self.printed) < MAX_PRINTED:
+            self.printed.append(f"{time / 1e9:.3f} {message}: {what}")
 
     def value(self, time, message, signal, found, wanted):
         self.values[f"{message}.{signal}"] += 1
@@ -229,10 +229,10 @@ class Comparison:
 def compare(reader, life, estimates, events, frame_list):
     rules = {code: snake(str(word)) for code, word in reader.signals["PACKWATCH_Alarm", "Rule"].choices.items()}
     result = Comparison(reader, rules)
-    told = defaultdict(list)  # alarm events by time, for the frames that go out at once
+    pending = defaultdict(list)  # alarm events by time that still need an immediate frame
     for event in events:
         if event["event"] == "alarm":
-            told[event["time"]].append(event)
+            pending[event["time"]].append(event)
     periods = [event["seconds"] for event in events if event["event"] == "recharge_period"]
     done = 0
     estimate, event = 0, 0
@@ -270,8 +270,8 @@ def compare(reader, life, estimates, events, frame_list):
         elif message == "Digest":
             compare_digest(result, life, time, values)
         else:
-            compare_alarm(result, life, time, values, told)
-    for time, left in told.items():
+            compare_alarm(result, life, time, values, pending)
+    for time, left in pending.items():
         for alarm in left:
             result.fault(time, "Alarm", f"no immediate frame for {alarm}")
     return result
@@ -284,7 +284,7 @@ def compare_digest(result, life, time, values):
         result.value(time, "Digest", "Worst", values["Worst"], max((SEVERITIES[of] for _, _, of in life.alarms), default=0))
 
 
-def compare_alarm(result, life, time, values, told):
+def compare_alarm(result, life, time, values, pending):
     """The first frame after an alarm event must match that event. The others repeat alarms that are raised, unknown, or changed
     before."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
@@ -294,13 +294,13 @@ def compare_alarm(result, life, time, values, told):
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
     # If there are more changes than the frame budget allows, they are sent one after another, each alarm in its current state.
-    waiting = [(at, e) for at in told if time - WAIT_NS <= at <= time for e in told[at] if (e["rule"], e["cell"], e["severity"]) == key]
+    waiting = [(at, e) for at in pending if time - WAIT_NS <= at <= time for e in pending[at] if (e["rule"], e["cell"], e["severity"]) == key]
     at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)
     event = at_once or life.alarms.get(key)
     if at_once:
         for at, past in waiting:
-            told[at].remove(past)
+            pending[at].remove(past)
         if waiting[-1][0] == time:
             result.value(time, "Alarm", name, values[name], scaled(at_once["value"], factor))
         result.frames["Alarm at once"] += 1
@@ -333,7 +333,7 @@ def main():
         events = [json.loads(line) for line in lines]
     life = Life(len({row["cell"] for _, row in estimates}), float(rated_ah))
     result = compare(Reader(dbc), life, estimates, events, frames(frame_log))
-    for line in result.told:
+    for line in result.printed:
         print(line)
     print(json.dumps({"faults": result.faults, "cells": life.cells, "frames": dict(result.frames),
                       "values": sum(result.values.values()), "unreported": result.unreported, "restated": result.restated, "per_signal": dict(result.values)}))

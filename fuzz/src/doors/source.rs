@@ -45,7 +45,7 @@ impl<'a> Source<'a> {
         choices[usize::from(self.byte()) % choices.len()]
     }
 
-    /// Any number: a usual one, one of any order of magnitude, or any bits.
+    /// A number: a plausible one, one of random magnitude, a special value, or arbitrary bits.
     pub(super) fn number(&mut self) -> f64 {
         match self.byte() % 4 {
             0 => f64::from(self.i16()) / 100.0,
